@@ -1,0 +1,291 @@
+"""Gymnasium's MuJoCo locomotion tasks (version 5) as Brax environments.
+
+One class, and a row in `TASKS` for each task. The models are the XML files that
+Gymnasium ships; observation, reward, termination, start and frame skip are those of
+``gymnasium.envs.mujoco.*_v5``.
+"""
+
+import dataclasses
+import pathlib
+import types
+from collections.abc import Callable, Mapping
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from brax.envs import Env, State
+from flax import struct
+from mujoco import mjx
+
+from gasil_envs.physics.mjx import MjxPhysics, PhysicsState
+
+Range = tuple[float, float]
+_EVERYTHING: Range = (-float("inf"), float("inf"))
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What tells one locomotion task from another.
+
+    Attributes:
+      xml: file name among Gymnasium's MuJoCo assets.
+      frame_skip: physics steps for each environment step.
+      forward_reward: weight of the forward velocity, 1 / (m/s).
+      control_cost: weight of the squared norm of the action.
+      healthy_reward: given for each step that ends in a healthy state.
+      healthy_z: open interval of the torso's height in metres, qpos[z_index].
+      healthy_angle: open interval of the torso's angle in radians, qpos[2].
+      healthy_state: open interval for all of qpos[2:] and qvel.
+      z_index: index in qpos of the height.
+      reset_noise: half width of the uniform noise on the start, and the
+        standard deviation of the velocity noise where that is normal.
+      normal_velocity_noise: whether the start's velocity noise is normal.
+      hidden_positions: how many leading entries of qpos are not observed.
+      max_velocity: observed velocities are clipped to +-this.
+      position: from physics data to the planar position (2,) whose change is the
+        forward velocity, or None for qpos[0:2].
+      observe_more: from (physics, data) to the rest of the observation.
+      contact_cost: from contact forces (nbody, 6) to a cost.
+    """
+
+    xml: str
+    frame_skip: int
+    forward_reward: float = 1.0
+    control_cost: float = 1e-3
+    healthy_reward: float = 0.0
+    healthy_z: Range = _EVERYTHING
+    healthy_angle: Range = _EVERYTHING
+    healthy_state: Range = _EVERYTHING
+    z_index: int = 1
+    reset_noise: float = 5e-3
+    normal_velocity_noise: bool = False
+    hidden_positions: int = 1
+    max_velocity: float = float("inf")
+    position: Callable[[mujoco.MjModel, mjx.Data], jax.Array] | None = None
+    observe_more: Callable[[mjx.Data, jax.Array], jax.Array] | None = None
+    contact_cost: Callable[[jax.Array], jax.Array] | None = None
+
+
+def _torso_position(model: mujoco.MjModel, data: mjx.Data) -> jax.Array:
+    return data.xpos[1, :2]
+
+
+def _mass_centre(model: mujoco.MjModel, data: mjx.Data) -> jax.Array:
+    mass = jnp.asarray(model.body_mass, jnp.float32)
+    return (mass @ data.xipos / mass.sum())[:2]
+
+
+def _clipped_contact_forces(data: mjx.Data, contact_forces: jax.Array) -> jax.Array:
+    return jnp.clip(contact_forces, -1.0, 1.0)[1:].ravel()
+
+
+def _body_observations(data: mjx.Data, contact_forces: jax.Array) -> jax.Array:
+    return jnp.concatenate(
+        [
+            data._impl.cinert[1:].ravel(),
+            data.cvel[1:].ravel(),
+            data.qfrc_actuator[6:],
+            contact_forces[1:].ravel(),
+        ]
+    )
+
+
+TASKS: Mapping[str, Task] = types.MappingProxyType(
+    {
+        "hopper": Task(
+            xml="hopper.xml",
+            frame_skip=4,
+            healthy_reward=1.0,
+            healthy_z=(0.7, float("inf")),
+            healthy_angle=(-0.2, 0.2),
+            healthy_state=(-100.0, 100.0),
+            max_velocity=10.0,
+        ),
+        "walker2d": Task(
+            xml="walker2d_v5.xml",
+            frame_skip=4,
+            healthy_reward=1.0,
+            healthy_z=(0.8, 2.0),
+            healthy_angle=(-1.0, 1.0),
+            max_velocity=10.0,
+        ),
+        "halfcheetah": Task(
+            xml="half_cheetah.xml",
+            frame_skip=5,
+            control_cost=0.1,
+            reset_noise=0.1,
+            normal_velocity_noise=True,
+        ),
+        "swimmer": Task(
+            xml="swimmer.xml",
+            frame_skip=4,
+            control_cost=1e-4,
+            reset_noise=0.1,
+            hidden_positions=2,
+        ),
+        "ant": Task(
+            xml="ant.xml",
+            frame_skip=5,
+            control_cost=0.5,
+            healthy_reward=1.0,
+            healthy_z=(0.2, 1.0),
+            z_index=2,
+            reset_noise=0.1,
+            normal_velocity_noise=True,
+            hidden_positions=2,
+            position=_torso_position,
+            observe_more=_clipped_contact_forces,
+            contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
+        ),
+        "humanoid": Task(
+            xml="humanoid.xml",
+            frame_skip=5,
+            forward_reward=1.25,
+            control_cost=0.1,
+            healthy_reward=5.0,
+            healthy_z=(1.0, 2.0),
+            z_index=2,
+            reset_noise=1e-2,
+            hidden_positions=2,
+            position=_mass_centre,
+            observe_more=_body_observations,
+            contact_cost=lambda f: jnp.minimum(5e-7 * jnp.sum(f**2), 10.0),
+        ),
+    }
+)
+
+
+@struct.dataclass
+class LocomotionState:
+    """Physics state and the planar position (2,) that velocity is measured from."""
+
+    physics: PhysicsState
+    position: jax.Array
+
+
+class Locomotion(Env):
+    """A task of `TASKS` on MJX.
+
+    Actions are in the units of the model's actuators, as in Gymnasium: physics
+    limits them to `action_range`, the control cost sees them as given (humanoid's,
+    as Gymnasium's does, sees the action too).
+    """
+
+    episode_length = 1000
+
+    def __init__(self, name: str):
+        self.task = task = TASKS[name]
+        assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+        self.model = mujoco.MjModel.from_xml_path(str(assets / task.xml))
+        self.physics = MjxPhysics(self.model)
+        self.dt = self.model.opt.timestep * task.frame_skip
+        # Constants of the traced functions stay NumPy arrays: they are embedded.
+        self._start = np.asarray(self.model.qpos0, np.float32)
+        self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return self._observation_size[0]
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector: the number of actuators."""
+        return self.model.nu
+
+    @property
+    def action_range(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest control, float32 (action,) each."""
+        low, high = self.model.actuator_ctrlrange.T.astype(np.float32)
+        return low, high
+
+    @property
+    def backend(self) -> str:
+        """Brax's name for the physics."""
+        return "mjx"
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start at rest with Gymnasium's noise on positions and velocities."""
+        scale = self.task.reset_noise
+        position_key, velocity_key = jax.random.split(rng)
+        qpos = self._start + jax.random.uniform(
+            position_key, self._start.shape, jnp.float32, -scale, scale
+        )
+        shape = (self.model.nv,)
+        if self.task.normal_velocity_noise:
+            qvel = scale * jax.random.normal(velocity_key, shape, jnp.float32)
+        else:
+            qvel = jax.random.uniform(velocity_key, shape, jnp.float32, -scale, scale)
+        # MuJoCo reads a quaternion as its normalization; MJX does not everywhere.
+        for joint in np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+            first = self.model.jnt_qposadr[joint] + 3
+            quaternion = qpos[first : first + 4]
+            quaternion = quaternion / jnp.linalg.norm(quaternion)
+            qpos = qpos.at[first : first + 4].set(quaternion)
+        return self.state_at(qpos, qvel)
+
+    def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
+        """The state of an episode that starts at `qpos` (nq,) and `qvel` (nv,)."""
+        physics = self.physics.init(qpos, qvel)
+        data = self.physics.kinematics(physics)
+        no_contact = jnp.zeros((self.model.nbody, 6), jnp.float32)
+        zero = jnp.float32(0)
+        return State(
+            pipeline_state=LocomotionState(physics, self._position(physics, data)),
+            obs=self._observe(physics, data, no_contact),
+            reward=zero,
+            done=zero,
+            metrics={"x_velocity": zero, "x_position": qpos[0]},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Advance `frame_skip` physics steps under one action."""
+        before = state.pipeline_state
+        physics, data = self.physics.step(before.physics, action, self.task.frame_skip)
+        task = self.task
+        position = self._position(physics, data)
+        x_velocity = (position[0] - before.position[0]) / self.dt
+
+        contact_forces = jnp.zeros((self.model.nbody, 6), jnp.float32)
+        if task.contact_cost is not None:
+            contact_forces = self.physics.contact_forces(data)
+        healthy = self._is_healthy(physics)
+        reward = task.forward_reward * x_velocity + task.healthy_reward * healthy
+        reward = reward - task.control_cost * jnp.sum(action**2)
+        if task.contact_cost is not None:
+            reward = reward - task.contact_cost(contact_forces)
+        return state.replace(
+            pipeline_state=LocomotionState(physics, position),
+            obs=self._observe(physics, data, contact_forces),
+            reward=reward,
+            done=1.0 - healthy,
+            metrics={"x_velocity": x_velocity, "x_position": physics.qpos[0]},
+        )
+
+    def _position(self, physics: PhysicsState, data: mjx.Data) -> jax.Array:
+        if self.task.position is None:
+            return physics.qpos[:2]
+        return self.task.position(self.model, data)
+
+    def _is_healthy(self, physics: PhysicsState) -> jax.Array:
+        task, qpos = self.task, physics.qpos
+        within = lambda x, bounds: jnp.all((bounds[0] < x) & (x < bounds[1]))
+        healthy = within(qpos[task.z_index], task.healthy_z)
+        healthy &= within(qpos[2], task.healthy_angle)
+        healthy &= within(jnp.concatenate([qpos[2:], physics.qvel]), task.healthy_state)
+        # Without bounds a comparison with infinity still catches NaN and infinity.
+        return healthy.astype(jnp.float32)
+
+    def _observe(
+        self, physics: PhysicsState, data: mjx.Data, contact_forces: jax.Array
+    ) -> jax.Array:
+        task = self.task
+        parts = [
+            physics.qpos[task.hidden_positions :],
+            jnp.clip(physics.qvel, -task.max_velocity, task.max_velocity),
+        ]
+        if task.observe_more is not None:
+            parts.append(task.observe_more(data, contact_forces))
+        return jnp.concatenate(parts)

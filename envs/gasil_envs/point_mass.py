@@ -1,0 +1,124 @@
+"""The paper's 2D point mass (section 5.2), with its layout as data.
+
+The action is the agent's velocity. Objects are collected once: blue +5, green +10,
+orange distractors -5. An actuation cost proportional to the L2 norm of the action
+discourages speed. The paper prints no coordinates; `Layout`'s defaults are ours and
+are laid out so that its story can happen: a blue object tempts nearby, two greens
+lie at the top behind a row of distractors.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from brax.envs import Env, State
+from flax import struct
+
+
+@dataclasses.dataclass(frozen=True)
+class Layout:
+    """Where things are, in units of the half width of the box [-1, 1] x [-1, 1].
+
+    An object is collected when the agent comes within `radius` of its centre.
+    The agent starts uniformly within `start_spread` of `start` in each coordinate.
+    """
+
+    blue: tuple[tuple[float, float], ...] = ((0.35, -0.45), (-0.7, -0.2))
+    green: tuple[tuple[float, float], ...] = ((-0.35, 0.7), (0.45, 0.75))
+    orange: tuple[tuple[float, float], ...] = (
+        (-0.6, 0.3),
+        (-0.2, 0.3),
+        (0.2, 0.3),
+        (0.6, 0.3),
+    )
+    start: tuple[float, float] = (0.0, -0.4)
+    start_spread: float = 0.1
+    radius: float = 0.15
+    max_speed: float = 0.1
+    actuation_cost: float = 0.1
+    blue_reward: float = 5.0
+    green_reward: float = 10.0
+    orange_reward: float = -5.0
+    episode_length: int = 50
+
+
+@struct.dataclass
+class PointMassState:
+    """The agent's position (2,) and which objects are collected (objects,) bool."""
+
+    position: jax.Array
+    collected: jax.Array
+
+
+class PointMass(Env):
+    """A point that moves with a chosen velocity in a box and collects objects.
+
+    Observation, float32 (2 + objects,): the position, then 1 for each object that
+    is still there and 0 for each that is collected, in the order blue, green,
+    orange. Action, float32 (2,): the velocity as a fraction of
+    `Layout.max_speed`, limited to [-1, 1] in each coordinate. The reward is the
+    sum over collected objects minus ``actuation_cost * ||action||_2``.
+    """
+
+    def __init__(self, layout: Layout | None = None):
+        self.layout = layout = layout or Layout()
+        self.objects = jnp.array(
+            layout.blue + layout.green + layout.orange, jnp.float32
+        )
+        self.object_rewards = jnp.array(
+            [layout.blue_reward] * len(layout.blue)
+            + [layout.green_reward] * len(layout.green)
+            + [layout.orange_reward] * len(layout.orange),
+            jnp.float32,
+        )
+        self.episode_length = layout.episode_length
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation vector."""
+        return 2 + self.objects.shape[0]
+
+    @property
+    def action_size(self) -> int:
+        """Length of the action vector."""
+        return 2
+
+    @property
+    def backend(self) -> str:
+        """Brax's name for the physics: there is none here."""
+        return "none"
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start near `Layout.start` with every object in place."""
+        spread = self.layout.start_spread
+        offset = jax.random.uniform(rng, (2,), jnp.float32, -spread, spread)
+        pipeline_state = PointMassState(
+            position=jnp.array(self.layout.start, jnp.float32) + offset,
+            collected=jnp.zeros(self.objects.shape[0], bool),
+        )
+        zero = jnp.float32(0)
+        return State(pipeline_state, self._observe(pipeline_state), zero, zero)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Move and collect."""
+        action = jnp.clip(action, -1.0, 1.0)
+        before = state.pipeline_state
+        position = jnp.clip(
+            before.position + self.layout.max_speed * action, -1.0, 1.0
+        )
+        distance = jnp.linalg.norm(position - self.objects, axis=-1)
+        found = (distance <= self.layout.radius) & ~before.collected
+        pipeline_state = PointMassState(position, before.collected | found)
+        reward = jnp.sum(jnp.where(found, self.object_rewards, 0.0))
+        cost = self.layout.actuation_cost * jnp.sqrt(jnp.sum(action**2))
+        return state.replace(
+            pipeline_state=pipeline_state,
+            obs=self._observe(pipeline_state),
+            reward=reward - cost,
+            done=jnp.float32(0),
+        )
+
+    def _observe(self, state: PointMassState) -> jax.Array:
+        return jnp.concatenate(
+            [state.position, 1.0 - state.collected.astype(jnp.float32)]
+        )

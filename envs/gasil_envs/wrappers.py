@@ -1,0 +1,149 @@
+"""Wrappers that compose with every Brax-style environment.
+
+Each keeps its own state in ``State.info`` and leaves the keys of the wrappers
+below it alone. Order, innermost first: `EpisodeLimit` (it decides when an episode
+ends), `RewardDelay` (it must see that end), `ObservationNoise`, `AutoReset`.
+"""
+
+import jax
+import jax.numpy as jnp
+from brax.envs import Env, State, Wrapper
+
+
+class EpisodeLimit(Wrapper):
+    """End an episode after `episode_length` steps.
+
+    Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
+    limit and not the environment ended the episode).
+    """
+
+    def __init__(self, env: Env, episode_length: int):
+        super().__init__(env)
+        self.episode_length = episode_length
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode."""
+        state = self.env.reset(rng)
+        info = {**state.info, "steps": jnp.int32(0), "truncation": jnp.float32(0)}
+        return state.replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and set ``done`` and ``truncation`` at the limit."""
+        steps = state.info["steps"] + 1
+        state = self.env.step(state, action)
+        at_limit = (steps >= self.episode_length).astype(jnp.float32)
+        info = {
+            **state.info,
+            "steps": steps,
+            "truncation": at_limit * (1.0 - state.done),
+        }
+        return state.replace(done=jnp.maximum(state.done, at_limit), info=info)
+
+
+class RewardDelay(Wrapper):
+    """Give the accumulated reward every `delay` steps and at the episode's end.
+
+    Paper, section 5.4. Nothing is lost: the rewards given in an episode sum to the
+    rewards earned. ``info["true_reward"]`` keeps the reward of each step, on which
+    evaluation is done.
+    """
+
+    def __init__(self, env: Env, delay: int):
+        super().__init__(env)
+        self.delay = delay
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode with nothing held back."""
+        state = self.env.reset(rng)
+        info = {
+            **state.info,
+            "true_reward": jnp.zeros_like(state.reward),
+            "held_reward": jnp.zeros_like(state.reward),
+            "delay_steps": jnp.int32(0),
+        }
+        return state.replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and hold back or give the reward."""
+        held, steps = state.info["held_reward"], state.info["delay_steps"] + 1
+        state = self.env.step(state, action)
+        held = held + state.reward
+        give = (steps % self.delay == 0) | (state.done > 0)
+        info = {
+            **state.info,
+            "true_reward": state.reward,
+            "held_reward": jnp.where(give, 0.0, held),
+            "delay_steps": steps,
+        }
+        return state.replace(reward=jnp.where(give, held, 0.0), info=info)
+
+
+class ObservationNoise(Wrapper):
+    """Add independent Gaussian noise to every observation (paper, section 5.3).
+
+    Physics and reward do not see it.
+    """
+
+    def __init__(self, env: Env, standard_deviation: float):
+        super().__init__(env)
+        self.standard_deviation = standard_deviation
+
+    def _noisy(self, state: State, key: jax.Array) -> State:
+        key, noise_key = jax.random.split(key)
+        noise = jax.random.normal(noise_key, state.obs.shape, state.obs.dtype)
+        return state.replace(
+            obs=state.obs + self.standard_deviation * noise,
+            info={**state.info, "noise_key": key},
+        )
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; `rng` is split between the environment and the noise."""
+        env_key, noise_key = jax.random.split(rng)
+        return self._noisy(self.env.reset(env_key), noise_key)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and add fresh noise to the observation."""
+        noise_key = state.info["noise_key"]
+        return self._noisy(self.env.step(state, action), noise_key)
+
+
+class AutoReset(Wrapper):
+    """Start the next episode where one ended, from a fresh random start.
+
+    For use under Brax's and Playground's tools; `gasil_jax` resets in its rollout.
+    ``info["final_observation"]`` keeps the observation that the episode ended with,
+    from which a truncated episode's value is bootstrapped.
+    """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; `rng` also draws the later starts."""
+        key, reset_key = jax.random.split(rng)
+        state = self.env.reset(reset_key)
+        info = {**state.info, "reset_key": key, "final_observation": state.obs}
+        return state.replace(info=info)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and replace an ended episode's state by a fresh start."""
+        # The episode that ended is seen by the caller once, with its done flag.
+        key, reset_key = jax.random.split(state.info["reset_key"])
+        info = dict(state.info)
+        del info["reset_key"], info["final_observation"]
+        stepped = self.env.step(state.replace(info=info, done=0.0 * state.done), action)
+        fresh = self.env.reset(reset_key)
+        done = stepped.done > 0
+        select = lambda a, b: jax.tree.map(lambda x, y: jnp.where(done, x, y), a, b)
+        kept = {k: v for k, v in stepped.info.items() if k in _LAST_STEP_INFO}
+        return stepped.replace(
+            pipeline_state=select(fresh.pipeline_state, stepped.pipeline_state),
+            obs=select(fresh.obs, stepped.obs),
+            info={
+                **select(fresh.info, stepped.info),
+                **kept,
+                "reset_key": key,
+                "final_observation": stepped.obs,
+            },
+        )
+
+
+# Facts about the step that ended the episode, which the fresh start must not erase.
+_LAST_STEP_INFO = ("truncation", "true_reward")

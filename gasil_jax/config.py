@@ -1,0 +1,165 @@
+"""What a run is: `Config` (static, decides shapes) and `Hyperparameters` (traced).
+
+Defaults are the paper's appendix where it gives a value, else OpenAI baselines', on
+which the paper's code was built.
+"""
+
+import dataclasses
+import difflib
+import math
+
+from flax import struct
+
+
+@struct.dataclass
+class Hyperparameters:
+    """Every float of the algorithms: a pytree, so a sweep is a `vmap` over leaves.
+
+    Attributes:
+      learning_rate: Adam's step size for policy and value.
+      learning_rate_decay: the share of the learning rate that is gone, linearly,
+        at the end of training: 1 anneals to 0, 0 keeps it constant.
+      gamma: discount factor.
+      gae_lambda: the lambda of generalized advantage estimation.
+      clip_epsilon: PPO's clip range of the probability ratio.
+      entropy_coefficient: the paper's lambda, weight of the policy's entropy.
+      value_coefficient: weight of the squared error of the value.
+      max_grad_norm: gradients are scaled down to this global norm, the policy's
+        and the value's each for itself.
+      alpha: scale of the discriminator's reward (paper, section 4.3).
+      discriminator_learning_rate: Adam's step size for the discriminator.
+      discriminator_entropy_coefficient: weight of the entropy of D's output.
+    """
+
+    learning_rate: float = 3e-4
+    learning_rate_decay: float = 1.0
+    gamma: float = 0.99
+    gae_lambda: float = 0.95
+    clip_epsilon: float = 0.2
+    entropy_coefficient: float = 0.0
+    value_coefficient: float = 1.0
+    max_grad_norm: float = 0.5
+    alpha: float = 0.1
+    discriminator_learning_rate: float = 1e-4
+    discriminator_entropy_coefficient: float = 1e-3
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Everything that changes shapes, loop counts or the program; hashable.
+
+    Attributes:
+      agent: name of the agent, see `gasil_jax.agents()`.
+      total_steps: environment steps a seed; rounded up to whole batches.
+      num_envs: environments a seed steps at once.
+      batch_steps: environment steps in an iteration, over all environments
+        (the paper's horizon).
+      num_epochs: passes of PPO over a batch.
+      minibatch_size: steps in one gradient step of PPO.
+      hidden_sizes: widths of the tanh layers of the policy and of the value.
+      buffer_steps: capacity of the good-trajectory buffer, in steps.
+      discriminator_updates: gradient steps of the discriminator an iteration.
+      discriminator_minibatch_size: policy steps, and as many good steps, in each.
+      discriminator_hidden_sizes: widths of the discriminator's tanh layers.
+      max_episode_steps: an episode is truncated after so many steps; None takes
+        the environment's own limit, or 1000 if it has none.
+      hyperparameters: the floats; `make_train` can replace them under a trace.
+    """
+
+    agent: str = "ppo+gasil"
+    total_steps: int = 1_000_000
+    num_envs: int = 16
+    batch_steps: int = 2048
+    num_epochs: int = 10
+    minibatch_size: int = 64
+    hidden_sizes: tuple[int, ...] = (64, 64)
+    buffer_steps: int = 1000
+    discriminator_updates: int = 5
+    discriminator_minibatch_size: int = 128
+    discriminator_hidden_sizes: tuple[int, ...] = (100, 100)
+    max_episode_steps: int | None = None
+    hyperparameters: Hyperparameters = dataclasses.field(
+        default_factory=Hyperparameters
+    )
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of each environment in an iteration."""
+        return self.batch_steps // self.num_envs
+
+    @property
+    def num_minibatches(self) -> int:
+        """Gradient steps of PPO in an epoch."""
+        return self.batch_steps // self.minibatch_size
+
+    @property
+    def num_iterations(self) -> int:
+        """Iterations of Algorithm 1 in a run."""
+        return math.ceil(self.total_steps / self.batch_steps)
+
+    def replace(self, **changes: object) -> "Config":
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+
+def nearest(name: str, allowed: tuple[str, ...]) -> str:
+    """The allowed name that is most like `name`."""
+    return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
+
+
+# name -> (lowest, highest, whether the lowest itself is allowed)
+_HYPERPARAMETER_RANGES = {
+    "learning_rate": (0.0, math.inf, False),
+    "learning_rate_decay": (0.0, 1.0, True),
+    "gamma": (0.0, 1.0, True),
+    "gae_lambda": (0.0, 1.0, True),
+    "clip_epsilon": (0.0, math.inf, False),
+    "entropy_coefficient": (0.0, math.inf, True),
+    "value_coefficient": (0.0, math.inf, True),
+    "max_grad_norm": (0.0, math.inf, False),
+    "alpha": (0.0, math.inf, True),
+    "discriminator_learning_rate": (0.0, math.inf, False),
+    "discriminator_entropy_coefficient": (0.0, math.inf, True),
+}
+
+
+def validate(config: Config, agents: tuple[str, ...]) -> None:
+    """Raise `ValueError`, naming the value and what is allowed, for a bad config.
+
+    Args:
+      config: what to check. Hyperparameters that are JAX arrays are not looked at:
+        they may be traced.
+      agents: the registered agents' names.
+    """
+    if config.agent not in agents:
+        raise ValueError(
+            f"agent {config.agent!r} is unknown: did you mean "
+            f"{nearest(config.agent, agents)!r}? (one of {', '.join(agents)})"
+        )
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if field.name in ("agent", "hyperparameters") or value is None:
+            continue
+        for number in value if isinstance(value, tuple) else (value,):
+            if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+                raise ValueError(
+                    f"{field.name} is {value}: it must be a whole number, 1 or more"
+                )
+    for whole, part in (("batch_steps", "num_envs"), ("batch_steps", "minibatch_size")):
+        total, size = getattr(config, whole), getattr(config, part)
+        if total % size:
+            divisors = [n for n in range(1, total + 1) if total % n == 0]
+            closest = min(divisors, key=lambda n: abs(n - size))
+            raise ValueError(
+                f"{part} is {size}, which does not divide {whole} {total}: "
+                f"the nearest that does is {closest}"
+            )
+    for name, (low, high, closed) in _HYPERPARAMETER_RANGES.items():
+        value = getattr(config.hyperparameters, name)
+        if not isinstance(value, int | float):
+            continue
+        above = value >= low if closed else value > low
+        if not (above and value <= high and math.isfinite(value)):
+            least = f"{low:g} or more" if closed else f"more than {low:g}"
+            most = "finite" if math.isinf(high) else f"at most {high:g}"
+            raise ValueError(f"{name} is {value}: it must be {least} and {most}")

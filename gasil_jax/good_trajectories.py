@@ -1,0 +1,228 @@
+"""The good-trajectory buffer: the steps of the top-K episodes, in fixed arrays.
+
+Paper, section 4.1. The capacity is in steps. All steps ever offered are ordered by
+(return descending, episode, time) and the first `capacity` are kept, so the last
+admitted episode may be cut; on a tie the older episode stays. An episode enters
+whole, once it has ended, with the discounted return R = sum_t gamma^t r_t of the
+environment's own reward. Pure functions on arrays: they work under jit, vmap and
+shard_map, and an empty buffer is a normal state.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+# Shape letters: C capacity in steps, E episodes on offer, H steps of history of an
+# environment, N environments.
+
+
+@struct.dataclass
+class GoodTrajectories:
+    """The best steps so far, best episode first, each in the order of time.
+
+    Attributes:
+      observation: float32 (C, obs), not normalized.
+      action: float32 (C, action).
+      return_: float32 (C,), the return of the step's episode; -inf where empty.
+      time: int32 (C,), the step's place in its episode.
+      size: int32 (), how many steps are filled, always the first ones.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    return_: jax.Array
+    time: jax.Array
+    size: jax.Array
+
+    @property
+    def capacity(self) -> int:
+        """Most steps that fit."""
+        return self.return_.shape[-1]
+
+
+@struct.dataclass
+class History:
+    """The last H steps of each environment, a ring over time.
+
+    Attributes:
+      observation: float32 (N, H, obs).
+      action: float32 (N, H, action).
+      cursor: int32 (), where the next step is written.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    cursor: jax.Array
+
+
+@struct.dataclass
+class Episodes:
+    """Ended episodes on offer; entries with ``length == 0`` are none.
+
+    Attributes:
+      return_: float32 (E,).
+      length: int32 (E,), steps.
+      env: int32 (E,), the environment it ran in.
+      last: int32 (E,), the place of its last step in the ring of its environment.
+    """
+
+    return_: jax.Array
+    length: jax.Array
+    env: jax.Array
+    last: jax.Array
+
+
+def init(capacity: int, observation_size: int, action_size: int) -> GoodTrajectories:
+    """An empty buffer."""
+    if capacity < 1:
+        raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
+    return GoodTrajectories(
+        observation=jnp.zeros((capacity, observation_size), jnp.float32),
+        action=jnp.zeros((capacity, action_size), jnp.float32),
+        return_=jnp.full(capacity, -jnp.inf, jnp.float32),
+        time=jnp.zeros(capacity, jnp.int32),
+        size=jnp.int32(0),
+    )
+
+
+def init_history(
+    num_envs: int,
+    num_steps: int,
+    max_episode_steps: int,
+    observation_size: int,
+    action_size: int,
+) -> History:
+    """A ring that holds any episode that ends within the last `num_steps` steps.
+
+    Its length is a multiple of `num_steps`, so that a batch is written in one piece.
+    """
+    batches = -(-(max_episode_steps + num_steps) // num_steps)
+    length = batches * num_steps
+    return History(
+        observation=jnp.zeros((num_envs, length, observation_size), jnp.float32),
+        action=jnp.zeros((num_envs, length, action_size), jnp.float32),
+        cursor=jnp.int32(0),
+    )
+
+
+def record(history: History, observation: jax.Array, action: jax.Array) -> History:
+    """Write a batch, (time, N, obs) and (time, N, action), over the oldest steps."""
+    chex.assert_equal_shape_prefix([observation, action], 2)
+    num_steps = observation.shape[0]
+    write = lambda ring, new: jax.lax.dynamic_update_slice_in_dim(
+        ring, jnp.swapaxes(new, 0, 1), history.cursor, axis=1
+    )
+    return History(
+        observation=write(history.observation, observation),
+        action=write(history.action, action),
+        cursor=(history.cursor + num_steps) % history.observation.shape[1],
+    )
+
+
+def ended_episodes(
+    history: History, ended: jax.Array, return_: jax.Array, length: jax.Array
+) -> Episodes:
+    """The episodes that ended in the batch that was recorded last, oldest first.
+
+    Args:
+      history: after `record` of that batch.
+      ended: bool (time, N), the episode ended with this step.
+      return_: float32 (time, N), the discounted return of the episode up to here.
+      length: int32 (time, N), its steps up to here.
+    """
+    chex.assert_equal_shape([ended, return_, length])
+    num_steps, num_envs = ended.shape
+    ring = history.observation.shape[1]
+    first = history.cursor - num_steps  # the batch's place in the ring
+    place = (first + jnp.arange(num_steps, dtype=jnp.int32)) % ring
+    env = jnp.arange(num_envs, dtype=jnp.int32)
+    return Episodes(
+        return_=return_.ravel(),
+        length=jnp.where(ended, length, 0).ravel(),
+        env=jnp.broadcast_to(env, ended.shape).ravel(),
+        last=jnp.broadcast_to(place[:, None], ended.shape).ravel(),
+    )
+
+
+def insert(
+    good_trajectories: GoodTrajectories, history: History, episodes: Episodes
+) -> GoodTrajectories:
+    """Keep the best `capacity` steps of the buffer and the ended episodes.
+
+    Sorts whole episodes, not steps, then gathers each kept step from where it is.
+    Episodes with a return that is not finite are refused; `record`ed steps that are
+    not finite must come with such a return.
+    """
+    capacity = good_trajectories.capacity
+    slot = jnp.arange(capacity, dtype=jnp.int32)
+    filled = slot < good_trajectories.size
+    # What is kept already, as episodes: one at each first step, else of length 0.
+    starts = filled & (good_trajectories.time == 0)
+    next_start = jnp.minimum(
+        jnp.flip(
+            jax.lax.cummin(jnp.flip(jnp.where(starts, slot, capacity)))
+        ),
+        good_trajectories.size,
+    )
+    # next_start[i] is the first start at or after i: the end of the one before.
+    following = jnp.append(next_start[1:], good_trajectories.size)
+    kept_length = jnp.where(
+        starts, jnp.minimum(following, good_trajectories.size) - slot, 0
+    )
+    offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
+    length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
+    return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
+    # Stable, and the kept ones come first: on a tie the older episode stays.
+    order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
+    end = jnp.cumsum(length[order])
+    size = jnp.minimum(end[-1], capacity)
+
+    rank = jnp.minimum(
+        jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1
+    )
+    source = order[rank]
+    time = slot - (end[rank] - length[order][rank])
+    is_kept = source < capacity
+    kept_index = jnp.where(is_kept, source + time, 0)
+    offer = jnp.where(is_kept, 0, source - capacity)
+    env = episodes.env[offer]
+    ring = history.observation.shape[1]
+    place = (episodes.last[offer] - episodes.length[offer] + 1 + time) % ring
+
+    filled = slot < size
+    gather = lambda kept, recorded: jnp.where(
+        filled[:, None],
+        jnp.where(is_kept[:, None], kept[kept_index], recorded[env, place]),
+        0.0,
+    )
+    return GoodTrajectories(
+        observation=gather(good_trajectories.observation, history.observation),
+        action=gather(good_trajectories.action, history.action),
+        return_=jnp.where(filled, return_[source], -jnp.inf),
+        time=jnp.where(filled, time, 0),
+        size=size,
+    )
+
+
+def sample(
+    key: jax.Array, good_trajectories: GoodTrajectories, num_samples: int
+) -> tuple[jax.Array, jax.Array]:
+    """Steps drawn uniformly with replacement: (samples, obs), (samples, action).
+
+    From an empty buffer the result is zeros; look at ``size`` before using it. The
+    key is consumed.
+    """
+    uniform = jax.random.uniform(key, (num_samples,))
+    index = (uniform * good_trajectories.size).astype(jnp.int32)
+    index = jnp.clip(index, 0, jnp.maximum(good_trajectories.size - 1, 0))
+    return good_trajectories.observation[index], good_trajectories.action[index]
+
+
+def mean_return(good_trajectories: GoodTrajectories) -> jax.Array:
+    """Mean over the kept steps of their episodes' return, (); NaN while empty."""
+    filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
+    total = jnp.sum(jnp.where(filled, good_trajectories.return_, 0.0))
+    return jnp.where(good_trajectories.size > 0, total, jnp.nan) / jnp.maximum(
+        good_trajectories.size, 1
+    )

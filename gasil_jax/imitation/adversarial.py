@@ -1,0 +1,165 @@
+"""Generative adversarial self-imitation (paper, section 4).
+
+Signs are the paper's. D(s, a) is the probability that the pair comes from the policy
+and not from the buffer; the discriminator ascends
+
+    E_pi[log D(s, a)] + E_B[log(1 - D(s, a))]
+
+and the policy is paid the bonus -alpha log D(s, a) >= 0, more for pairs that look
+like the buffer. Everything is computed from the logit l of D:
+log D = -softplus(-l), log(1 - D) = -softplus(l). The bonus is never negative, which
+favours long episodes (survival bias); the paper has it so.
+
+While the buffer is empty D does not train and the bonus is 0.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from gasil_jax import good_trajectories, normalization
+from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
+from gasil_jax.networks import Discriminator
+
+
+@struct.dataclass
+class AdversarialState:
+    """The discriminator's parameters and its optimizer's state."""
+
+    params: Any
+    optimizer_state: Any
+
+
+def bonus(logit: jax.Array, alpha: jax.Array) -> jax.Array:
+    """-alpha log D (paper, section 4.3) from the logit of D: (...) -> (...)."""
+    return alpha * jax.nn.softplus(-logit)
+
+
+def loss(
+    policy_logit: jax.Array, good_logit: jax.Array, entropy_coefficient: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """What the discriminator descends: minus the paper's objective (equation 7).
+
+    Args:
+      policy_logit: (minibatch,), logits of D on the policy's pairs.
+      good_logit: (minibatch,), logits of D on the buffer's pairs.
+      entropy_coefficient: weight of the entropy of D's output over both, which
+        keeps D from certainty (OpenAI baselines' GAIL).
+
+    Returns:
+      The loss, (), and its parts.
+    """
+    log_likelihood = -jnp.mean(jax.nn.softplus(-policy_logit)) - jnp.mean(
+        jax.nn.softplus(good_logit)
+    )
+    logits = jnp.concatenate([policy_logit, good_logit])
+    probability = jax.nn.sigmoid(logits)
+    entropy = jnp.mean(jax.nn.softplus(-logits) + (1.0 - probability) * logits)
+    metrics = {
+        "discriminator_loss": -log_likelihood,
+        "discriminator_policy_probability": jnp.mean(jax.nn.sigmoid(policy_logit)),
+        "discriminator_good_probability": jnp.mean(jax.nn.sigmoid(good_logit)),
+    }
+    return -log_likelihood - entropy_coefficient * entropy, metrics
+
+
+def _network(config: Config) -> Discriminator:
+    return Discriminator(config.discriminator_hidden_sizes)
+
+
+def _init(
+    key: jax.Array, config: Config, observation_size: int, action_size: int
+) -> AdversarialState:
+    params = _network(config).init(
+        key, jnp.zeros(observation_size), jnp.zeros(action_size)
+    )
+    return AdversarialState(params, optax.scale_by_adam().init(params))
+
+
+def _train_discriminator(
+    state: AdversarialState, context: Context, key: jax.Array
+) -> tuple[AdversarialState, Metrics]:
+    """`discriminator_updates` gradient steps, none of which count while B is empty."""
+    config: Config = context.config
+    hyperparameters: Hyperparameters = context.hyperparameters
+    network, transform = _network(config), optax.scale_by_adam()
+    rollout = context.rollout
+    observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
+    action = rollout.action.reshape(-1, rollout.action.shape[-1])
+    minibatch_size = config.discriminator_minibatch_size
+
+    def objective(params: Any, policy_pair: Any, good_pair: Any) -> Any:
+        return loss(
+            network.apply(params, *policy_pair),
+            network.apply(params, *good_pair),
+            hyperparameters.discriminator_entropy_coefficient,
+        )
+
+    def step(state: AdversarialState, key: jax.Array) -> Any:
+        policy_key, good_key = jax.random.split(key)
+        rows = jax.random.randint(
+            policy_key, (minibatch_size,), 0, observation.shape[0]
+        )
+        normalize = lambda x: normalization.normalize(context.normalizer, x)
+        good_observation, good_action = good_trajectories.sample(
+            good_key, context.good_trajectories, minibatch_size
+        )
+        gradient, metrics = jax.grad(objective, has_aux=True)(
+            state.params,
+            (normalize(observation[rows]), action[rows]),
+            (normalize(good_observation), good_action),
+        )
+        updates, optimizer_state = transform.update(gradient, state.optimizer_state)
+        params = jax.tree.map(
+            lambda p, u: p - hyperparameters.discriminator_learning_rate * u,
+            state.params,
+            updates,
+        )
+        return AdversarialState(params, optimizer_state), metrics
+
+    trained, metrics = jax.lax.scan(
+        step, state, jax.random.split(key, config.discriminator_updates)
+    )
+    has_good = context.good_trajectories.size > 0
+    state = jax.tree.map(lambda a, b: jnp.where(has_good, a, b), trained, state)
+    metrics = {
+        name: jnp.where(has_good, jnp.mean(value), jnp.nan)
+        for name, value in metrics.items()
+    }
+    return state, metrics
+
+
+def _update_and_reward(
+    combine: Callable[[jax.Array, jax.Array], jax.Array],
+) -> Callable[[AdversarialState, Context, jax.Array], Any]:
+    def update_and_reward(
+        state: AdversarialState, context: Context, key: jax.Array
+    ) -> tuple[AdversarialState, jax.Array, Metrics]:
+        state, metrics = _train_discriminator(state, context, key)
+        rollout = context.rollout
+        observation = normalization.normalize(context.normalizer, rollout.observation)
+        logit = _network(context.config).apply(
+            state.params, observation, rollout.action
+        )
+        shaped = jnp.where(
+            context.good_trajectories.size > 0,
+            bonus(logit, context.hyperparameters.alpha),
+            0.0,
+        )
+        metrics["bonus"] = jnp.mean(shaped)
+        return state, combine(rollout.reward, shaped), metrics
+
+    return update_and_reward
+
+
+#: r - alpha log D (section 4.3).
+PPO_GASIL = Imitation(
+    _init, _update_and_reward(lambda reward, bonus: reward + bonus), leave_policy
+)
+#: -alpha log D alone (Algorithm 1).
+GASIL = Imitation(_init, _update_and_reward(lambda reward, bonus: bonus), leave_policy)

@@ -1,0 +1,67 @@
+"""What the training loop asks of a way of imitating."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from flax import struct
+
+from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.normalization import Normalizer
+from gasil_jax.rollout import Rollout
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class Context:
+    """What an imitation module sees of an iteration.
+
+    Attributes:
+      rollout: the batch, (time, env, ...).
+      good_trajectories: the buffer, the batch's ended episodes in it.
+      normalizer: of the observations, as the policy used it in the batch.
+      hyperparameters: the floats.
+      config: the static configuration.
+    """
+
+    rollout: Rollout
+    good_trajectories: GoodTrajectories
+    normalizer: Normalizer
+    hyperparameters: Hyperparameters
+    config: Config = struct.field(pytree_node=False)
+
+
+class Imitation(NamedTuple):
+    """Pure functions; their state is a pytree that the loop carries.
+
+    Attributes:
+      init: (key, config, observation size, action size) -> state.
+      update_and_reward: (state, context, key) -> state, reward (time, env),
+        metrics. Learns from the batch, and gives the reward that PPO maximizes.
+      update_policy: (state, params, optimizer state, learning rate, context, key)
+        -> state, params, optimizer state, metrics. Gradient steps of its own on
+        the policy and value after PPO's.
+    """
+
+    init: Callable[[jax.Array, Config, int, int], Any]
+    update_and_reward: Callable[
+        [Any, Context, jax.Array], tuple[Any, jax.Array, Metrics]
+    ]
+    update_policy: Callable[
+        [Any, Any, Any, jax.Array, Context, jax.Array],
+        tuple[Any, Any, Any, Metrics],
+    ]
+
+
+def leave_policy(
+    state: Any,
+    params: Any,
+    optimizer_state: Any,
+    learning_rate: jax.Array,
+    context: Context,
+    key: jax.Array,
+) -> tuple[Any, Any, Any, Metrics]:
+    """An `update_policy` that takes no steps."""
+    return state, params, optimizer_state, {}

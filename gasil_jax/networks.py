@@ -1,0 +1,86 @@
+"""Policy, value and discriminator networks (Flax linen)."""
+
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+_LOG_2PI = 1.8378770664093453
+
+
+class MLP(nn.Module):
+    """Tanh layers and a linear output layer, orthogonally initialized.
+
+    Attributes:
+      hidden_sizes: widths of the tanh layers.
+      output_size: width of the output.
+      output_scale: scale of the output layer's initial weights.
+    """
+
+    hidden_sizes: Sequence[int]
+    output_size: int
+    output_scale: float = 1.0
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """(..., input) -> (..., output)."""
+        for size in self.hidden_sizes:
+            kernel_init = nn.initializers.orthogonal(jnp.sqrt(2.0))
+            x = nn.tanh(nn.Dense(size, kernel_init=kernel_init)(x))
+        kernel_init = nn.initializers.orthogonal(self.output_scale)
+        return nn.Dense(self.output_size, kernel_init=kernel_init)(x)
+
+
+class Policy(nn.Module):
+    """Gaussian policy with a log standard deviation that no state changes.
+
+    The last layer starts at scale 0.01, so that the first policy is nearly the same
+    everywhere (OpenAI baselines, ppo1).
+    """
+
+    hidden_sizes: Sequence[int]
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """(..., obs) -> mean (..., action), log standard deviation (action,)."""
+        mean = MLP(self.hidden_sizes, self.action_size, 0.01)(observation)
+        log_std = self.param("log_std", nn.initializers.zeros, (self.action_size,))
+        return mean, log_std
+
+
+class Value(nn.Module):
+    """State value."""
+
+    hidden_sizes: Sequence[int]
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """(..., obs) -> (...)."""
+        return MLP(self.hidden_sizes, 1)(observation)[..., 0]
+
+
+class Discriminator(nn.Module):
+    """The logit of D(s, a), the probability that the pair comes from the policy."""
+
+    hidden_sizes: Sequence[int]
+
+    @nn.compact
+    def __call__(self, observation: jax.Array, action: jax.Array) -> jax.Array:
+        """(..., obs), (..., action) -> (...)."""
+        x = jnp.concatenate([observation, action], axis=-1)
+        return MLP(self.hidden_sizes, 1)(x)[..., 0]
+
+
+def gaussian_log_prob(
+    mean: jax.Array, log_std: jax.Array, action: jax.Array
+) -> jax.Array:
+    """Log density of a diagonal Gaussian: (..., action) -> (...)."""
+    z = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
+
+
+def gaussian_entropy(log_std: jax.Array) -> jax.Array:
+    """Entropy of a diagonal Gaussian in nats: (..., action) -> (...)."""
+    return jnp.sum(log_std + 0.5 * (_LOG_2PI + 1.0), axis=-1)

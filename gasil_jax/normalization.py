@@ -1,0 +1,60 @@
+"""Running normalization of observations."""
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+
+@struct.dataclass
+class Normalizer:
+    """Mean and variance of all observations so far.
+
+    Attributes:
+      count: observations seen, float32 ().
+      mean: float32 (obs,).
+      m2: sum of squared differences from the mean, float32 (obs,).
+    """
+
+    count: jax.Array
+    mean: jax.Array
+    m2: jax.Array
+
+
+def init(observation_size: int) -> Normalizer:
+    """A normalizer that has seen nothing and changes nothing but the clip."""
+    zeros = jnp.zeros(observation_size, jnp.float32)
+    return Normalizer(jnp.float32(0), zeros, zeros)
+
+
+def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
+    """Take in a batch (..., obs); rows that are not finite are left out.
+
+    Chan, Golub, LeVeque 1979: parallel update of mean and sum of squares.
+    """
+    chex.assert_equal(observation.shape[-1:], normalizer.mean.shape)
+    rows = observation.reshape(-1, observation.shape[-1])
+    valid = jnp.all(jnp.isfinite(rows), axis=-1, keepdims=True)
+    rows = jnp.where(valid, rows, 0.0)
+    count = jnp.sum(valid, dtype=jnp.float32)
+    mean = jnp.sum(rows, axis=0) / jnp.maximum(count, 1.0)
+    m2 = jnp.sum(jnp.where(valid, (rows - mean) ** 2, 0.0), axis=0)
+    total = normalizer.count + count
+    delta = mean - normalizer.mean
+    share = count / jnp.maximum(total, 1.0)
+    return Normalizer(
+        count=total,
+        mean=normalizer.mean + delta * share,
+        m2=normalizer.m2 + m2 + delta**2 * normalizer.count * share,
+    )
+
+
+def normalize(
+    normalizer: Normalizer, observation: jax.Array, clip: float = 10.0
+) -> jax.Array:
+    """Observations (..., obs) at mean 0 and variance 1, clipped to +-`clip`."""
+    variance = jnp.where(
+        normalizer.count > 0, normalizer.m2 / jnp.maximum(normalizer.count, 1.0), 1.0
+    )
+    scaled = (observation - normalizer.mean) * jax.lax.rsqrt(variance + 1e-8)
+    return jnp.clip(scaled, -clip, clip)

@@ -1,0 +1,87 @@
+"""A live display of a run: a bar on a terminal, plain lines elsewhere."""
+
+import time
+from types import TracebackType
+
+import numpy as np
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    Progress as RichProgress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+_SECONDS_BETWEEN_LINES = 10.0
+
+
+class Progress:
+    """Shows steps, return (mean over seeds and spread), steps/s and time left."""
+
+    def __init__(self, title: str, total_steps: int):
+        self._console = Console(stderr=True)
+        self._title = title
+        self._total = total_steps
+        self._live = self._console.is_terminal
+        self._training_since = self._last_line = time.monotonic()
+        self._return = np.nan
+        self._spread = np.nan
+        self._bar = RichProgress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=self._console,
+            disable=not self._live,
+        )
+        self._task = self._bar.add_task(title, total=total_steps, status="")
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def phase(self, name: str) -> None:
+        """Say what is happening now."""
+        self._training_since = self._last_line = time.monotonic()
+        self._bar.update(self._task, status=name)
+        if not self._live:
+            self._line(name)
+
+    def update(self, steps: int, returns: np.ndarray) -> None:
+        """Show progress.
+
+        Args:
+          steps: environment steps so far, over all seeds.
+          returns: (seeds, iterations) of the last chunk, NaN where no episode ended.
+        """
+        per_seed = [row[np.isfinite(row)] for row in returns]
+        per_seed = [row.mean() for row in per_seed if row.size]
+        if per_seed:
+            self._return, self._spread = np.mean(per_seed), np.std(per_seed)
+        now = time.monotonic()
+        speed = steps / max(now - self._training_since, 1e-9)
+        status = (
+            f"{steps:,}/{self._total:,} steps, "
+            f"return {self._return:.1f} ± {self._spread:.1f}, {speed:,.0f} steps/s"
+        )
+        self._bar.update(self._task, completed=steps, status=status)
+        due = now - self._last_line > _SECONDS_BETWEEN_LINES or steps >= self._total
+        if not self._live and due:
+            self._last_line = now
+            left = (self._total - steps) / speed
+            self._line(f"{status}, {left:,.0f} s left")
+
+    def _line(self, text: str) -> None:
+        print(f"{self._title}: {text}", file=self._console.file, flush=True)

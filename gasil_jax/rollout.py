@@ -1,0 +1,174 @@
+"""Act in the environments for one batch, with the bookkeeping of episodes."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from gasil_jax.networks import gaussian_log_prob
+
+
+@struct.dataclass
+class Rollout:
+    """One batch of experience; every field is (time, env, ...).
+
+    Attributes:
+      observation: float32 (time, env, obs), before the action, not normalized.
+      next_observation: float32 (time, env, obs), after it, the final observation
+        of an episode that ended and not the start of the next.
+      action: float32 (time, env, action), as drawn from the policy.
+      log_prob: float32 (time, env), of the action when it was drawn.
+      reward: float32 (time, env), the environment's, delayed where it delays.
+      terminated: bool (time, env), the episode ended and had no future.
+      truncated: bool (time, env), it was cut off and its value is bootstrapped.
+      episode_return: float32 (time, env), sum of the true rewards up to here.
+      discounted_return: float32 (time, env), sum of gamma^t reward up to here;
+        NaN from the first number on that was not finite.
+      episode_length: int32 (time, env), steps up to here.
+      faulty: bool (time, env), the step gave a number that is not finite.
+    """
+
+    observation: jax.Array
+    next_observation: jax.Array
+    action: jax.Array
+    log_prob: jax.Array
+    reward: jax.Array
+    terminated: jax.Array
+    truncated: jax.Array
+    episode_return: jax.Array
+    discounted_return: jax.Array
+    episode_length: jax.Array
+    faulty: jax.Array
+
+    @property
+    def ended(self) -> jax.Array:
+        """The episode ended with this step, bool (time, env)."""
+        return self.terminated | self.truncated
+
+
+@struct.dataclass
+class EnvironmentStates:
+    """Running episodes; every field is (env, ...).
+
+    Attributes:
+      state: the environment's state, a Brax ``State``.
+      episode_return: float32 (env,), sum of the true rewards so far.
+      discounted_return: float32 (env,), sum of gamma^t reward so far.
+      discount: float32 (env,), gamma^t.
+      episode_length: int32 (env,), steps so far.
+    """
+
+    state: Any
+    episode_return: jax.Array
+    discounted_return: jax.Array
+    discount: jax.Array
+    episode_length: jax.Array
+
+
+def _strip_weak_types(tree: Any) -> Any:
+    # A weak type in the first state only would compile everything twice.
+    return jax.tree.map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), tree)
+
+
+def init(env: Any, key: jax.Array, num_envs: int) -> EnvironmentStates:
+    """Start an episode in each of `num_envs` environments. The key is consumed."""
+    state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    zeros = jnp.zeros(num_envs, jnp.float32)
+    return EnvironmentStates(
+        state=_strip_weak_types(state),
+        episode_return=zeros,
+        discounted_return=zeros,
+        discount=jnp.ones(num_envs, jnp.float32),
+        episode_length=jnp.zeros(num_envs, jnp.int32),
+    )
+
+
+def _is_finite(tree: Any) -> jax.Array:
+    leaves = jax.tree.leaves(tree)
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
+
+
+def collect(
+    env: Any,
+    policy: Any,
+    environments: EnvironmentStates,
+    key: jax.Array,
+    *,
+    num_steps: int,
+    max_episode_steps: int,
+    gamma: jax.Array,
+) -> tuple[EnvironmentStates, Rollout]:
+    """Take `num_steps` in each environment; an ended episode is followed by a fresh one.
+
+    Args:
+      env: a single environment with Brax's interface, not wrapped to reset itself.
+      policy: observation (env, obs) -> mean (env, action), log std (action,).
+      environments: the running episodes.
+      key: consumed.
+      num_steps: steps of each environment.
+      max_episode_steps: longer episodes are truncated.
+      gamma: discount of the episodes' return.
+
+    Physics that diverges (an observation or reward that is not finite) terminates
+    the episode with reward 0 and is reported in ``faulty``.
+    """
+    num_envs = environments.episode_length.shape[0]
+    low, high = getattr(env, "action_range", (-1.0, 1.0))
+
+    def step_one(state: Any, action: jax.Array, reset_key: jax.Array) -> Any:
+        stepped = env.step(state, jnp.clip(action, low, high))
+        return stepped, env.reset(reset_key)
+
+    def step(carry: EnvironmentStates, key: jax.Array) -> Any:
+        action_key, reset_key = jax.random.split(key)
+        observation = carry.state.obs
+        mean, log_std = policy(observation)
+        noise = jax.random.normal(action_key, mean.shape, mean.dtype)
+        action = mean + jnp.exp(log_std) * noise
+        reset_keys = jax.random.split(reset_key, num_envs)
+        stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
+
+        finite = jax.vmap(_is_finite)((stepped.obs, stepped.reward))
+        length = carry.episode_length + 1
+        reward = jnp.where(finite, stepped.reward, 0.0)
+        true_reward = jnp.where(
+            finite, stepped.info.get("true_reward", stepped.reward), 0.0
+        )
+        cut_off = stepped.info.get("truncation", jnp.zeros(num_envs)) > 0
+        done = stepped.done > 0
+        terminated = (done & ~cut_off) | ~finite
+        truncated = ~terminated & (cut_off | (length >= max_episode_steps))
+        ended = terminated | truncated
+
+        next_observation = jnp.where(finite[:, None], stepped.obs, 0.0)
+        episode_return = carry.episode_return + true_reward
+        discounted_return = carry.discounted_return + carry.discount * jnp.where(
+            finite, reward, jnp.nan
+        )
+        transition = Rollout(
+            observation=observation,
+            next_observation=next_observation,
+            action=action,
+            log_prob=gaussian_log_prob(mean, log_std, action),
+            reward=reward,
+            terminated=terminated,
+            truncated=truncated,
+            episode_return=episode_return,
+            discounted_return=discounted_return,
+            episode_length=length,
+            faulty=~finite,
+        )
+        select = lambda a, b: jnp.where(ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b)
+        carry = EnvironmentStates(
+            state=jax.tree.map(
+                lambda a, b: select(a, b).astype(b.dtype), fresh, stepped
+            ),
+            episode_return=jnp.where(ended, 0.0, episode_return),
+            discounted_return=jnp.where(ended, 0.0, discounted_return),
+            discount=jnp.where(ended, 1.0, carry.discount * gamma),
+            episode_length=jnp.where(ended, 0, length),
+        )
+        return carry, transition
+
+    return jax.lax.scan(step, environments, jax.random.split(key, num_steps))

@@ -1,0 +1,257 @@
+"""Command line: ``python -m gasil_jax.run --env walker2d --seeds 10``.
+
+Parses, drives the training loop in chunks, logs and saves. No algorithm is here.
+"""
+
+import contextlib
+import dataclasses
+import io
+import os
+import pathlib
+import re
+import sys
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from gasil_jax.config import Config, validate
+
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train an agent on an environment, many seeds at once.
+
+    Attributes:
+      env: environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
+        humanoid.
+      seeds: how many seeds.
+      first_seed: number of the first seed; a seed's result depends on its number
+        alone.
+      out: run folder, created here; default runs/ENV-AGENT-TIME.
+      reward_delay: give the accumulated reward every so many steps.
+      obs_noise: standard deviation of Gaussian noise on the observations.
+      devices: host devices that the seeds are sharded over; default the cores.
+      config: the algorithm.
+    """
+
+    env: str
+    seeds: int = 1
+    first_seed: int = 0
+    out: pathlib.Path | None = None
+    reward_delay: int = 1
+    obs_noise: float = 0.0
+    devices: int | None = None
+    config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=Config
+    )
+
+
+class InputError(Exception):
+    """Bad input, in one line."""
+
+
+def parse(arguments: Sequence[str] | None = None) -> Options:
+    """Options from the command line.
+
+    Raises:
+      InputError: what tyro refuses, its message in one line.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            return tyro.cli(
+                tyro.conf.OmitArgPrefixes[Options],
+                args=arguments,
+                prog="python -m gasil_jax.run",
+            )
+    except SystemExit as exit_:
+        if exit_.code in (0, None):
+            raise
+        text = re.sub(r"\x1b\[[0-9;]*m|[╭╮╰╯│─┌┐└┘]", " ", printed.getvalue())
+        lines = [" ".join(line.split()) for line in text.splitlines()]
+        message = " ".join(line for line in lines if line and set(line) - {"-", "+"})
+        raise InputError(message) from None
+
+
+def check(options: Options) -> None:
+    """Refuse bad input before anything compiles.
+
+    Raises:
+      InputError: the value and what is allowed.
+    """
+    import gasil_envs.registry
+
+    from gasil_jax.imitation import AGENTS
+
+    try:
+        gasil_envs.registry.check(
+            options.env,
+            reward_delay=options.reward_delay,
+            obs_noise=options.obs_noise,
+        )
+        validate(options.config, tuple(AGENTS))
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    if options.seeds < 1:
+        raise InputError(f"seeds is {options.seeds}: it must be 1 or more")
+    last = 2**32 - options.seeds
+    if not 0 <= options.first_seed <= last:
+        raise InputError(
+            f"first_seed is {options.first_seed}: it must be from 0 to {last}"
+        )
+    if options.devices is not None and options.devices < 1:
+        raise InputError(f"devices is {options.devices}: it must be 1 or more")
+
+
+def make_run_folder(options: Options) -> pathlib.Path:
+    """Create the run folder; one that holds anything is refused.
+
+    Raises:
+      InputError: it is used or can't be written.
+    """
+    folder = options.out
+    if folder is None:
+        stamp = time.strftime("%Y%m%d-%H%M%S")
+        folder = pathlib.Path("runs", f"{options.env}-{options.config.agent}-{stamp}")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if any(folder.iterdir()):
+            raise InputError(
+                f"out is {folder}, which is not empty: name a new or an empty folder"
+            )
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"out is {folder}, which can't be written: {error.strerror}"
+        ) from None
+    return folder
+
+
+def _use_devices(options: Options) -> None:
+    """Settings that must stand before JAX starts."""
+    import jax
+
+    count = options.devices or os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", min(count, options.seeds))
+    # TF32 has ruined PPO runs on Ampere and later GPUs.
+    jax.config.update("jax_default_matmul_precision", "highest")
+
+
+def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
+    """Train, log and save; returns the summary."""
+    import jax
+
+    from gasil_jax import environments, logging, plotting, sweep
+    from gasil_jax.progress import Progress
+
+    config = options.config
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
+    described |= {"out": str(folder), "config": dataclasses.asdict(config)}
+    logging.write_json(folder / "config.json", described)
+    env = environments.make_env(
+        options.env, reward_delay=options.reward_delay, obs_noise=options.obs_noise
+    )
+    chunk = max(1, min(100, config.num_iterations // 50))
+    total_steps = config.num_iterations * config.batch_steps * options.seeds
+    writer = logging.MetricsWriter(folder / "metrics.csv", seeds)
+    history: list[dict[str, np.ndarray]] = []
+    with Progress(f"{options.env} {config.agent}", total_steps) as progress:
+        progress.phase("compiling")
+        started = time.monotonic()
+        batch = sweep.make_seed_batch(env, config, seeds, chunk=chunk)
+        states = jax.block_until_ready(batch.init(batch.seeds))
+        advance = batch.advance.lower(states, np.int32(0)).compile()
+        compile_seconds = time.monotonic() - started
+
+        progress.phase("training")
+        started = time.monotonic()
+        done = 0
+        while done < config.num_iterations:
+            count = min(chunk, config.num_iterations - done)
+            states, metrics = advance(states, np.int32(count))
+            metrics = {
+                name: np.asarray(value)[: options.seeds, :count]
+                for name, value in metrics.items()
+            }
+            # float32 counts exactly only to 2**24.
+            steps = (np.arange(done, done + count) + 1) * config.batch_steps
+            metrics["env_steps"] = np.broadcast_to(steps, (options.seeds, count))
+            writer.write(metrics)
+            history.append(metrics)
+            done += count
+            progress.update(
+                done * config.batch_steps * options.seeds,
+                metrics["episode_return"],
+            )
+        train_seconds = time.monotonic() - started
+    writer.close()
+
+    returns = np.concatenate([m["episode_return"] for m in history], axis=1)
+    steps = np.concatenate([m["env_steps"][0] for m in history])
+    faulty = sum(m["faulty_steps"].sum(axis=1) for m in history)
+    plotting.learning_curve(
+        folder / "learning_curve.png", steps, returns, f"{options.env}, {config.agent}"
+    )
+    final = final_returns(returns)
+    summary = {
+        "env": options.env,
+        "agent": config.agent,
+        "env_steps_per_seed": int(steps[-1]),
+        "final_return": {
+            str(seed): None if np.isnan(value) else float(value)
+            for seed, value in zip(seeds, final, strict=True)
+        },
+        "final_return_mean": None if np.isnan(final).all() else float(np.nanmean(final)),
+        "faulty_steps": {
+            str(seed): int(n) for seed, n in zip(seeds, faulty, strict=True)
+        },
+        "compile_seconds": compile_seconds,
+        "train_seconds": train_seconds,
+        "env_steps_per_second": total_steps / train_seconds,
+        "device": f"{len(batch.devices)} x {batch.devices[0].device_kind}",
+        "versions": logging.versions(),
+    }
+    logging.write_json(folder / "summary.json", summary)
+    return summary
+
+
+def final_returns(returns: np.ndarray) -> np.ndarray:
+    """Each seed's mean return over the last tenth of iterations, (seeds,).
+
+    NaN where no episode ended in that time.
+    """
+    last = returns[:, -max(1, returns.shape[1] // 10) :]
+    count = np.isfinite(last).sum(axis=1)
+    total = np.nansum(last, axis=1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = parse(arguments)
+        check(options)
+        folder = make_run_folder(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    _use_devices(options)
+    summary = train(options, folder)
+    mean = summary["final_return_mean"]
+    print(
+        f"final return {'none ended' if mean is None else format(mean, '.1f')} "
+        f"(mean over {options.seeds} seeds), "
+        f"{summary['env_steps_per_second']:,.0f} steps/s, in {folder}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

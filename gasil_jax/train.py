@@ -1,0 +1,255 @@
+"""Algorithm 1 of the paper: `init`, `iterate`, and `make_train`, their composition.
+
+Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or over
+any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from gasil_jax import good_trajectories, normalization, ppo, rollout
+from gasil_jax.config import Config, Hyperparameters, validate
+from gasil_jax.imitation import AGENTS
+from gasil_jax.imitation.interface import Context
+from gasil_jax.networks import Policy, Value
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class TrainState:
+    """All that a run needs to go on, and nothing that it can do without.
+
+    Attributes:
+      params: {"policy": ..., "value": ...}.
+      optimizer_state: of both, the same keys.
+      normalizer: of observations.
+      environments: the running episodes, (env, ...).
+      history: the last steps of each environment, (env, steps, ...).
+      good_trajectories: the buffer B of the paper.
+      imitation: the state of the agent's way of imitating.
+      hyperparameters: the floats that this run trains with.
+      key: consumed by the next iteration.
+      iteration: int32 (), iterations done.
+    """
+
+    params: Any
+    optimizer_state: Any
+    normalizer: normalization.Normalizer
+    environments: rollout.EnvironmentStates
+    history: good_trajectories.History
+    good_trajectories: good_trajectories.GoodTrajectories
+    imitation: Any
+    hyperparameters: Hyperparameters
+    key: jax.Array
+    iteration: jax.Array
+
+
+def _max_episode_steps(env: Any, config: Config) -> int:
+    return config.max_episode_steps or getattr(env, "episode_length", 1000)
+
+
+def _apply(env: Any, config: Config) -> Callable[[Any, jax.Array], Any]:
+    """(params, normalized observation) -> mean, log std, value."""
+    policy = Policy(config.hidden_sizes, env.action_size)
+    value = Value(config.hidden_sizes)
+
+    def apply(params: Any, observation: jax.Array) -> Any:
+        mean, log_std = policy.apply(params["policy"], observation)
+        return mean, log_std, value.apply(params["value"], observation)
+
+    return apply
+
+
+def init(
+    env: Any,
+    config: Config,
+    key: jax.Array,
+    hyperparameters: Hyperparameters | None = None,
+) -> TrainState:
+    """The state before the first iteration. The key is consumed."""
+    if hyperparameters is None:
+        hyperparameters = config.hyperparameters
+    hyperparameters = jax.tree.map(
+        lambda x: jnp.asarray(x, jnp.float32), hyperparameters
+    )
+    key, policy_key, value_key, env_key, imitation_key = jax.random.split(key, 5)
+    observation_size, action_size = env.observation_size, env.action_size
+    observation = jnp.zeros(observation_size)
+    params = {
+        "policy": Policy(config.hidden_sizes, action_size).init(
+            policy_key, observation
+        ),
+        "value": Value(config.hidden_sizes).init(value_key, observation),
+    }
+    transform = ppo.optimizer(hyperparameters)
+    return TrainState(
+        params=params,
+        optimizer_state={name: transform.init(params[name]) for name in params},
+        normalizer=normalization.init(observation_size),
+        environments=rollout.init(env, env_key, config.num_envs),
+        history=good_trajectories.init_history(
+            config.num_envs,
+            config.num_steps,
+            _max_episode_steps(env, config),
+            observation_size,
+            action_size,
+        ),
+        good_trajectories=good_trajectories.init(
+            config.buffer_steps, observation_size, action_size
+        ),
+        imitation=AGENTS[config.agent].init(
+            imitation_key, config, observation_size, action_size
+        ),
+        hyperparameters=hyperparameters,
+        key=key,
+        iteration=jnp.int32(0),
+    )
+
+
+def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
+    """One iteration of Algorithm 1: a batch of experience and the updates from it.
+
+    Returns the next state and a dict of float32 scalars. Means over the episodes
+    that ended in the batch are NaN if none did.
+    """
+    agent, apply, hp = AGENTS[config.agent], _apply(env, config), state.hyperparameters
+    key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
+    normalize = lambda observation: normalization.normalize(
+        state.normalizer, observation
+    )
+    progress = state.iteration / config.num_iterations
+    learning_rate = hp.learning_rate * (1.0 - hp.learning_rate_decay * progress)
+
+    # Sample policy trajectories.
+    environments, batch = rollout.collect(
+        env,
+        lambda observation: apply(state.params, normalize(observation))[:2],
+        state.environments,
+        act_key,
+        num_steps=config.num_steps,
+        max_episode_steps=_max_episode_steps(env, config),
+        gamma=hp.gamma,
+    )
+    # Update the good trajectory buffer.
+    history = good_trajectories.record(state.history, batch.observation, batch.action)
+    episodes = good_trajectories.ended_episodes(
+        history, batch.ended, batch.discounted_return, batch.episode_length
+    )
+    buffer = good_trajectories.insert(state.good_trajectories, history, episodes)
+
+    # Update the discriminator, and shape the reward with it.
+    context = Context(
+        rollout=batch,
+        good_trajectories=buffer,
+        normalizer=state.normalizer,
+        hyperparameters=hp,
+        config=config,
+    )
+    imitation, reward, imitation_metrics = agent.update_and_reward(
+        state.imitation, context, imitate_key
+    )
+    # Update the policy.
+    observation = normalize(batch.observation)
+    value = apply(state.params, observation)[2]
+    next_value = apply(state.params, normalize(batch.next_observation))[2]
+    advantage = ppo.generalized_advantage_estimation(
+        reward,
+        value,
+        next_value,
+        batch.terminated,
+        batch.ended,
+        gamma=hp.gamma,
+        gae_lambda=hp.gae_lambda,
+    )
+    return_ = advantage + value
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    params, optimizer_state, ppo_metrics = ppo.update(
+        state.params,
+        state.optimizer_state,
+        ppo.Batch(
+            observation=flat(observation),
+            action=flat(batch.action),
+            log_prob=flat(batch.log_prob),
+            advantage=flat(
+                (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+            ),
+            return_=flat(return_),
+        ),
+        ppo_key,
+        apply=apply,
+        learning_rate=learning_rate,
+        config=config,
+        hyperparameters=hp,
+    )
+    imitation, params, optimizer_state, policy_metrics = agent.update_policy(
+        imitation, params, optimizer_state, learning_rate, context, policy_key
+    )
+
+    state = TrainState(
+        params=params,
+        optimizer_state=optimizer_state,
+        # Only now: within an iteration the policy that acts is the one that learns.
+        normalizer=normalization.update(state.normalizer, batch.observation),
+        environments=environments,
+        history=history,
+        good_trajectories=buffer,
+        imitation=imitation,
+        hyperparameters=hp,
+        key=key,
+        iteration=state.iteration + 1,
+    )
+    mean_of_ended = lambda x: jnp.sum(jnp.where(batch.ended, x, 0)) / jnp.sum(
+        batch.ended
+    )
+    metrics = {
+        "env_steps": (state.iteration * config.batch_steps).astype(jnp.float32),
+        "episode_return": mean_of_ended(batch.episode_return),
+        "episode_length": mean_of_ended(batch.episode_length),
+        "episodes": jnp.sum(batch.ended),
+        "faulty_steps": jnp.sum(batch.faulty),
+        "good_return": good_trajectories.mean_return(buffer),
+        "good_steps": buffer.size,
+        "explained_variance": 1.0
+        - jnp.var(return_ - value) / (jnp.var(return_) + 1e-8),
+        "learning_rate": learning_rate,
+        **ppo_metrics,
+        **imitation_metrics,
+        **policy_metrics,
+    }
+    return state, jax.tree.map(lambda x: x.astype(jnp.float32), metrics)
+
+
+def make_train(
+    env: Any, config: Config
+) -> Callable[[jax.Array, Hyperparameters | None], tuple[TrainState, Metrics]]:
+    """A pure function that trains from nothing to `config.total_steps`.
+
+    Args:
+      env: one environment with Brax's interface (`gasil_jax.make_env`, or any of
+        ``brax.envs``), not wrapped to reset itself.
+      config: what to run.
+
+    Returns:
+      ``train(key, hyperparameters=None) -> (TrainState, Metrics)``. The key is
+      consumed; metrics are (iterations,) each.
+
+    Raises:
+      ValueError: a bad configuration, before anything compiles.
+    """
+    validate(config, tuple(AGENTS))
+
+    def train(
+        key: jax.Array, hyperparameters: Hyperparameters | None = None
+    ) -> tuple[TrainState, Metrics]:
+        return jax.lax.scan(
+            lambda state, _: iterate(env, config, state),
+            init(env, config, key, hyperparameters),
+            length=config.num_iterations,
+        )
+
+    return train

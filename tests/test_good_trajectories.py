@@ -1,0 +1,158 @@
+"""The buffer against a plain Python list that does the same."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gasil_jax import good_trajectories
+
+CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
+
+
+class ListBuffer:
+    """All steps ever offered, sorted; the first `capacity` are the buffer."""
+
+    def __init__(self):
+        self.steps = []  # (-return, episode, time, observation)
+        self.episodes = 0
+
+    def insert(self, return_, observations):
+        if np.isfinite(return_):
+            self.steps += [
+                (-return_, self.episodes, time, observation)
+                for time, observation in enumerate(observations)
+            ]
+        self.episodes += 1
+        self.steps = sorted(self.steps)[:CAPACITY]
+
+
+@functools.partial(jax.jit)
+def push(buffer, history, observation, ended, return_, length):
+    action = -observation
+    history = good_trajectories.record(history, observation, action)
+    episodes = good_trajectories.ended_episodes(history, ended, return_, length)
+    return good_trajectories.insert(buffer, history, episodes), history
+
+
+def empty():
+    return (
+        good_trajectories.init(CAPACITY, 1, 1),
+        good_trajectories.init_history(NUM_ENVS, NUM_STEPS, MAX_EPISODE, 1, 1),
+    )
+
+
+step = st.tuples(
+    st.booleans(), st.sampled_from([-2.0, 0.0, 1.0, 1.5, float("nan"), float("inf")])
+)
+batches = st.lists(
+    st.lists(
+        st.lists(step, min_size=NUM_ENVS, max_size=NUM_ENVS),
+        min_size=NUM_STEPS,
+        max_size=NUM_STEPS,
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+def replay(batches):
+    """Play batches of (ends, return) into the buffer and into the list."""
+    buffer, history = empty()
+    reference = ListBuffer()
+    running = [[] for _ in range(NUM_ENVS)]
+    counter = 0.0
+    for batch in batches:
+        observation = np.zeros((NUM_STEPS, NUM_ENVS, 1), np.float32)
+        ended = np.zeros((NUM_STEPS, NUM_ENVS), bool)
+        return_ = np.zeros((NUM_STEPS, NUM_ENVS), np.float32)
+        length = np.zeros((NUM_STEPS, NUM_ENVS), np.int32)
+        for time, row in enumerate(batch):
+            for env, (ends, value) in enumerate(row):
+                counter += 1.0
+                observation[time, env] = counter
+                running[env].append(counter)
+                length[time, env] = len(running[env])
+                return_[time, env] = value
+                if ends or len(running[env]) == MAX_EPISODE:
+                    ended[time, env] = True
+                    reference.insert(value, running[env])
+                    running[env] = []
+        buffer, history = push(buffer, history, observation, ended, return_, length)
+    return buffer, reference
+
+
+@settings(max_examples=150, deadline=None)
+@given(batches)
+def test_buffer_equals_a_sorted_list(batches):
+    buffer, reference = replay(batches)
+    expected = reference.steps
+    size = int(buffer.size)
+    assert size == len(expected) <= CAPACITY
+    np.testing.assert_array_equal(buffer.return_[:size], [-s[0] for s in expected])
+    np.testing.assert_array_equal(buffer.time[:size], [s[2] for s in expected])
+    np.testing.assert_array_equal(
+        buffer.observation[:size, 0], [s[3] for s in expected]
+    )
+    np.testing.assert_array_equal(buffer.action, -buffer.observation)
+    assert np.all(np.isneginf(buffer.return_[size:]))
+    assert np.all(buffer.observation[size:] == 0)
+
+
+def batch_of(*rows):
+    return [[row, (False, 0.0)] for row in rows]
+
+
+def test_an_episode_that_spans_batches_enters_whole():
+    going, end = (False, 0.0), (True, 3.0)
+    buffer, _ = replay([batch_of(going, going, going), batch_of(end, going, going)])
+    np.testing.assert_array_equal(buffer.observation[:4, 0], [1, 3, 5, 7])
+
+
+def test_the_last_admitted_episode_is_cut_and_ties_go_to_the_older():
+    going, end = (False, 0.0), (True, 1.0)
+    buffer, reference = replay([batch_of(going, going, end)] * 3)
+    assert int(buffer.size) == CAPACITY
+    np.testing.assert_array_equal(buffer.time, [0, 1, 2, 0, 1, 2, 0])
+    np.testing.assert_array_equal(
+        buffer.observation[:, 0], [s[3] for s in reference.steps]
+    )
+
+
+def test_an_empty_buffer_samples_zeros_and_never_nan():
+    buffer, _ = empty()
+    observation, action = good_trajectories.sample(jax.random.key(0), buffer, 5)
+    assert observation.shape == action.shape == (5, 1)
+    assert np.all(np.asarray(observation) == 0)
+
+
+def test_samples_come_uniformly_from_the_filled_part():
+    buffer, _ = replay([batch_of((False, 0.0), (False, 0.0), (True, 1.0))])
+    observation, _ = good_trajectories.sample(jax.random.key(0), buffer, 3000)
+    values, counts = np.unique(np.asarray(observation), return_counts=True)
+    np.testing.assert_array_equal(values, [1, 3, 5])
+    assert np.all(np.abs(counts - 1000) < 150)
+
+
+def test_vmapped_insertion_equals_one_by_one():
+    rng = np.random.default_rng(0)
+    members = 3
+    observation = rng.normal(size=(members, NUM_STEPS, NUM_ENVS, 1)).astype(np.float32)
+    ended = rng.random((members, NUM_STEPS, NUM_ENVS)) < 0.6
+    return_ = rng.normal(size=ended.shape).astype(np.float32)
+    length = np.ones(ended.shape, np.int32)
+    buffer, history = empty()
+    repeat = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * members), tree)
+    batched, _ = jax.vmap(push)(
+        repeat(buffer), repeat(history), observation, ended, return_, length
+    )
+    for i in range(members):
+        alone, _ = push(
+            buffer, history, observation[i], ended[i], return_[i], length[i]
+        )
+        jax.tree.map(
+            lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), batched, alone
+        )

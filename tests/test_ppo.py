@@ -1,0 +1,89 @@
+"""GAE and the PPO loss against plain NumPy."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gasil_jax import ppo
+from gasil_jax.config import Hyperparameters
+
+
+def test_gae_equals_a_plain_loop():
+    rng = np.random.default_rng(0)
+    shape, gamma, lam = (9, 3), 0.97, 0.9
+    reward, value, next_value = rng.normal(size=(3, *shape)).astype(np.float32)
+    terminated = rng.random(shape) < 0.2
+    truncated = ~terminated & (rng.random(shape) < 0.2)
+    ended = terminated | truncated
+    expected = np.zeros(shape)
+    for env in range(shape[1]):
+        for start in range(shape[0]):
+            weight = 1.0
+            for t in range(start, shape[0]):
+                future = 0.0 if terminated[t, env] else gamma * next_value[t, env]
+                delta = reward[t, env] + future - value[t, env]
+                expected[start, env] += weight * delta
+                weight *= gamma * lam
+                if ended[t, env]:
+                    break
+    result = ppo.generalized_advantage_estimation(
+        reward, value, next_value, terminated, ended, gamma=gamma, gae_lambda=lam
+    )
+    np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("terminated", [False, True])
+def test_truncation_bootstraps_and_termination_does_not(terminated):
+    one = jnp.ones((1, 1))
+    advantage = ppo.generalized_advantage_estimation(
+        one, 0 * one, 10 * one, one == terminated, one == 1, gamma=0.9, gae_lambda=0.5
+    )
+    np.testing.assert_allclose(advantage, 1.0 if terminated else 10.0)
+
+
+def test_loss_equals_numpy():
+    rng = np.random.default_rng(1)
+    n, size = 16, 3
+    action, mean = rng.normal(size=(2, n, size))
+    log_std = rng.normal(size=size) * 0.3
+    value, advantage, return_ = rng.normal(size=(3, n))
+    log_prob = np.array(
+        [
+            sum(
+                -0.5 * ((a - m) / np.exp(s)) ** 2 - s - 0.5 * np.log(2 * np.pi)
+                for a, m, s in zip(row, means, log_std, strict=True)
+            )
+            for row, means in zip(action, mean, strict=True)
+        ]
+    )
+    old = log_prob + rng.normal(size=n) * 0.3
+    hp = Hyperparameters(
+        clip_epsilon=0.2, entropy_coefficient=0.01, value_coefficient=0.7
+    )
+    surrogate = []
+    for ratio, adv in zip(np.exp(log_prob - old), advantage, strict=True):
+        surrogate.append(min(ratio * adv, min(max(ratio, 0.8), 1.2) * adv))
+    entropy = sum(s + 0.5 * np.log(2 * np.pi * np.e) for s in log_std)
+    squared = np.mean((value - return_) ** 2)
+    expected = -np.mean(surrogate) + 0.7 * 0.5 * squared - 0.01 * entropy
+    batch = ppo.Batch(
+        *(jnp.asarray(x, jnp.float32) for x in (mean, action, old, advantage, return_))
+    )
+    apply = lambda params, observation: (
+        observation,
+        jnp.asarray(log_std, jnp.float32),
+        jnp.asarray(value, jnp.float32),
+    )
+    total, metrics = ppo.loss(None, batch, apply=apply, hyperparameters=hp)
+    np.testing.assert_allclose(total, expected, rtol=1e-5)
+    kl = np.mean(np.exp(log_prob - old) - 1 - (log_prob - old))
+    np.testing.assert_allclose(metrics["approx_kl"], kl, rtol=1e-4)
+
+
+def test_the_gradient_step_of_one_network_ignores_the_size_of_the_others():
+    """Each network's gradient is clipped for itself."""
+    transform = ppo.optimizer(Hyperparameters(max_grad_norm=1.0))
+    gradient = {"w": jnp.array([3.0, 4.0])}
+    updates, _ = transform.update(gradient, transform.init(gradient))
+    assert jax.tree.all(jax.tree.map(lambda u: jnp.all(jnp.isfinite(u)), updates))

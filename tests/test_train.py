@@ -1,0 +1,92 @@
+"""The training loop on the point mass."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gasil_jax
+
+SMALL = gasil_jax.Config(
+    total_steps=512,
+    num_envs=4,
+    batch_steps=256,
+    minibatch_size=64,
+    num_epochs=2,
+    hidden_sizes=(16,),
+    discriminator_hidden_sizes=(16,),
+    discriminator_updates=2,
+    buffer_steps=100,
+)
+
+
+@functools.cache
+def trainer(agent="ppo+gasil"):
+    env = gasil_jax.make_env("point_mass")
+    return jax.jit(gasil_jax.make_train(env, SMALL.replace(agent=agent)))
+
+
+@pytest.mark.parametrize("agent", gasil_jax.agents())
+def test_every_agent_trains_without_a_nan(agent):
+    state, metrics = trainer(agent)(jax.random.key(0), SMALL.hyperparameters)
+    assert int(state.iteration) == 2
+    for leaf in jax.tree.leaves((state.params, state.imitation)):
+        assert np.all(np.isfinite(leaf))
+    assert np.all(np.isfinite(metrics["policy_loss"]))
+    assert int(state.good_trajectories.size) == 100
+
+
+def test_one_seed_alone_equals_the_same_seed_in_a_batch_of_ten():
+    env = gasil_jax.make_env("point_mass")
+    train = gasil_jax.make_train(env, SMALL)
+    keys = jax.vmap(jax.random.key)(jnp.arange(10))
+    batch = jax.jit(jax.vmap(train))(keys)[1]
+    alone = trainer()(jax.random.key(7), SMALL.hyperparameters)[1]
+    for name in alone:
+        np.testing.assert_allclose(
+            batch[name][7], alone[name], rtol=2e-4, atol=2e-4, err_msg=name
+        )
+
+
+def test_vmap_over_a_hyperparameter_equals_single_runs():
+    env = gasil_jax.make_env("point_mass")
+    train = gasil_jax.make_train(env, SMALL)
+    key = jax.random.key(0)
+    with_alpha = lambda a: SMALL.hyperparameters.replace(alpha=a)
+    alphas = jnp.array([0.02, 1.0])
+    _, swept = jax.jit(jax.vmap(lambda a: train(key, with_alpha(a))))(alphas)
+    for i, alpha in enumerate(alphas):
+        _, single = trainer()(key, with_alpha(float(alpha)))
+        np.testing.assert_allclose(
+            swept["bonus"][i], single["bonus"], rtol=1e-3, atol=1e-5
+        )
+    assert np.all(swept["bonus"][1] > swept["bonus"][0])
+
+
+@pytest.mark.parametrize("agent", ["ppo", "ppo+gasil"])
+def test_it_learns_on_the_point_mass(agent):
+    env = gasil_jax.make_env("point_mass")
+    config = gasil_jax.Config(agent=agent, total_steps=24 * 2048)
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    _, metrics = jax.jit(jax.vmap(gasil_jax.make_train(env, config)))(keys)
+    returns = np.asarray(metrics["episode_return"])
+    assert np.all(returns[:, -3:].mean(1) > returns[:, :3].mean(1) + 3.0)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agent": "ppo+gasill"}, "'ppo+gasil'"),
+        ({"num_envs": 0}, "num_envs is 0"),
+        ({"minibatch_size": 60}, "nearest that does is"),
+        ({"num_envs": 3}, "num_envs is 3"),
+        ({"hyperparameters": gasil_jax.Hyperparameters(alpha=-1.0)}, "alpha is -1.0"),
+        ({"hyperparameters": gasil_jax.Hyperparameters(gamma=1.5)}, "gamma is 1.5"),
+    ],
+)
+def test_a_bad_configuration_is_refused(change, message):
+    env = gasil_jax.make_env("point_mass")
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.make_train(env, SMALL.replace(**change))
