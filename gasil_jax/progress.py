@@ -7,11 +7,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import (
     BarColumn,
-    Progress as RichProgress,
     SpinnerColumn,
     TextColumn,
     TimeElapsedColumn,
     TimeRemainingColumn,
+)
+from rich.progress import (
+    Progress as RichProgress,
 )
 
 _SECONDS_BETWEEN_LINES = 10.0

@@ -20,7 +20,6 @@ import tyro
 from gasil_jax.config import Config, validate
 
 
-
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Train an agent on an environment, many seeds at once.
@@ -84,7 +83,6 @@ def check(options: Options) -> None:
       InputError: the value and what is allowed.
     """
     import gasil_envs.registry
-
     from gasil_jax.imitation import AGENTS
 
     try:
