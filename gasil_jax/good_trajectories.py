@@ -160,9 +160,7 @@ def insert(
     # What is kept already, as episodes: one at each first step, else of length 0.
     starts = filled & (good_trajectories.time == 0)
     next_start = jnp.minimum(
-        jnp.flip(
-            jax.lax.cummin(jnp.flip(jnp.where(starts, slot, capacity)))
-        ),
+        jnp.flip(jax.lax.cummin(jnp.flip(jnp.where(starts, slot, capacity)))),
         good_trajectories.size,
     )
     # next_start[i] is the first start at or after i: the end of the one before.
@@ -178,9 +176,7 @@ def insert(
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
 
-    rank = jnp.minimum(
-        jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1
-    )
+    rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]
     time = slot - (end[rank] - length[order][rank])
     is_kept = source < capacity

@@ -99,7 +99,7 @@ def collect(
     max_episode_steps: int,
     gamma: jax.Array,
 ) -> tuple[EnvironmentStates, Rollout]:
-    """Take `num_steps` in each environment; an ended episode is followed by a fresh one.
+    """Take `num_steps` in each environment; a fresh episode follows an ended one.
 
     Args:
       env: a single environment with Brax's interface, not wrapped to reset itself.
@@ -159,7 +159,9 @@ def collect(
             episode_length=length,
             faulty=~finite,
         )
-        select = lambda a, b: jnp.where(ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b)
+        select = lambda a, b: jnp.where(
+            ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b
+        )
         carry = EnvironmentStates(
             state=jax.tree.map(
                 lambda a, b: select(a, b).astype(b.dtype), fresh, stepped

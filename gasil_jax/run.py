@@ -206,7 +206,9 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
             str(seed): None if np.isnan(value) else float(value)
             for seed, value in zip(seeds, final, strict=True)
         },
-        "final_return_mean": None if np.isnan(final).all() else float(np.nanmean(final)),
+        "final_return_mean": None
+        if np.isnan(final).all()
+        else float(np.nanmean(final)),
         "faulty_steps": {
             str(seed): int(n) for seed, n in zip(seeds, faulty, strict=True)
         },

@@ -175,9 +175,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
             observation=flat(observation),
             action=flat(batch.action),
             log_prob=flat(batch.log_prob),
-            advantage=flat(
-                (advantage - advantage.mean()) / (advantage.std() + 1e-8)
-            ),
+            advantage=flat((advantage - advantage.mean()) / (advantage.std() + 1e-8)),
             return_=flat(return_),
         ),
         ppo_key,
@@ -203,8 +201,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         key=key,
         iteration=state.iteration + 1,
     )
-    mean_of_ended = lambda x: jnp.sum(jnp.where(batch.ended, x, 0)) / jnp.sum(
-        batch.ended
+    mean_of_ended = lambda x: (
+        jnp.sum(jnp.where(batch.ended, x, 0)) / jnp.sum(batch.ended)
     )
     metrics = {
         "env_steps": (state.iteration * config.batch_steps).astype(jnp.float32),

@@ -13,9 +13,9 @@ def test_gradient_is_the_papers():
     policy, good = rng.normal(size=(2, 6, 4))
     w = rng.normal(size=4)
     sigmoid = lambda x: 1 / (1 + np.exp(-x))
-    ascent = np.mean(
-        [(1 - sigmoid(x @ w)) * x for x in policy], axis=0
-    ) + np.mean([-sigmoid(x @ w) * x for x in good], axis=0)
+    ascent = np.mean([(1 - sigmoid(x @ w)) * x for x in policy], axis=0) + np.mean(
+        [-sigmoid(x @ w) * x for x in good], axis=0
+    )
     descent = jax.grad(
         lambda w: adversarial.loss(
             jnp.asarray(policy, jnp.float32) @ w,

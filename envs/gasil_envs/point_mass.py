@@ -103,9 +103,7 @@ class PointMass(Env):
         """Move and collect."""
         action = jnp.clip(action, -1.0, 1.0)
         before = state.pipeline_state
-        position = jnp.clip(
-            before.position + self.layout.max_speed * action, -1.0, 1.0
-        )
+        position = jnp.clip(before.position + self.layout.max_speed * action, -1.0, 1.0)
         distance = jnp.linalg.norm(position - self.objects, axis=-1)
         found = (distance <= self.layout.radius) & ~before.collected
         pipeline_state = PointMassState(position, before.collected | found)
