@@ -2,8 +2,10 @@
 
 import csv
 import dataclasses
+import importlib.metadata
 import json
 import pathlib
+import platform
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -26,15 +28,20 @@ COLUMNS = (
 )
 
 
-def versions() -> dict[str, str]:
-    """Versions of what a result depends on."""
-    import importlib.metadata as metadata
-    import platform
-
+def versions() -> dict[str, str | None]:
+    """Versions of what a result depends on; None for what isn't installed."""
     packages = ("gasil_jax", "jax", "jaxlib", "flax", "optax", "brax")
     packages += ("mujoco", "mujoco-mjx", "gymnasium", "numpy")
-    found = {name: metadata.version(name) for name in packages}
-    return {"python": platform.python_version(), **found}
+    return {"python": platform.python_version()} | {
+        name: _version(name) for name in packages
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:

@@ -1,12 +1,30 @@
 """Policy, value and discriminator networks (Flax linen)."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
 _LOG_2PI = 1.8378770664093453
+
+
+def orthogonal(scale: float) -> nn.initializers.Initializer:
+    """Flax's orthogonal initializer, one matrix at a time also under `jax.vmap`.
+
+    Several batched QR factorizations in one program can deadlock jaxlib 0.10.1 on
+    CPU; single ones in a loop can't.
+    """
+    initializer = nn.initializers.orthogonal(scale)
+
+    def init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Any:
+        one = jax.custom_batching.sequential_vmap(
+            lambda data: initializer(jax.random.wrap_key_data(data), shape, dtype)
+        )
+        return one(jax.random.key_data(key))
+
+    return init
 
 
 class MLP(nn.Module):
@@ -26,9 +44,9 @@ class MLP(nn.Module):
     def __call__(self, x: jax.Array) -> jax.Array:
         """(..., input) -> (..., output)."""
         for size in self.hidden_sizes:
-            kernel_init = nn.initializers.orthogonal(jnp.sqrt(2.0))
+            kernel_init = orthogonal(2.0**0.5)
             x = nn.tanh(nn.Dense(size, kernel_init=kernel_init)(x))
-        kernel_init = nn.initializers.orthogonal(self.output_scale)
+        kernel_init = orthogonal(self.output_scale)
         return nn.Dense(self.output_size, kernel_init=kernel_init)(x)
 
 

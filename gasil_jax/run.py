@@ -70,10 +70,26 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
     except SystemExit as exit_:
         if exit_.code in (0, None):
             raise
-        text = re.sub(r"\x1b\[[0-9;]*m|[╭╮╰╯│─┌┐└┘]", " ", printed.getvalue())
-        lines = [" ".join(line.split()) for line in text.splitlines()]
-        message = " ".join(line for line in lines if line and set(line) - {"-", "+"})
-        raise InputError(message) from None
+        raise InputError(_in_one_line(printed.getvalue())) from None
+
+
+def _in_one_line(refusal: str) -> str:
+    """What a framed message of tyro says, without frame, title and pointers."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
+    framed = [line.strip(" │|") for line in text.splitlines() if line[:1] in "│|"]
+    lines = [line for line in framed if set(line) - set("-─+ ")]
+    message = " ".join(" ".join(lines).split())
+    message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
+    number = re.match(
+        r"Error parsing --([\w-]+): (?:invalid literal for (int)|could not convert)"
+        r".*: '(.*)'$",
+        message,
+    )
+    if number is None:
+        return message
+    name, whole, value = number.groups()
+    kind = "a whole number" if whole else "a number"
+    return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
 def check(options: Options) -> None:

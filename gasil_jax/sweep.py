@@ -90,13 +90,6 @@ def make_seed_batch(
         function, mesh=mesh, in_specs=in_specs, out_specs=P("seeds"), check_vma=False
     )
     sharding = NamedSharding(mesh, P("seeds"))
-
-    # Not sharded: jaxlib 0.10.1 never returns from a sharded program that holds
-    # several batched QR factorizations, and orthogonal initialization is that.
-    init_all = jax.jit(jax.vmap(init_one))
-
-    def init(seeds: np.ndarray) -> Any:
-        return jax.device_put(init_all(seeds), sharding)
-
+    init = jax.jit(shard(jax.vmap(init_one), P("seeds")), in_shardings=sharding)
     advance = jax.jit(shard(advance, (P("seeds"), P())), donate_argnums=0)
     return SeedBatch(len(seeds), init, advance, padded, devices)

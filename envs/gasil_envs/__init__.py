@@ -5,6 +5,13 @@
 what there is. Nothing here imports ``gasil_jax``.
 """
 
+import contextlib
+import io
+
+# MJX prints at its first import that its optional Warp backend is absent.
+with contextlib.redirect_stdout(io.StringIO()):
+    import mujoco.mjx  # noqa: F401
+
 from gasil_envs.registry import make, names
 
 __all__ = ["make", "names"]

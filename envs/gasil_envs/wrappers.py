@@ -81,7 +81,7 @@ class RewardDelay(Wrapper):
 class ObservationNoise(Wrapper):
     """Add independent Gaussian noise to every observation (paper, section 5.3).
 
-    Physics and reward do not see it.
+    Physics and reward do not see it; ``info["true_observation"]`` is without noise.
     """
 
     def __init__(self, env: Env, standard_deviation: float):
@@ -93,7 +93,7 @@ class ObservationNoise(Wrapper):
         noise = jax.random.normal(noise_key, state.obs.shape, state.obs.dtype)
         return state.replace(
             obs=state.obs + self.standard_deviation * noise,
-            info={**state.info, "noise_key": key},
+            info={**state.info, "noise_key": key, "true_observation": state.obs},
         )
 
     def reset(self, rng: jax.Array) -> State:
@@ -104,6 +104,8 @@ class ObservationNoise(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and add fresh noise to the observation."""
         noise_key = state.info["noise_key"]
+        # An environment may build on its last observation: it gets its own back.
+        state = state.replace(obs=state.info["true_observation"])
         return self._noisy(self.env.step(state, action), noise_key)
 
 

@@ -1,0 +1,148 @@
+"""Every environment under jit and vmap, and one step of each against Gymnasium."""
+
+import functools
+
+import chex
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gasil_envs
+from gasil_envs import locomotion, point_mass
+
+GYMNASIUM_NAMES = {
+    "hopper": "Hopper-v5",
+    "walker2d": "Walker2d-v5",
+    "halfcheetah": "HalfCheetah-v5",
+    "swimmer": "Swimmer-v5",
+    "ant": "Ant-v5",
+    "humanoid": "Humanoid-v5",
+}
+BATCH = 32
+STRIDE = 2  # of the steps in Gymnasium that are compared, so that falls are among them
+
+
+@functools.cache
+def env_and_functions(name):
+    """The environment, and its jitted and vmapped reset and step."""
+    env = gasil_envs.make(name)
+    return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+
+
+def test_every_task_is_compared_with_gymnasium():
+    assert set(GYMNASIUM_NAMES) == set(locomotion.TASKS)
+    assert set(gasil_envs.names()) == {"point_mass", *GYMNASIUM_NAMES}
+
+
+@pytest.mark.parametrize("name", gasil_envs.names())
+def test_reset_and_step_under_jit_and_vmap(name):
+    env, reset, step = env_and_functions(name)
+    state = reset(jax.random.split(jax.random.key(0), BATCH))
+    assert state.obs.shape == (BATCH, env.observation_size)
+    assert len(np.unique(state.obs, axis=0)) == BATCH  # each start is its own
+    action = jax.random.uniform(
+        jax.random.key(1), (BATCH, env.action_size), minval=-0.4, maxval=0.4
+    )
+    following = step(state, action)
+    chex.assert_trees_all_equal_shapes_and_dtypes(state, following)
+    assert following.obs.dtype == jnp.float32
+    assert following.reward.shape == following.done.shape == (BATCH,)
+    assert np.all(np.isfinite(following.obs)) and np.all(np.isfinite(following.reward))
+    assert not np.any(following.done)
+    assert not np.array_equal(state.obs, following.obs)
+
+
+@functools.cache
+def gymnasium_transitions(name, count):
+    """Steps of a random policy in Gymnasium, falls and contacts among them."""
+    env = gymnasium.make(GYMNASIUM_NAMES[name]).unwrapped
+    env.action_space.seed(0)
+    observation, _ = env.reset(seed=0)
+    steps = []
+    for _ in range(count * STRIDE):
+        data = env.data
+        before = [data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()]
+        action = env.action_space.sample()
+        observation, reward, terminated, *_ = env.step(action)
+        steps.append((*before, action, observation, reward, terminated))
+        if terminated:
+            env.reset()
+    return tuple(np.stack(column) for column in zip(*steps[::STRIDE]))
+
+
+@pytest.mark.parametrize("name", GYMNASIUM_NAMES)
+def test_one_step_is_gymnasiums(name):
+    env, _, step = env_and_functions(name)
+    transitions = gymnasium_transitions(name, BATCH)
+    qpos, qvel, warmstart, action = (
+        jnp.asarray(x, jnp.float32) for x in transitions[:4]
+    )
+    observation, reward, terminated = transitions[4:]
+    assert terminated.any() or name in ("halfcheetah", "swimmer", "ant")
+
+    def state_at(qpos, qvel, warmstart):
+        state = env.env.state_at(qpos, qvel)
+        physics = state.pipeline_state.physics.replace(qacc_warmstart=warmstart)
+        inner = state.pipeline_state.replace(physics=physics)
+        info = {"steps": jnp.int32(0), "truncation": jnp.float32(0)}
+        return state.replace(pipeline_state=inner, info=info)
+
+    state = step(jax.jit(jax.vmap(state_at))(qpos, qvel, warmstart), action)
+    error = np.abs(state.obs - observation) / (1.0 + np.abs(observation))
+    assert np.median(error.max(axis=1)) < 1e-5
+    assert np.median(np.abs(state.reward - reward) / (1.0 + np.abs(reward))) < 5e-4
+    np.testing.assert_array_equal(state.done, terminated)
+
+
+def test_point_mass_against_a_plain_python_twin():
+    env = gasil_envs.make("point_mass")
+    layout = env.env.layout
+    step = jax.jit(env.step)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    objects = [(p, layout.blue_reward) for p in layout.blue]
+    objects += [(p, layout.green_reward) for p in layout.green]
+    objects += [(p, layout.orange_reward) for p in layout.orange]
+    position = np.array(state.obs[:2], np.float64)
+    left = [True] * len(objects)
+    total = collected = 0.0
+    rng = np.random.default_rng(1)
+    target = 0
+    for t in range(layout.episode_length):
+        # From object to object, with noise, beyond the limits now and then.
+        if not left[target]:
+            target = (target + 3) % len(objects)
+        action = 3.0 * (np.array(objects[target][0]) - position)
+        action = (action + rng.normal(size=2)).astype(np.float32)
+        limited = np.clip(action, -1.0, 1.0)
+        position = np.clip(position + layout.max_speed * limited, -1.0, 1.0)
+        reward = -layout.actuation_cost * np.sqrt(np.sum(limited**2))
+        for i, (place, value) in enumerate(objects):
+            if left[i] and np.hypot(*(position - place)) <= layout.radius:
+                left[i] = False
+                reward += value
+                collected += 1
+        state = step(state, jnp.asarray(action))
+        np.testing.assert_allclose(state.obs[:2], position, atol=1e-5)
+        np.testing.assert_array_equal(state.obs[2:], np.array(left, np.float32))
+        np.testing.assert_allclose(state.reward, reward, atol=1e-5)
+        last = t == layout.episode_length - 1
+        assert bool(state.done) == bool(state.info["truncation"]) == last
+        total += reward
+    assert collected >= 3
+
+
+def test_point_mass_layout_is_data():
+    layout = point_mass.Layout(
+        blue=(), green=((0.0, 0.0),), orange=(), start=(0.0, 0.0)
+    )
+    env = point_mass.PointMass(layout)
+    assert env.observation_size == 3
+    state = env.step(env.reset(jax.random.key(0)), jnp.zeros(2))
+    assert float(state.reward) == 10.0
+
+
+def test_an_unknown_name_is_refused_with_the_nearest():
+    with pytest.raises(ValueError, match="did you mean 'walker2d'"):
+        gasil_envs.make("walker")

@@ -1,0 +1,97 @@
+"""Wrappers on a scripted environment whose every reward and ending is known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import Env, State
+
+from gasil_envs import wrappers
+
+
+class Scripted(Env):
+    """Pays t + 1 at step t and terminates after `length` steps; starts at random."""
+
+    def __init__(self, length):
+        self.length = length
+
+    observation_size, action_size, backend = 2, 1, "none"
+
+    def reset(self, rng):
+        start = jax.random.uniform(rng)
+        zero = jnp.float32(0)
+        return State(jnp.int32(0), jnp.stack([zero, start]), zero, zero)
+
+    def step(self, state, action):
+        t = state.pipeline_state + 1
+        return state.replace(
+            pipeline_state=t,
+            obs=state.obs.at[0].set(t.astype(jnp.float32)),
+            reward=t.astype(jnp.float32),
+            done=(t >= self.length).astype(jnp.float32),
+        )
+
+
+def roll(env, steps, key=0):
+    def one(state, _):
+        state = env.step(state, jnp.zeros(1))
+        return state, state
+
+    start = env.reset(jax.random.key(key))
+    return start, jax.jit(lambda s: jax.lax.scan(one, s, length=steps)[1])(start)
+
+
+@pytest.mark.parametrize("delay", [1, 2, 3, 5, 50])
+@pytest.mark.parametrize(("terminates", "limit"), [(7, 100), (100, 7)])
+def test_delayed_reward_loses_nothing(delay, terminates, limit):
+    env = wrappers.EpisodeLimit(Scripted(terminates), limit)
+    _, states = roll(wrappers.RewardDelay(env, delay), 7)
+    true = np.arange(1.0, 8.0)
+    np.testing.assert_array_equal(states.info["true_reward"], true)
+    expected = np.zeros(7)
+    for first in range(0, 7, delay):
+        last = min(first + delay, 7) - 1  # the end falls into the middle of a window
+        expected[last] = true[first : last + 1].sum()
+    np.testing.assert_array_equal(states.reward, expected)
+    assert states.done[-1] == 1.0 and not states.done[:-1].any()
+
+
+def test_the_limit_truncates_and_an_end_does_not():
+    _, cut = roll(wrappers.EpisodeLimit(Scripted(100), 4), 4)
+    np.testing.assert_array_equal(cut.done, [0, 0, 0, 1])
+    np.testing.assert_array_equal(cut.info["truncation"], [0, 0, 0, 1])
+    _, ended = roll(wrappers.EpisodeLimit(Scripted(4), 4), 4)
+    np.testing.assert_array_equal(ended.done, [0, 0, 0, 1])
+    np.testing.assert_array_equal(ended.info["truncation"], [0, 0, 0, 0])
+
+
+def test_noise_is_fresh_gaussian_and_only_on_the_observation():
+    _, plain = roll(Scripted(10_000), 4000)
+    _, noisy = roll(wrappers.ObservationNoise(Scripted(10_000), 0.5), 4000)
+    noise = np.asarray(noisy.obs[:, 0] - plain.obs[:, 0])
+    # The second entry is carried by the wrapped environment from its own last
+    # observation: noise must not pile up there.
+    other = np.asarray(noisy.obs[:, 1])
+    for sample in (noise, other):
+        assert abs(sample.mean() - np.median(sample)) < 0.05
+        assert abs(sample.std() - 0.5) < 0.03
+        assert abs(np.corrcoef(sample[1:], sample[:-1])[0, 1]) < 0.06
+    np.testing.assert_array_equal(noisy.reward, plain.reward)
+    np.testing.assert_array_equal(noisy.done, plain.done)
+
+
+def test_auto_reset_starts_afresh_and_keeps_the_final_observation():
+    env = wrappers.AutoReset(
+        wrappers.RewardDelay(wrappers.EpisodeLimit(Scripted(100), 4), 3)
+    )
+    start, states = roll(env, 8)
+    np.testing.assert_array_equal(states.done, [0, 0, 0, 1, 0, 0, 0, 1])
+    np.testing.assert_array_equal(states.info["truncation"], states.done)
+    np.testing.assert_array_equal(states.obs[:, 0], [1, 2, 3, 0, 1, 2, 3, 0])
+    np.testing.assert_array_equal(
+        states.info["final_observation"][:, 0], [1, 2, 3, 4, 1, 2, 3, 4]
+    )
+    np.testing.assert_array_equal(states.info["true_reward"], [1, 2, 3, 4] * 2)
+    np.testing.assert_array_equal(states.reward, [0, 0, 6, 4] * 2)
+    starts = [float(start.obs[1]), float(states.obs[3, 1]), float(states.obs[7, 1])]
+    assert len(set(starts)) == 3
