@@ -76,9 +76,10 @@ def parse(arguments: Sequence[str] | None = None) -> Options:
 def _in_one_line(refusal: str) -> str:
     """What a framed message of tyro says, without frame, title and pointers."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    framed = [line.strip(" │|") for line in text.splitlines() if line[:1] in "│|"]
-    lines = [line for line in framed if set(line) - set("-─+ ")]
-    message = " ".join(" ".join(lines).split())
+    # Drawn with lines, with ASCII or with blanks, as the terminal's encoding allows.
+    lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
+    _title, *rest = [line for line in lines if line.strip("-")]
+    message = " ".join(" ".join(rest).split())
     message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
     number = re.match(
         r"Error parsing --([\w-]+): (?:invalid literal for (int)|could not convert)"

@@ -2,6 +2,7 @@
 
 import functools
 
+import brax.envs
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -63,6 +64,17 @@ def test_vmap_over_a_hyperparameter_equals_single_runs():
             swept["bonus"][i], single["bonus"], rtol=1e-3, atol=1e-5
         )
     assert np.all(swept["bonus"][1] > swept["bonus"][0])
+
+
+def test_it_trains_an_environment_of_brax():
+    env = brax.envs.get_environment("inverted_pendulum", backend="positional")
+    config = SMALL.replace(total_steps=1024, max_episode_steps=50)
+    state, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    assert np.all(np.isfinite(metrics["policy_loss"]))
+    # One point for each step upright, and no episode above the limit.
+    np.testing.assert_allclose(metrics["episode_return"], metrics["episode_length"])
+    assert np.nanmax(metrics["episode_length"]) <= 50
+    assert int(state.good_trajectories.size) > 0
 
 
 @pytest.mark.parametrize("agent", ["ppo", "ppo+gasil"])

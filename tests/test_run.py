@@ -1,0 +1,112 @@
+"""The command line: a run from end to end, and refusals before anything compiles."""
+
+import csv
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+SMALL = (
+    *("--env", "point_mass", "--seeds", "3", "--first-seed", "5"),
+    *("--total-steps", "1000", "--batch-steps", "256", "--num-envs", "4"),
+    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--num-epochs", "2", "--alpha", "0.5", "--buffer-steps", "300"),
+)
+
+
+def run(*arguments, cwd):
+    return subprocess.run(
+        [sys.executable, "-m", "gasil_jax.run", *arguments],
+        cwd=cwd,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    result = run(*SMALL, "--out", "out", cwd=folder)
+    assert result.returncode == 0, result.stderr
+    return result, folder / "out"
+
+
+def test_a_run_from_end_to_end(finished):
+    result, out = finished
+    assert "compiling" in result.stderr and "steps/s" in result.stderr
+    assert len(result.stdout.splitlines()) == 1 and "final return" in result.stdout
+
+    config = json.loads((out / "config.json").read_text())
+    assert config["env"] == "point_mass" and config["first_seed"] == 5
+    assert config["config"]["hyperparameters"]["alpha"] == 0.5
+
+    rows = list(csv.DictReader((out / "metrics.csv").open()))
+    assert {row["seed"] for row in rows} == {"5", "6", "7"}
+    assert [int(r["env_steps"]) for r in rows[::3]] == [256, 512, 768, 1024]
+    assert list(rows[0])[:6] == [
+        *("seed", "env_steps", "episode_return", "episode_length"),
+        *("good_return", "discriminator_loss"),
+    ]
+    for column in ("policy_loss", "value_loss", "entropy", "explained_variance"):
+        assert all(float(row[column]) is not None for row in rows)
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert set(summary["final_return"]) == {"5", "6", "7"}
+    assert summary["env_steps_per_second"] > 0 and summary["compile_seconds"] > 0
+    assert "jax" in summary["versions"] and summary["device"]
+    # The last tenth of four iterations is one.
+    last = {row["seed"]: float(row["episode_return"]) for row in rows[-3:]}
+    for seed, value in summary["final_return"].items():
+        assert value == pytest.approx(last[seed], rel=1e-5)
+    assert (out / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_a_used_folder_is_refused_and_left_alone(finished):
+    _, out = finished
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    result = run(*SMALL, "--out", str(out), cwd=out.parent)
+    assert result.returncode == 2
+    assert "not empty" in result.stderr
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'?"),
+        ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
+        ("--env hopper --seeds 0", "seeds is 0: it must be 1 or more"),
+        ("--env hopper --seeds two", "seeds is 'two': it must be a whole number"),
+        ("--env hopper --alpha big", "alpha is 'big': it must be a number"),
+        ("--env hopper --num-envs -2", "num_envs is -2"),
+        ("--env hopper --total-steps 0", "total_steps is 0"),
+        ("--env hopper --minibatch-size 60", "nearest that does is 64"),
+        ("--env hopper --alpha nan", "alpha is nan"),
+        ("--env hopper --reward-delay 0", "reward_delay is 0"),
+        ("--env hopper --obs-noise -1", "obs_noise is -1"),
+        ("--env hopper --out /proc/nowhere/run", "can't be written"),
+        ("--env hopper --total-step 5", "--total-steps"),
+        ("", "--env"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
+    from gasil_jax.run import main
+
+    assert main(arguments.split()) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert len(captured.err.splitlines()) == 1
+    assert message in captured.err
+
+
+def test_a_refusal_takes_less_than_five_seconds(tmp_path):
+    started = time.monotonic()
+    result = run("--env", "hoper", cwd=tmp_path)
+    assert time.monotonic() - started < 5.0
+    assert result.returncode == 2
+    assert result.stdout == "" and len(result.stderr.splitlines()) == 1
+    assert "did you mean 'hopper'" in result.stderr
+    assert list(tmp_path.iterdir()) == []
