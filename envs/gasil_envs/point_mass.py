@@ -3,14 +3,15 @@
 The action is the agent's velocity. Objects are collected once: blue +5, green +10,
 orange distractors -5. An actuation cost proportional to the L2 norm of the action
 discourages speed. The paper prints no coordinates; `Layout`'s defaults are ours and
-are laid out so that its story can happen: a blue object tempts nearby, two greens
-lie at the top behind a row of distractors.
+are laid out so that its story can happen: a blue object tempts nearby, three greens
+lie at the top behind a row of distractors with gaps to steer through.
 """
 
 import dataclasses
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs import Env, State
 from flax import struct
 
@@ -23,19 +24,14 @@ class Layout:
     The agent starts uniformly within `start_spread` of `start` in each coordinate.
     """
 
-    blue: tuple[tuple[float, float], ...] = ((0.35, -0.45), (-0.7, -0.2))
-    green: tuple[tuple[float, float], ...] = ((-0.35, 0.7), (0.45, 0.75))
-    orange: tuple[tuple[float, float], ...] = (
-        (-0.6, 0.3),
-        (-0.2, 0.3),
-        (0.2, 0.3),
-        (0.6, 0.3),
-    )
-    start: tuple[float, float] = (0.0, -0.4)
-    start_spread: float = 0.1
+    blue: tuple[tuple[float, float], ...] = ((0.0, -0.4),)
+    green: tuple[tuple[float, float], ...] = ((-0.4, 0.6), (0.0, 0.75), (0.4, 0.6))
+    orange: tuple[tuple[float, float], ...] = ((-0.4, 0.3), (0.0, 0.4), (0.4, 0.3))
+    start: tuple[float, float] = (0.0, 0.0)
+    start_spread: float = 0.2
     radius: float = 0.15
     max_speed: float = 0.1
-    actuation_cost: float = 0.1
+    actuation_cost: float = 0.02
     blue_reward: float = 5.0
     green_reward: float = 10.0
     orange_reward: float = -5.0
@@ -62,14 +58,13 @@ class PointMass(Env):
 
     def __init__(self, layout: Layout | None = None):
         self.layout = layout = layout or Layout()
-        self.objects = jnp.array(
-            layout.blue + layout.green + layout.orange, jnp.float32
-        )
-        self.object_rewards = jnp.array(
+        # Constants of the traced functions stay NumPy arrays: they are embedded.
+        self.objects = np.array(layout.blue + layout.green + layout.orange, np.float32)
+        self.object_rewards = np.array(
             [layout.blue_reward] * len(layout.blue)
             + [layout.green_reward] * len(layout.green)
             + [layout.orange_reward] * len(layout.orange),
-            jnp.float32,
+            np.float32,
         )
         self.episode_length = layout.episode_length
 
