@@ -1,10 +1,14 @@
 """MuJoCo physics in pure JAX, on MJX."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import mujoco
 from flax import struct
 from mujoco import mjx
+
+from gasil_envs.physics import dynamics
 
 
 @struct.dataclass
@@ -31,7 +35,11 @@ class MjxPhysics:
     """
 
     def __init__(
-        self, model: mujoco.MjModel, iterations: int = 4, ls_iterations: int = 8
+        self,
+        model: mujoco.MjModel,
+        solver: str = "small",
+        iterations: int = 4,
+        ls_iterations: int = 8,
     ):
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
@@ -40,6 +48,11 @@ class MjxPhysics:
         self.model = model
         self._mjx_model = mjx.put_model(model)
         self._blank_data = mjx.make_data(model)
+        if solver == "small":
+            self._dynamics = dynamics.make(model, self._mjx_model)
+            self._step = functools.partial(dynamics.step, self._dynamics)
+        else:
+            self._step = functools.partial(mjx.step, self._mjx_model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
@@ -68,7 +81,7 @@ class MjxPhysics:
         """
         data = self.data(state).replace(ctrl=control)
         data = jax.lax.scan(
-            lambda data, _: (mjx.step(self._mjx_model, data), None),
+            lambda data, _: (self._step(data), None),
             data,
             length=frame_skip,
         )[0]
