@@ -33,6 +33,7 @@ class Options:
       out: run folder, created here; default runs/ENV-AGENT-TIME.
       reward_delay: give the accumulated reward every so many steps.
       obs_noise: standard deviation of Gaussian noise on the observations.
+      solver: of the contacts, small (ours, faster) or mjx.
       devices: host devices that the seeds are sharded over; default the cores.
       config: the algorithm.
     """
@@ -43,6 +44,7 @@ class Options:
     out: pathlib.Path | None = None
     reward_delay: int = 1
     obs_noise: float = 0.0
+    solver: str = "small"
     devices: int | None = None
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Config
@@ -107,6 +109,7 @@ def check(options: Options) -> None:
             options.env,
             reward_delay=options.reward_delay,
             obs_noise=options.obs_noise,
+            solver=options.solver,
         )
         validate(options.config, tuple(AGENTS))
     except ValueError as error:
@@ -171,7 +174,10 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
     described |= {"out": str(folder), "config": dataclasses.asdict(config)}
     logging.write_json(folder / "config.json", described)
     env = environments.make_env(
-        options.env, reward_delay=options.reward_delay, obs_noise=options.obs_noise
+        options.env,
+        reward_delay=options.reward_delay,
+        obs_noise=options.obs_noise,
+        solver=options.solver,
     )
     chunk = max(1, min(100, config.num_iterations // 50))
     total_steps = config.num_iterations * config.batch_steps * options.seeds

@@ -20,8 +20,12 @@ GYMNASIUM_NAMES = {
     "ant": "Ant-v5",
     "humanoid": "Humanoid-v5",
 }
-BATCH = 32
-STRIDE = 2  # of the steps in Gymnasium that are compared, so that falls are among them
+BATCH = 200
+# One worker for each environment, so that it is compiled once.
+EACH_NAME = [
+    pytest.param(name, marks=pytest.mark.xdist_group(name))
+    for name in gasil_envs.names()
+]
 
 
 @functools.cache
@@ -36,7 +40,7 @@ def test_every_task_is_compared_with_gymnasium():
     assert set(gasil_envs.names()) == {"point_mass", *GYMNASIUM_NAMES}
 
 
-@pytest.mark.parametrize("name", gasil_envs.names())
+@pytest.mark.parametrize("name", EACH_NAME)
 def test_reset_and_step_under_jit_and_vmap(name):
     env, reset, step = env_and_functions(name)
     state = reset(jax.random.split(jax.random.key(0), BATCH))
@@ -54,45 +58,60 @@ def test_reset_and_step_under_jit_and_vmap(name):
     assert not np.array_equal(state.obs, following.obs)
 
 
-@functools.cache
-def gymnasium_transitions(name, count):
-    """Steps of a random policy in Gymnasium, falls and contacts among them."""
+def gymnasium_transitions(name):
+    """Steps of a random policy in Gymnasium: all falls, and others to make BATCH."""
     env = gymnasium.make(GYMNASIUM_NAMES[name]).unwrapped
+    position_of = locomotion.TASKS[name].position or (lambda _, data: data.qpos[:2])
     env.action_space.seed(0)
-    observation, _ = env.reset(seed=0)
+    env.reset(seed=0)
     steps = []
-    for _ in range(count * STRIDE):
+    for _ in range(3 * BATCH):
         data = env.data
         before = [data.qpos.copy(), data.qvel.copy(), data.qacc_warmstart.copy()]
+        # Velocity is measured from where the last evaluation of the dynamics was.
+        before.append(np.array(position_of(env.model, data)))
         action = env.action_space.sample()
         observation, reward, terminated, *_ = env.step(action)
         steps.append((*before, action, observation, reward, terminated))
         if terminated:
             env.reset()
-    return tuple(np.stack(column) for column in zip(*steps[::STRIDE]))
+    falls = [step for step in steps if step[-1]][: BATCH // 4]
+    others = [step for step in steps if not step[-1]]
+    spaced = np.linspace(0, len(others) - 1, BATCH - len(falls)).astype(int)
+    chosen = falls + [others[i] for i in spaced]
+    return tuple(np.stack(column) for column in zip(*chosen))
 
 
-@pytest.mark.parametrize("name", GYMNASIUM_NAMES)
+# The largest errors are of steps in which a contact or limit begins or ends: there
+# the acceleration jumps, and a rounding of the state decides in which substep.
+@pytest.mark.parametrize("name", EACH_NAME[1:])
 def test_one_step_is_gymnasiums(name):
     env, _, step = env_and_functions(name)
-    transitions = gymnasium_transitions(name, BATCH)
-    qpos, qvel, warmstart, action = (
-        jnp.asarray(x, jnp.float32) for x in transitions[:4]
-    )
-    observation, reward, terminated = transitions[4:]
+    transitions = gymnasium_transitions(name)
+    *before, action = (jnp.asarray(x, jnp.float32) for x in transitions[:5])
+    observation, reward, terminated = transitions[5:]
     assert terminated.any() or name in ("halfcheetah", "swimmer", "ant")
 
-    def state_at(qpos, qvel, warmstart):
+    def state_at(qpos, qvel, warmstart, position):
         state = env.env.state_at(qpos, qvel)
         physics = state.pipeline_state.physics.replace(qacc_warmstart=warmstart)
-        inner = state.pipeline_state.replace(physics=physics)
+        inner = state.pipeline_state.replace(physics=physics, position=position)
         info = {"steps": jnp.int32(0), "truncation": jnp.float32(0)}
         return state.replace(pipeline_state=inner, info=info)
 
-    state = step(jax.jit(jax.vmap(state_at))(qpos, qvel, warmstart), action)
+    state = step(jax.jit(jax.vmap(state_at))(*before), action)
     error = np.abs(state.obs - observation) / (1.0 + np.abs(observation))
-    assert np.median(error.max(axis=1)) < 1e-5
-    assert np.median(np.abs(state.reward - reward) / (1.0 + np.abs(reward))) < 5e-4
+    error = error.max(axis=1)  # the worst entry of each step
+    reward_error = np.abs(state.reward - reward) / (1.0 + np.abs(reward))
+    quantiles = (0.5, 0.9, 0.99, 1.0)
+    show = lambda x: np.array2string(np.quantile(x, quantiles), precision=1)
+    print(f"{name}: quantiles {quantiles} of the relative error of one step")
+    print("  observation", show(error))
+    print("  reward", show(reward_error))
+    assert np.median(error) < 1e-5
+    assert np.quantile(error, 0.9) < 1e-3
+    assert np.median(reward_error) < 1e-5
+    assert np.quantile(reward_error, 0.99) < 2e-2
     np.testing.assert_array_equal(state.done, terminated)
 
 

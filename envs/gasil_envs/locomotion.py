@@ -175,11 +175,11 @@ class Locomotion(Env):
 
     episode_length = 1000
 
-    def __init__(self, name: str):
+    def __init__(self, name: str, *, solver: str = "small"):
         self.task = task = TASKS[name]
         assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
         self.model = mujoco.MjModel.from_xml_path(str(assets / task.xml))
-        self.physics = MjxPhysics(self.model)
+        self.physics = MjxPhysics(self.model, solver)
         self.dt = self.model.opt.timestep * task.frame_skip
         # Constants of the traced functions stay NumPy arrays: they are embedded.
         self._start = np.asarray(self.model.qpos0, np.float32)

@@ -16,6 +16,12 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+_SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
+_PLANE_AND_CAPSULE = [
+    int(mujoco.mjtGeom.mjGEOM_PLANE),
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
+]
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impedance:
@@ -100,8 +106,6 @@ class Contacts:
 
     condim: int
     index: np.ndarray
-    geom: np.ndarray
-    is_capsule_on_plane: np.ndarray
     root: np.ndarray
     mask: np.ndarray
     friction: np.ndarray
@@ -111,10 +115,18 @@ class Contacts:
 
 
 class Layout(NamedTuple):
-    """All that is known of a model's constraint rows before the state is."""
+    """All that is known of a model's constraint rows before the state is.
+
+    Attributes:
+      limits: of joints.
+      contacts: by condim.
+      capsule_on_plane: (2, n), which of MJX's contacts are of a capsule on a plane,
+        and the capsule's geom.
+    """
 
     limits: Limits
     contacts: tuple[Contacts, ...]
+    capsule_on_plane: np.ndarray
 
 
 class Rows(NamedTuple):
@@ -136,7 +148,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if model.tendon_limited.any():
         return "it has limited tendons"
     limited = model.jnt_type[model.jnt_limited.astype(bool)]
-    if np.isin(limited, [mujoco.mjtJoint.mjJNT_BALL, mujoco.mjtJoint.mjJNT_FREE]).any():
+    if not np.isin(limited, _SLIDE_AND_HINGE).all():
         return "it has limited ball joints"
     if not np.isin(model.geom_condim, [1, 3]).all() or model.npair:
         return "it has contacts with torsional or rolling friction, or named pairs"
@@ -169,7 +181,14 @@ def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
         contact = collide(mjx.make_data(model))
     condim = np.asarray(contact.dim).reshape(-1)
     contacts = [_contacts(model, contact, condim, dim) for dim in (1, 3)]
-    return Layout(limits, tuple(c for c in contacts if c.index.size))
+    geom = np.asarray(contact.geom).reshape(-1, 2)
+    kind = model.geom_type[geom]
+    index = np.flatnonzero((kind == _PLANE_AND_CAPSULE).all(axis=1))
+    return Layout(
+        limits,
+        tuple(c for c in contacts if c.index.size),
+        np.stack([index, geom[index, 1]]),
+    )
 
 
 def _contacts(
@@ -181,7 +200,6 @@ def _contacts(
     moves = np.zeros((model.nbody, model.nv))
     for i in range(1, model.nbody):
         moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
-    kind = model.geom_type[geom]
     friction = np.asarray(contact.friction).reshape(-1, 5)[index, 0]
     inverse_weight = model.body_invweight0[body, 0].sum(axis=1)
     if condim > 1:
@@ -191,9 +209,6 @@ def _contacts(
     return Contacts(
         condim=condim,
         index=index,
-        geom=geom,
-        is_capsule_on_plane=(kind[:, 0] == mujoco.mjtGeom.mjGEOM_PLANE)
-        & (kind[:, 1] == mujoco.mjtGeom.mjGEOM_CAPSULE),
         root=model.body_rootid[body].max(axis=1),
         mask=(moves[body[:, 1]] - moves[body[:, 0]]).astype(np.float32),
         friction=friction.astype(np.float32),
@@ -236,20 +251,23 @@ def _limit_rows(limits: Limits, data: mjx.Data) -> Rows:
     )
 
 
-def frames(contacts: Contacts, data: mjx.Data) -> jax.Array:
-    """Normal and two tangents of each contact, (n, 3, 3), as C MuJoCo chooses them."""
-    frame = data._impl.contact.frame[contacts.index]
-    if not contacts.is_capsule_on_plane.any():
-        return frame
+def align_frames(layout: Layout, data: mjx.Data) -> mjx.Data:
+    """Contact frames as C MuJoCo chooses them, after MJX's collision."""
+    index, capsule = layout.capsule_on_plane
+    if not index.size:
+        return data
     # mjc_PlaneCapsule gives the capsule's axis, mju_makeFrame projects it.
+    contact = data._impl.contact
+    frame = contact.frame[index]
     normal = frame[:, 0]
-    axis = data.geom_xmat[contacts.geom[:, 1]].reshape(-1, 3, 3)[:, :, 2]
+    axis = data.geom_xmat[capsule].reshape(-1, 3, 3)[:, :, 2]
     tangent = axis - normal * jnp.sum(normal * axis, axis=-1, keepdims=True)
     length = jnp.sqrt(jnp.sum(tangent**2, axis=-1, keepdims=True))
     tangent = tangent / jnp.maximum(length, 1e-15)
     aligned = jnp.stack([normal, tangent, jnp.cross(normal, tangent)], axis=1)
-    use = contacts.is_capsule_on_plane[:, None, None] & (length[..., None] > 1e-15)
-    return jnp.where(use, aligned, frame)
+    aligned = jnp.where(length[..., None] > 1e-15, aligned, frame)
+    contact = contact.replace(frame=contact.frame.at[index].set(aligned))
+    return data.tree_replace({"_impl.contact": contact})
 
 
 def _contact_rows(contacts: Contacts, data: mjx.Data) -> Rows:
@@ -258,7 +276,7 @@ def _contact_rows(contacts: Contacts, data: mjx.Data) -> Rows:
     active = distance < 0.0
     distance = jnp.where(active, distance, 0.0)
     arm = contact.pos[contacts.index] - data.subtree_com[contacts.root]
-    axes = frames(contacts, data)[:, : contacts.condim]
+    axes = contact.frame[contacts.index][:, : contacts.condim]
     # cdof is (rotation, translation) of a point at the root's centre of mass.
     wrench = jnp.concatenate([jnp.cross(arm[:, None], axes), axes], axis=-1)
     along = wrench @ data.cdof.T * contacts.mask[:, None]  # (n, condim, nv)

@@ -15,10 +15,11 @@ from mujoco import mjx
 
 from gasil_envs.physics import constraints, newton
 
-_JOINT_TRANSMISSION = (
-    mujoco.mjtTrn.mjTRN_JOINT,
-    mujoco.mjtTrn.mjTRN_JOINTINPARENT,
-)
+_JOINT_TRANSMISSION = [
+    int(mujoco.mjtTrn.mjTRN_JOINT),
+    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
+]
+_SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
 
 
 class Dynamics(NamedTuple):
@@ -29,12 +30,14 @@ class Dynamics(NamedTuple):
       rows: the layout of the constraint rows.
       motor: (nu, nv), generalized force of one unit of control.
       control_range: (2, nu).
+      iterations: of the solver.
     """
 
     model: mjx.Model
     rows: constraints.Layout
     motor: np.ndarray
     control_range: np.ndarray
+    iterations: int
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -45,13 +48,13 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if (
         model.na
         or not np.isin(model.actuator_trntype, _JOINT_TRANSMISSION).all()
-        or (model.actuator_gaintype != mujoco.mjtGain.mjGAIN_FIXED).any()
-        or (model.actuator_biastype != mujoco.mjtBias.mjBIAS_NONE).any()
+        or (model.actuator_gaintype != int(mujoco.mjtGain.mjGAIN_FIXED)).any()
+        or (model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_NONE)).any()
         or model.actuator_forcelimited.any()
         or model.jnt_actfrclimited.any()
-        or (
-            model.jnt_type[model.actuator_trnid[:, 0]] < mujoco.mjtJoint.mjJNT_SLIDE
-        ).any()
+        or not np.isin(
+            model.jnt_type[model.actuator_trnid[:, 0]], _SLIDE_AND_HINGE
+        ).all()
     ):
         return "it has actuators other than plain motors on slides and hinges"
     if model.nv > 60:
@@ -59,7 +62,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     return constraints.unsupported(model)
 
 
-def make(model: mujoco.MjModel, mjx_model: mjx.Model) -> Dynamics:
+def make(model: mujoco.MjModel, mjx_model: mjx.Model, iterations: int = 4) -> Dynamics:
     """Work out what does not depend on the state, for a supported model."""
     motor = np.zeros((model.nu, model.nv), np.float32)
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
@@ -73,6 +76,7 @@ def make(model: mujoco.MjModel, mjx_model: mjx.Model) -> Dynamics:
         constraints.layout(model, mjx_model),
         motor,
         control_range.T.astype(np.float32),
+        iterations,
     )
 
 
@@ -92,7 +96,7 @@ def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     data = mjx.tendon(model, data)
     data = mjx.crb(model, data)
     data = mjx.tendon_armature(model, data)
-    data = mjx.collision(model, data)
+    data = constraints.align_frames(dynamics.rows, mjx.collision(model, data))
     data = mjx.com_vel(model, data)
     data = mjx.passive(model, data)
     data = mjx.rne(model, data)
@@ -109,7 +113,8 @@ def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
             reference=rows.reference,
             weight=rows.weight,
             warmstart=data.qacc_warmstart,
-        )
+        ),
+        dynamics.iterations,
     )
     return data.tree_replace(
         {

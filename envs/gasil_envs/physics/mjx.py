@@ -1,6 +1,7 @@
 """MuJoCo physics in pure JAX, on MJX."""
 
 import functools
+import logging
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +10,8 @@ from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import dynamics
+
+_LOGGER = logging.getLogger(__name__)
 
 
 @struct.dataclass
@@ -26,12 +29,23 @@ class PhysicsState:
     qacc_warmstart: jax.Array
 
 
+#: What `MjxPhysics` takes as `solver`.
+SOLVERS = ("small", "mjx")
+
+
 class MjxPhysics:
     """Steps a MuJoCo model with MJX.
 
-    Float32 never meets the solver tolerance that is tuned for float64, so MuJoCo's
-    100 iterations would all be spent; with 4 iterations and 8 line-search steps
-    the result is the same (relative error against C MuJoCo 6e-7 on walker2d).
+    Args:
+      model: the model; its solver options are overwritten.
+      solver: "small" takes our constraint rows and Newton's method for small dense
+        problems (`dynamics`), or, for a model that these can't take, falls back to
+        "mjx" with a warning in the log; "mjx" takes MJX's own step.
+      iterations: Newton iterations, of both solvers.
+      ls_iterations: line-search steps of MJX's solver. Float32 never meets the
+        tolerance that is tuned for float64, so MuJoCo's 100 iterations would all be
+        spent; with 4 and 8 the result is the same (relative error against C MuJoCo
+        6e-7 on walker2d).
     """
 
     def __init__(
@@ -45,12 +59,14 @@ class MjxPhysics:
         model.opt.ls_iterations = ls_iterations
         # humanoid.xml asks for PGS, which MJX lacks.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
-        self.model = model
         self._mjx_model = mjx.put_model(model)
         self._blank_data = mjx.make_data(model)
-        if solver == "small":
-            self._dynamics = dynamics.make(model, self._mjx_model)
-            self._step = functools.partial(dynamics.step, self._dynamics)
+        reason = dynamics.unsupported(model) if solver == "small" else None
+        if reason is not None:
+            _LOGGER.warning("MJX's own solver steps this model: %s", reason)
+        if solver == "small" and reason is None:
+            small = dynamics.make(model, self._mjx_model, iterations)
+            self._step = functools.partial(dynamics.step, small)
         else:
             self._step = functools.partial(mjx.step, self._mjx_model)
 
