@@ -3,6 +3,7 @@
 import pathlib
 
 import matplotlib
+
 from gasil_envs.point_mass import Layout
 
 FIGURE = pathlib.Path(__file__).parent / "figures" / "point_mass_layout.png"

@@ -29,6 +29,8 @@ class Hyperparameters:
       alpha: scale of the discriminator's reward (paper, section 4.3).
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_entropy_coefficient: weight of the entropy of D's output.
+      behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
+      sil_value_coefficient: weight of the value's part of the loss of PPO+SIL.
     """
 
     learning_rate: float = 3e-4
@@ -42,6 +44,8 @@ class Hyperparameters:
     alpha: float = 0.1
     discriminator_learning_rate: float = 1e-4
     discriminator_entropy_coefficient: float = 1e-3
+    behavior_cloning_coefficient: float = 0.1
+    sil_value_coefficient: float = 0.01
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +65,11 @@ class Config:
       discriminator_updates: gradient steps of the discriminator an iteration.
       discriminator_minibatch_size: policy steps, and as many good steps, in each.
       discriminator_hidden_sizes: widths of the discriminator's tanh layers.
+      behavior_cloning_updates: gradient steps of PPO+BC's own an iteration.
+      behavior_cloning_minibatch_size: good steps in each.
+      sil_updates: gradient steps of PPO+SIL's own an iteration.
+      sil_minibatch_size: replayed steps in each.
+      sil_buffer_steps: capacity of PPO+SIL's replay, in steps.
       max_episode_steps: an episode is truncated after so many steps; None takes
         the environment's own limit, or 1000 if it has none.
       hyperparameters: the floats; `make_train` can replace them under a trace.
@@ -77,6 +86,11 @@ class Config:
     discriminator_updates: int = 5
     discriminator_minibatch_size: int = 128
     discriminator_hidden_sizes: tuple[int, ...] = (100, 100)
+    behavior_cloning_updates: int = 10
+    behavior_cloning_minibatch_size: int = 64
+    sil_updates: int = 10
+    sil_minibatch_size: int = 512
+    sil_buffer_steps: int = 100_000
     max_episode_steps: int | None = None
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
@@ -120,6 +134,8 @@ _HYPERPARAMETER_RANGES = {
     "alpha": (0.0, math.inf, True),
     "discriminator_learning_rate": (0.0, math.inf, False),
     "discriminator_entropy_coefficient": (0.0, math.inf, True),
+    "behavior_cloning_coefficient": (0.0, math.inf, True),
+    "sil_value_coefficient": (0.0, math.inf, True),
 }
 
 

@@ -48,11 +48,15 @@ class History:
     Attributes:
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
+      reward: float32 (N, H), the environment's own.
+      ended: bool (N, H), the step was its episode's last.
       cursor: int32 (), where the next step is written.
     """
 
     observation: jax.Array
     action: jax.Array
+    reward: jax.Array
+    ended: jax.Array
     cursor: jax.Array
 
 
@@ -102,13 +106,30 @@ def init_history(
     return History(
         observation=jnp.zeros((num_envs, length, observation_size), jnp.float32),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
+        reward=jnp.zeros((num_envs, length), jnp.float32),
+        # No episode reaches back to before the first step.
+        ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
     )
 
 
-def record(history: History, observation: jax.Array, action: jax.Array) -> History:
-    """Write a batch, (time, N, obs) and (time, N, action), over the oldest steps."""
-    chex.assert_equal_shape_prefix([observation, action], 2)
+def record(
+    history: History,
+    observation: jax.Array,
+    action: jax.Array,
+    reward: jax.Array,
+    ended: jax.Array,
+) -> History:
+    """Write a batch over the oldest steps.
+
+    Args:
+      history: where to.
+      observation: float32 (time, N, obs).
+      action: float32 (time, N, action).
+      reward: float32 (time, N).
+      ended: bool (time, N).
+    """
+    chex.assert_equal_shape_prefix([observation, action, reward, ended], 2)
     num_steps = observation.shape[0]
     write = lambda ring, new: jax.lax.dynamic_update_slice_in_dim(
         ring, jnp.swapaxes(new, 0, 1), history.cursor, axis=1
@@ -116,6 +137,8 @@ def record(history: History, observation: jax.Array, action: jax.Array) -> Histo
     return History(
         observation=write(history.observation, observation),
         action=write(history.action, action),
+        reward=write(history.reward, reward),
+        ended=write(history.ended, ended),
         cursor=(history.cursor + num_steps) % history.observation.shape[1],
     )
 

@@ -72,7 +72,8 @@ def loss(
     params: Any,
     batch: Batch,
     *,
-    apply: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array, jax.Array]],
+    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    value: Callable[[Any, jax.Array], jax.Array],
     hyperparameters: Hyperparameters,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate (Schulman et al. 2017, equation 7), value error and entropy.
@@ -80,14 +81,16 @@ def loss(
     Args:
       params: of policy and value.
       batch: a minibatch.
-      apply: (params, observation) -> mean, log std, value.
+      policy: (params, observation) -> mean, log standard deviation.
+      value: (params, observation) -> value.
       hyperparameters: clip range and weights.
 
     Returns:
       The loss, (), and its parts.
     """
     chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_])
-    mean, log_std, value = apply(params, batch.observation)
+    mean, log_std = policy(params["policy"], batch.observation)
+    values = value(params["value"], batch.observation)
     log_prob = gaussian_log_prob(mean, log_std, batch.action)
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
@@ -95,7 +98,7 @@ def loss(
     clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -jnp.mean(surrogate)
-    value_loss = 0.5 * jnp.mean((value - batch.return_) ** 2)
+    value_loss = 0.5 * jnp.mean((values - batch.return_) ** 2)
     entropy = gaussian_entropy(log_std)
     total = (
         policy_loss
@@ -121,13 +124,29 @@ def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
     )
 
 
+def descend(
+    params: Any,
+    optimizer_state: Any,
+    gradient: Any,
+    learning_rate: jax.Array,
+    hyperparameters: Hyperparameters,
+) -> tuple[Any, Any]:
+    """One step of `optimizer` for one network: its new params and state."""
+    updates, optimizer_state = optimizer(hyperparameters).update(
+        gradient, optimizer_state
+    )
+    params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
+    return params, optimizer_state
+
+
 def update(
     params: Any,
     optimizer_state: Any,
     batch: Batch,
     key: jax.Array,
     *,
-    apply: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array, jax.Array]],
+    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    value: Callable[[Any, jax.Array], jax.Array],
     learning_rate: jax.Array,
     config: Config,
     hyperparameters: Hyperparameters,
@@ -139,7 +158,8 @@ def update(
       optimizer_state: {"policy": ..., "value": ...}.
       batch: (steps, ...), advantages already normalized.
       key: consumed.
-      apply: (params, observation) -> mean, log std, value.
+      policy: (params, observation) -> mean, log standard deviation.
+      value: (params, observation) -> value.
       learning_rate: step size of this iteration.
       config: counts and sizes.
       hyperparameters: the floats.
@@ -147,20 +167,24 @@ def update(
     Returns:
       params, optimizer state, and the metrics' means over all minibatches.
     """
-    transform = optimizer(hyperparameters)
 
     def minibatch_step(carry: Any, minibatch: Batch) -> Any:
         params, optimizer_state = carry
         gradient, metrics = jax.grad(loss, has_aux=True)(
-            params, minibatch, apply=apply, hyperparameters=hyperparameters
+            params,
+            minibatch,
+            policy=policy,
+            value=value,
+            hyperparameters=hyperparameters,
         )
         new_params, new_state = {}, {}
         for name in params:
-            updates, new_state[name] = transform.update(
-                gradient[name], optimizer_state[name]
-            )
-            new_params[name] = jax.tree.map(
-                lambda p, u: p - learning_rate * u, params[name], updates
+            new_params[name], new_state[name] = descend(
+                params[name],
+                optimizer_state[name],
+                gradient[name],
+                learning_rate,
+                hyperparameters,
             )
         return (new_params, new_state), metrics
 

@@ -53,16 +53,8 @@ def _max_episode_steps(env: Any, config: Config) -> int:
     return config.max_episode_steps or getattr(env, "episode_length", 1000)
 
 
-def _apply(env: Any, config: Config) -> Callable[[Any, jax.Array], Any]:
-    """(params, normalized observation) -> mean, log std, value."""
-    policy = Policy(config.hidden_sizes, env.action_size)
-    value = Value(config.hidden_sizes)
-
-    def apply(params: Any, observation: jax.Array) -> Any:
-        mean, log_std = policy.apply(params["policy"], observation)
-        return mean, log_std, value.apply(params["value"], observation)
-
-    return apply
+def _networks(env: Any, config: Config) -> tuple[Policy, Value]:
+    return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
 
 
 def init(
@@ -80,11 +72,10 @@ def init(
     key, policy_key, value_key, env_key, imitation_key = jax.random.split(key, 5)
     observation_size, action_size = env.observation_size, env.action_size
     observation = jnp.zeros(observation_size)
+    policy, value = _networks(env, config)
     params = {
-        "policy": Policy(config.hidden_sizes, action_size).init(
-            policy_key, observation
-        ),
-        "value": Value(config.hidden_sizes).init(value_key, observation),
+        "policy": policy.init(policy_key, observation),
+        "value": value.init(value_key, observation),
     }
     transform = ppo.optimizer(hyperparameters)
     return TrainState(
@@ -117,7 +108,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     Returns the next state and a dict of float32 scalars. Means over the episodes
     that ended in the batch are NaN if none did.
     """
-    agent, apply, hp = AGENTS[config.agent], _apply(env, config), state.hyperparameters
+    agent, hp = AGENTS[config.agent], state.hyperparameters
+    policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
     normalize = lambda observation: normalization.normalize(
         state.normalizer, observation
@@ -128,7 +120,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     # Sample policy trajectories.
     environments, batch = rollout.collect(
         env,
-        lambda observation: apply(state.params, normalize(observation))[:2],
+        lambda observation: policy(state.params["policy"], normalize(observation)),
         state.environments,
         act_key,
         num_steps=config.num_steps,
@@ -136,7 +128,9 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         gamma=hp.gamma,
     )
     # Update the good trajectory buffer.
-    history = good_trajectories.record(state.history, batch.observation, batch.action)
+    history = good_trajectories.record(
+        state.history, batch.observation, batch.action, batch.reward, batch.ended
+    )
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length
     )
@@ -145,28 +139,31 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     # Update the discriminator, and shape the reward with it.
     context = Context(
         rollout=batch,
+        history=history,
         good_trajectories=buffer,
         normalizer=state.normalizer,
         hyperparameters=hp,
         config=config,
+        policy=policy,
+        value=value,
     )
     imitation, reward, imitation_metrics = agent.update_and_reward(
         state.imitation, context, imitate_key
     )
     # Update the policy.
     observation = normalize(batch.observation)
-    value = apply(state.params, observation)[2]
-    next_value = apply(state.params, normalize(batch.next_observation))[2]
+    values = value(state.params["value"], observation)
+    next_values = value(state.params["value"], normalize(batch.next_observation))
     advantage = ppo.generalized_advantage_estimation(
         reward,
-        value,
-        next_value,
+        values,
+        next_values,
         batch.terminated,
         batch.ended,
         gamma=hp.gamma,
         gae_lambda=hp.gae_lambda,
     )
-    return_ = advantage + value
+    return_ = advantage + values
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     params, optimizer_state, ppo_metrics = ppo.update(
         state.params,
@@ -179,7 +176,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
             return_=flat(return_),
         ),
         ppo_key,
-        apply=apply,
+        policy=policy,
+        value=value,
         learning_rate=learning_rate,
         config=config,
         hyperparameters=hp,
@@ -213,7 +211,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         "good_return": good_trajectories.mean_return(buffer),
         "good_steps": buffer.size,
         "explained_variance": 1.0
-        - jnp.var(return_ - value) / (jnp.var(return_) + 1e-8),
+        - jnp.var(return_ - values) / (jnp.var(return_) + 1e-8),
         "learning_rate": learning_rate,
         **ppo_metrics,
         **imitation_metrics,

@@ -33,7 +33,9 @@ class ListBuffer:
 @functools.partial(jax.jit)
 def push(buffer, history, observation, ended, return_, length):
     action = -observation
-    history = good_trajectories.record(history, observation, action)
+    history = good_trajectories.record(
+        history, observation, action, jnp.zeros_like(return_), ended
+    )
     episodes = good_trajectories.ended_episodes(history, ended, return_, length)
     return good_trajectories.insert(buffer, history, episodes), history
 

@@ -20,6 +20,8 @@ SMALL = gasil_jax.Config(
     discriminator_hidden_sizes=(16,),
     discriminator_updates=2,
     buffer_steps=100,
+    sil_buffer_steps=500,
+    sil_minibatch_size=64,
 )
 
 
@@ -77,10 +79,17 @@ def test_it_trains_an_environment_of_brax():
     assert int(state.good_trajectories.size) > 0
 
 
-@pytest.mark.parametrize("agent", ["ppo", "ppo+gasil"])
+@pytest.mark.parametrize("agent", gasil_jax.agents())
 def test_it_learns_on_the_point_mass(agent):
     env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config(agent=agent, total_steps=40 * 2048)
+    config = gasil_jax.Config(
+        agent=agent,
+        total_steps=40 * 2048,
+        discriminator_updates=20,
+        hyperparameters=gasil_jax.Hyperparameters(
+            alpha=1.0, discriminator_learning_rate=3e-4
+        ),
+    )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
     _, metrics = jax.jit(jax.vmap(gasil_jax.make_train(env, config)))(keys)
     returns = np.asarray(metrics["episode_return"])

@@ -4,11 +4,13 @@ An agent is PPO plus one `Imitation`. To add one, write a file with such a tuple
 name it in `AGENTS`.
 """
 
-from gasil_jax.imitation import adversarial, none
+from gasil_jax.imitation import adversarial, behavior_cloning, none, self_imitation
 from gasil_jax.imitation.interface import Imitation
 
 AGENTS: dict[str, Imitation] = {
     "ppo": none.PPO,
+    "ppo+bc": behavior_cloning.PPO_BC,
+    "ppo+sil": self_imitation.PPO_SIL,
     "gasil": adversarial.GASIL,
     "ppo+gasil": adversarial.PPO_GASIL,
 }

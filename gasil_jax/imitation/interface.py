@@ -7,7 +7,7 @@ import jax
 from flax import struct
 
 from gasil_jax.config import Config, Hyperparameters
-from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.good_trajectories import GoodTrajectories, History
 from gasil_jax.normalization import Normalizer
 from gasil_jax.rollout import Rollout
 
@@ -20,17 +20,23 @@ class Context:
 
     Attributes:
       rollout: the batch, (time, env, ...).
+      history: the last steps of each environment, the batch's in it.
       good_trajectories: the buffer, the batch's ended episodes in it.
       normalizer: of the observations, as the policy used it in the batch.
       hyperparameters: the floats.
       config: the static configuration.
+      policy: (params, normalized observation) -> mean, log standard deviation.
+      value: (params, normalized observation) -> value.
     """
 
     rollout: Rollout
+    history: History
     good_trajectories: GoodTrajectories
     normalizer: Normalizer
     hyperparameters: Hyperparameters
     config: Config = struct.field(pytree_node=False)
+    policy: Callable[..., tuple[jax.Array, jax.Array]] = struct.field(pytree_node=False)
+    value: Callable[..., jax.Array] = struct.field(pytree_node=False)
 
 
 class Imitation(NamedTuple):

@@ -6,16 +6,18 @@ from gasil_jax.config import Config
 from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
 
 
-def _init(
+def no_state(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> tuple[()]:
+    """An `init` of agents that remember nothing."""
     return ()
 
 
-def _update_and_reward(
+def plain_reward(
     state: tuple[()], context: Context, key: jax.Array
 ) -> tuple[tuple[()], jax.Array, Metrics]:
+    """An `update_and_reward` that learns nothing and leaves the reward as it is."""
     return state, context.rollout.reward, {}
 
 
-PPO = Imitation(_init, _update_and_reward, leave_policy)
+PPO = Imitation(no_state, plain_reward, leave_policy)

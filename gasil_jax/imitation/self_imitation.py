@@ -1,0 +1,242 @@
+"""PPO+SIL: self-imitation learning (Oh, Guo, Singh, Lee 2018) beside PPO.
+
+A replay buffer holds (s, a, R) of the steps of ended episodes, R being the discounted
+return from that step on. After PPO's own steps, policy and value take
+`sil_updates` gradient steps on minibatches drawn with probability proportional to
+max(R - V(s), 0)^0.6, on the loss (equations 1 to 4 there)
+
+    -E[w log pi(a | s) (R - V(s))+] + sil_value_coefficient / 2 E[w ((R - V(s))+)^2]
+
+with w the importance weights of the prioritized sampling. As in the authors' code the
+advantage is clipped at 1, -log pi at 5, and the mean is over the steps with a positive
+advantage but over no fewer than 64.
+"""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from gasil_jax import normalization, ppo
+from gasil_jax.config import Config
+from gasil_jax.good_trajectories import History
+from gasil_jax.imitation.interface import Context, Imitation, Metrics
+from gasil_jax.networks import gaussian_log_prob
+
+_PRIORITY_EXPONENT = 0.6
+_IMPORTANCE_EXPONENT = 0.1
+_LEAST_PRIORITY = 1e-6
+_HIGHEST_ADVANTAGE = 1.0
+_HIGHEST_NEGATIVE_LOG_PROB = 5.0
+_LEAST_SAMPLES = 64
+
+
+@struct.dataclass
+class Replay:
+    """The last `capacity` steps of ended episodes, a ring.
+
+    Attributes:
+      observation: float32 (capacity, obs), not normalized.
+      action: float32 (capacity, action).
+      return_: float32 (capacity,), discounted, from the step on.
+      priority: float32 (capacity,), 0 where empty.
+      cursor: int32 (), where the next step is written.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    return_: jax.Array
+    priority: jax.Array
+    cursor: jax.Array
+
+
+def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
+    """An empty replay."""
+    return Replay(
+        observation=jnp.zeros((capacity, observation_size), jnp.float32),
+        action=jnp.zeros((capacity, action_size), jnp.float32),
+        return_=jnp.zeros(capacity, jnp.float32),
+        priority=jnp.zeros(capacity, jnp.float32),
+        cursor=jnp.int32(0),
+    )
+
+
+def returns_to_go(
+    history: History, num_steps: int, gamma: jax.Array
+) -> tuple[jax.Array, jax.Array]:
+    """Discounted returns of the steps whose episode ended in the last batch.
+
+    Args:
+      history: after `record` of the batch.
+      num_steps: steps of each environment in a batch.
+      gamma: discount.
+
+    Returns:
+      return (env, steps of history) and whether the step is of such an episode and
+      its return is finite, both in the order of time, oldest first.
+    """
+    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
+    reward, ended = in_time(history.reward), in_time(history.ended)
+    length = reward.shape[1]
+
+    def backward(carry: Any, step: Any) -> Any:
+        return_, wanted = carry
+        reward, ended, is_new = step
+        return_ = reward + jnp.where(ended, 0.0, gamma * return_)
+        wanted = jnp.where(ended, is_new, wanted)
+        return (return_, wanted), (return_, wanted)
+
+    num_envs = reward.shape[0]
+    start = (jnp.zeros(num_envs), jnp.zeros(num_envs, bool))
+    is_new = jnp.arange(length) >= length - num_steps
+    _, (return_, wanted) = jax.lax.scan(
+        backward, start, (reward.T, ended.T, is_new), reverse=True
+    )
+    return return_.T, wanted.T & jnp.isfinite(return_.T)
+
+
+def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Replay:
+    """Add the steps of the episodes that ended in the last batch, oldest first.
+
+    They get the highest priority there is, so that each is drawn soon.
+    """
+    return_, wanted = returns_to_go(history, num_steps, gamma)
+    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
+    flat = lambda x: x.reshape(-1, *x.shape[2:])
+    capacity = replay.return_.shape[0]
+    wanted = flat(wanted)
+    count = jnp.sum(wanted)
+    rank = jnp.cumsum(wanted) - 1
+    # Of more than fit, the last ones; the place `capacity` is out of bounds: dropped.
+    kept = wanted & (rank >= count - capacity)
+    place = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
+    write = lambda ring, new: ring.at[place].set(new, mode="drop")
+    highest = jnp.maximum(jnp.max(replay.priority), _LEAST_PRIORITY)
+    highest = jnp.where(jnp.any(replay.priority > 0), highest, 1.0)
+    return Replay(
+        observation=write(replay.observation, flat(in_time(history.observation))),
+        action=write(replay.action, flat(in_time(history.action))),
+        return_=write(replay.return_, flat(return_)),
+        priority=write(replay.priority, highest),
+        cursor=(replay.cursor + count) % capacity,
+    )
+
+
+def sample(
+    key: jax.Array, replay: Replay, num_samples: int
+) -> tuple[jax.Array, jax.Array]:
+    """Places drawn by priority, and their importance weights, (samples,) each.
+
+    Schaul et al. 2016; the weights are divided by the largest that there can be.
+    """
+    mass = jnp.where(replay.priority > 0, replay.priority**_PRIORITY_EXPONENT, 0.0)
+    cumulative = jnp.cumsum(mass)
+    total = cumulative[-1]
+    place = jnp.searchsorted(
+        cumulative, jax.random.uniform(key, (num_samples,)) * total, side="right"
+    )
+    place = jnp.minimum(place, mass.shape[0] - 1)
+    size = jnp.sum(replay.priority > 0)
+    weight = lambda mass: (mass / total * size) ** -_IMPORTANCE_EXPONENT
+    least = jnp.min(jnp.where(mass > 0, mass, jnp.inf))
+    return place, weight(jnp.maximum(mass[place], least)) / weight(least)
+
+
+def loss(
+    log_prob: jax.Array,
+    value: jax.Array,
+    return_: jax.Array,
+    weight: jax.Array,
+    value_coefficient: jax.Array,
+) -> tuple[jax.Array, jax.Array]:
+    """The loss of a minibatch, (), and the fraction of positive advantages, ()."""
+    chex.assert_equal_shape([log_prob, value, return_, weight])
+    advantage = jnp.clip(return_ - value, 0.0, _HIGHEST_ADVANTAGE)
+    num_positive = jnp.sum(advantage > 0)
+    num_samples = jnp.maximum(num_positive, _LEAST_SAMPLES)
+    constant = jax.lax.stop_gradient(advantage)
+    negative_log_prob = jnp.minimum(-log_prob, _HIGHEST_NEGATIVE_LOG_PROB)
+    policy_loss = jnp.sum(weight * constant * negative_log_prob) / num_samples
+    # The gradient of half the clipped square, also where the clip is active.
+    value_loss = -jnp.sum(weight * constant * value) / num_samples
+    fraction = num_positive / advantage.shape[0]
+    return policy_loss + value_coefficient * value_loss, fraction
+
+
+def _init(
+    key: jax.Array, config: Config, observation_size: int, action_size: int
+) -> Replay:
+    return init_replay(config.sil_buffer_steps, observation_size, action_size)
+
+
+def _update_and_reward(
+    replay: Replay, context: Context, key: jax.Array
+) -> tuple[Replay, jax.Array, Metrics]:
+    config, gamma = context.config, context.hyperparameters.gamma
+    replay = insert(replay, context.history, config.num_steps, gamma)
+    return replay, context.rollout.reward, {}
+
+
+def _update_policy(
+    replay: Replay,
+    params: Any,
+    optimizer_state: Any,
+    learning_rate: jax.Array,
+    context: Context,
+    key: jax.Array,
+) -> tuple[Replay, Any, Any, Metrics]:
+    config, hyperparameters = context.config, context.hyperparameters
+    normalize = lambda x: normalization.normalize(context.normalizer, x)
+
+    def objective(params: Any, rows: Replay, weight: jax.Array) -> Any:
+        observation = normalize(rows.observation)
+        log_prob = gaussian_log_prob(
+            *context.policy(params["policy"], observation), rows.action
+        )
+        value = context.value(params["value"], observation)
+        total, fraction = loss(
+            log_prob,
+            value,
+            rows.return_,
+            weight,
+            hyperparameters.sil_value_coefficient,
+        )
+        return total, (value, fraction)
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        params, optimizer_state, priority = carry
+        place, weight = sample(
+            key, replay.replace(priority=priority), config.sil_minibatch_size
+        )
+        rows = jax.tree.map(lambda x: x[place], replay.replace(cursor=replay.priority))
+        gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
+            params, rows, weight
+        )
+        new_params, new_state = {}, {}
+        for name in params:
+            new_params[name], new_state[name] = ppo.descend(
+                params[name],
+                optimizer_state[name],
+                gradient[name],
+                learning_rate,
+                hyperparameters,
+            )
+        advantage = jnp.clip(rows.return_ - value, 0.0, _HIGHEST_ADVANTAGE)
+        priority = priority.at[place].set(jnp.maximum(advantage, _LEAST_PRIORITY))
+        return (new_params, new_state, priority), fraction
+
+    before = (params, optimizer_state, replay.priority)
+    after, fraction = jax.lax.scan(
+        step, before, jax.random.split(key, config.sil_updates)
+    )
+    filled = jnp.any(replay.priority > 0)
+    params, optimizer_state, priority = jax.tree.map(
+        lambda a, b: jnp.where(filled, a, b), after, before
+    )
+    metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}
+    return replay.replace(priority=priority), params, optimizer_state, metrics
+
+
+PPO_SIL = Imitation(_init, _update_and_reward, _update_policy)

@@ -1,0 +1,91 @@
+"""PPO+SIL's replay and loss against plain Python."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gasil_jax import good_trajectories
+from gasil_jax.imitation import self_imitation
+
+GAMMA = 0.9
+
+
+def test_replay_holds_the_returns_of_ended_episodes_across_batches():
+    """Four batches of three steps in two environments, against lists of episodes."""
+    rng = np.random.default_rng(1)
+    num_steps, num_envs, capacity = 3, 2, 15
+    history = good_trajectories.init_history(num_envs, num_steps, 9, 1, 1)
+    replay = self_imitation.init_replay(capacity, 1, 1)
+    running = [[] for _ in range(num_envs)]
+    expected = []
+    for batch in range(6):
+        observation = rng.normal(size=(num_steps, num_envs, 1)).astype("f")
+        reward = rng.normal(size=(num_steps, num_envs)).astype("f")
+        ended = rng.random((num_steps, num_envs)) < 0.3
+        if batch == 3:
+            reward[1, 0] = np.nan
+        history = good_trajectories.record(
+            history, observation, -observation, reward, ended
+        )
+        replay = self_imitation.insert(replay, history, num_steps, GAMMA)
+        for env in range(num_envs):
+            for t in range(num_steps):
+                running[env].append((observation[t, env, 0], reward[t, env]))
+                if ended[t, env]:
+                    return_ = 0.0
+                    steps = []
+                    for seen, r in reversed(running[env]):
+                        return_ = r + GAMMA * return_
+                        if np.isfinite(return_):
+                            steps.append((seen, return_))
+                    expected.extend(reversed(steps))
+                    running[env] = []
+        size = min(len(expected), capacity)
+        assert int(jnp.sum(replay.priority > 0)) == size
+        place = (np.arange(len(expected) - size, len(expected))) % capacity
+        kept = np.array(expected[len(expected) - size :]).reshape(-1, 2)
+        np.testing.assert_allclose(replay.observation[place, 0], kept[:, 0])
+        np.testing.assert_allclose(replay.action[place, 0], -kept[:, 0])
+        np.testing.assert_allclose(replay.return_[place], kept[:, 1], rtol=1e-5)
+    assert len(expected) > capacity
+
+
+def test_sampling_follows_the_priorities():
+    priority = jnp.array([0.0, 1.0, 0.25, 1e-6, 3.0, 0.0])
+    replay = self_imitation.init_replay(6, 1, 1).replace(priority=priority)
+    place, weight = self_imitation.sample(jax.random.key(0), replay, 100_000)
+    mass = np.where(priority > 0, np.asarray(priority, np.float64) ** 0.6, 0.0)
+    probability = mass / mass.sum()
+    found = np.bincount(place, minlength=6) / 100_000
+    np.testing.assert_allclose(found, probability, atol=5e-3)
+    importance = (4 * probability[place]) ** -0.1
+    importance /= (4 * probability[probability > 0].min()) ** -0.1
+    np.testing.assert_allclose(weight, importance, rtol=1e-4)
+
+
+def test_loss_and_its_gradient_against_numpy():
+    rng = np.random.default_rng(2)
+    log_prob, value, return_ = rng.normal(size=(3, 100)) * [[4.0], [1.0], [1.0]]
+    weight = rng.random(100)
+    advantage = np.clip(return_ - value, 0.0, 1.0)
+    count = max(np.sum(advantage > 0), 64)
+
+    def total(log_prob, value):
+        arrays = (log_prob, value, return_, weight)
+        arrays = (jnp.asarray(x, jnp.float32) for x in arrays)
+        return self_imitation.loss(*arrays, 0.01)[0]
+
+    by_log_prob, by_value = jax.grad(total, argnums=(0, 1))(
+        jnp.asarray(log_prob, jnp.float32), jnp.asarray(value, jnp.float32)
+    )
+    free = -log_prob < 5.0
+    expected = -weight * advantage * free / count
+    np.testing.assert_allclose(by_log_prob, expected, rtol=1e-4, atol=1e-8)
+    np.testing.assert_allclose(
+        by_value, -0.01 * weight * advantage / count, rtol=1e-4, atol=1e-8
+    )
+    policy_part = np.sum(weight * advantage * np.minimum(-log_prob, 5.0)) / count
+    value_part = -0.01 * np.sum(weight * advantage * value) / count
+    np.testing.assert_allclose(
+        total(log_prob, value), policy_part + value_part, rtol=1e-4
+    )
