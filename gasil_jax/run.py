@@ -3,12 +3,9 @@
 Parses, drives the training loop in chunks, logs and saves. No algorithm is here.
 """
 
-import contextlib
 import dataclasses
-import io
 import os
 import pathlib
-import re
 import sys
 import time
 from collections.abc import Sequence
@@ -17,6 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from gasil_jax import command_line
+from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, validate
 
 
@@ -49,50 +48,6 @@ class Options:
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Config
     )
-
-
-class InputError(Exception):
-    """Bad input, in one line."""
-
-
-def parse(arguments: Sequence[str] | None = None) -> Options:
-    """Options from the command line.
-
-    Raises:
-      InputError: what tyro refuses, its message in one line.
-    """
-    printed = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(printed):
-            return tyro.cli(
-                tyro.conf.OmitArgPrefixes[Options],
-                args=arguments,
-                prog="python -m gasil_jax.run",
-            )
-    except SystemExit as exit_:
-        if exit_.code in (0, None):
-            raise
-        raise InputError(_in_one_line(printed.getvalue())) from None
-
-
-def _in_one_line(refusal: str) -> str:
-    """What a framed message of tyro says, without frame, title and pointers."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    # Drawn with lines, with ASCII or with blanks, as the terminal's encoding allows.
-    lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
-    _title, *rest = [line for line in lines if line.strip("-")]
-    message = " ".join(" ".join(rest).split())
-    message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
-    number = re.match(
-        r"Error parsing --([\w-]+): (?:invalid literal for (int)|could not convert)"
-        r".*: '(.*)'$",
-        message,
-    )
-    if number is None:
-        return message
-    name, whole, value = number.groups()
-    kind = "a whole number" if whole else "a number"
-    return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
 def check(options: Options) -> None:
@@ -165,7 +120,7 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
     """Train, log and save; returns the summary."""
     import jax
 
-    from gasil_jax import environments, logging, plotting, sweep
+    from gasil_jax import checkpoint, environments, logging, plotting, sweep
     from gasil_jax.progress import Progress
 
     config = options.config
@@ -213,6 +168,9 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
             )
         train_seconds = time.monotonic() - started
     writer.close()
+    checkpoint.save(
+        folder / "checkpoint", jax.tree.map(lambda x: x[: options.seeds], states)
+    )
 
     returns = np.concatenate([m["episode_return"] for m in history], axis=1)
     steps = np.concatenate([m["env_steps"][0] for m in history])
@@ -259,7 +217,7 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     try:
-        options = parse(arguments)
+        options = command_line.parse(Options, arguments, "gasil_jax.run")
         check(options)
         folder = make_run_folder(options)
     except InputError as error:

@@ -49,7 +49,8 @@ class TrainState:
     iteration: jax.Array
 
 
-def _max_episode_steps(env: Any, config: Config) -> int:
+def max_episode_steps(env: Any, config: Config) -> int:
+    """Steps after which an episode is truncated, at the latest."""
     return config.max_episode_steps or getattr(env, "episode_length", 1000)
 
 
@@ -86,7 +87,7 @@ def init(
         history=good_trajectories.init_history(
             config.num_envs,
             config.num_steps,
-            _max_episode_steps(env, config),
+            max_episode_steps(env, config),
             observation_size,
             action_size,
         ),
@@ -124,7 +125,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         state.environments,
         act_key,
         num_steps=config.num_steps,
-        max_episode_steps=_max_episode_steps(env, config),
+        max_episode_steps=max_episode_steps(env, config),
         gamma=hp.gamma,
     )
     # Update the good trajectory buffer.

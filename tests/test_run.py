@@ -64,13 +64,27 @@ def test_a_run_from_end_to_end(finished):
     assert (out / "learning_curve.png").read_bytes().startswith(b"\x89PNG")
 
 
+def test_the_final_policies_are_scored(finished, capsys):
+    from gasil_jax.evaluate import main
+
+    _, out = finished
+    assert main([str(out), "--episodes", "4"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "mean"]
+    assert main([str(out.parent)]) == 2
+    assert "must be the folder of a finished run" in capsys.readouterr().err
+    assert main([str(out), "--episodes", "0"]) == 2
+    assert "episodes is 0" in capsys.readouterr().err
+
+
 def test_a_used_folder_is_refused_and_left_alone(finished):
     _, out = finished
-    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    contents = lambda: {p.name: p.read_bytes() for p in out.iterdir() if p.is_file()}
+    before = contents()
     result = run(*SMALL, "--out", str(out), cwd=out.parent)
     assert result.returncode == 2
     assert "not empty" in result.stderr
-    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+    assert contents() == before
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,60 @@
+"""Parsing a command line into a dataclass, with refusals of one line."""
+
+import contextlib
+import io
+import re
+from collections.abc import Sequence
+from typing import TypeVar
+
+import tyro
+
+T = TypeVar("T")
+
+
+class InputError(ValueError):
+    """Bad input, in one line that names the value and what is allowed."""
+
+
+def parse(options: type[T], arguments: Sequence[str] | None, program: str) -> T:
+    """Options from the command line; prints help and exits where that is asked for.
+
+    Args:
+      options: a dataclass.
+      arguments: default what the program was started with.
+      program: the module that was started.
+
+    Raises:
+      InputError: what tyro refuses, its message in one line.
+    """
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed):
+            return tyro.cli(
+                tyro.conf.OmitArgPrefixes[options],
+                args=arguments,
+                prog=f"python -m {program}",
+            )
+    except SystemExit as exit_:
+        if exit_.code in (0, None):
+            raise
+        raise InputError(_in_one_line(printed.getvalue())) from None
+
+
+def _in_one_line(refusal: str) -> str:
+    """What a framed message of tyro says, without frame, title and pointers."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
+    # Drawn with lines, with ASCII or with blanks, as the terminal's encoding allows.
+    lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
+    _title, *rest = [line for line in lines if line.strip("-")]
+    message = " ".join(" ".join(rest).split())
+    message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
+    number = re.match(
+        r"Error parsing --([\w-]+): (?:invalid literal for (int)|could not convert)"
+        r".*: '(.*)'$",
+        message,
+    )
+    if number is None:
+        return message
+    name, whole, value = number.groups()
+    kind = "a whole number" if whole else "a number"
+    return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"

@@ -1,0 +1,183 @@
+"""Score policies: as a function, and ``python -m gasil_jax.evaluate RUN``."""
+
+import dataclasses
+import json
+import pathlib
+import sys
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from gasil_jax import command_line, environments, normalization, train
+from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.networks import Policy
+
+
+def evaluate(
+    env: Any,
+    config: Config,
+    state: train.TrainState,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    deterministic: bool = True,
+) -> dict[str, jax.Array]:
+    """Run whole episodes with the policy of one training state.
+
+    Pure: jit it, and vmap it over states. The return is of the environment's true
+    reward (undelayed, unshaped, undiscounted).
+
+    Args:
+      env: one environment.
+      config: of the run.
+      state: of one run, not of a batch of them.
+      key: consumed.
+      num_episodes: run side by side.
+      deterministic: act with the policy's mean; else draw from the policy.
+
+    Returns:
+      "episode_return" and "episode_length", (num_episodes,) each.
+    """
+    policy = Policy(config.hidden_sizes, env.action_size)
+    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    reset_key, act_key = jax.random.split(key)
+
+    def act(observation: jax.Array, key: jax.Array) -> jax.Array:
+        observation = normalization.normalize(state.normalizer, observation)
+        mean, log_std = policy.apply(state.params["policy"], observation)
+        noise = jax.random.normal(key, mean.shape, mean.dtype)
+        action = mean if deterministic else mean + jnp.exp(log_std) * noise
+        return jnp.clip(action, low, high)
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        states, running, return_, length = carry
+        states = jax.vmap(env.step)(states, act(states.obs, key))
+        reward = states.info.get("true_reward", states.reward)
+        return_ = return_ + jnp.where(running, reward, 0.0)
+        length = length + running
+        running = running & ~(states.done > 0) & jnp.isfinite(reward)
+        return (states, running, return_, length), None
+
+    start = (
+        jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes)),
+        jnp.ones(num_episodes, bool),
+        jnp.zeros(num_episodes),
+        jnp.zeros(num_episodes, jnp.int32),
+    )
+    keys = jax.random.split(act_key, train.max_episode_steps(env, config))
+    _, _, return_, length = jax.lax.scan(step, start, keys)[0]
+    return {"episode_return": return_, "episode_length": length}
+
+
+def numpy_policy(
+    state: train.TrainState, action_range: tuple[Any, Any] = (-1.0, 1.0)
+) -> Callable[[np.ndarray], np.ndarray]:
+    """The deterministic policy of one training state, in NumPy alone.
+
+    For Gymnasium and other programs without JAX: (..., obs) -> (..., action), clipped
+    to `action_range`.
+    """
+    params = jax.tree.map(np.asarray, state.params["policy"]["params"])
+    normalizer = jax.tree.map(np.asarray, state.normalizer)
+    layers = [params["MLP_0"][f"Dense_{i}"] for i in range(len(params["MLP_0"]))]
+
+    def act(observation: np.ndarray) -> np.ndarray:
+        variance = normalizer.m2 / max(normalizer.count, 1.0)
+        x = (observation - normalizer.mean) / np.sqrt(variance + 1e-8)
+        x = np.clip(x, -10.0, 10.0)
+        for layer in layers[:-1]:
+            x = np.tanh(x @ layer["kernel"] + layer["bias"])
+        return np.clip(x @ layers[-1]["kernel"] + layers[-1]["bias"], *action_range)
+
+    return act
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Score the final policies of a run.
+
+    Attributes:
+      run: the run's folder.
+      episodes: how many for each seed.
+      stochastic: draw actions from the policy instead of taking its mean.
+      key: of the episodes' starts and actions.
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    episodes: int = 20
+    stochastic: bool = False
+    key: int = 0
+
+
+def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
+    """Environment, config, seed numbers and final states (seed, ...) of a run.
+
+    Raises:
+      ValueError: it is not the folder of a finished run.
+    """
+    from gasil_jax import checkpoint
+
+    path = folder / "config.json"
+    if not (folder / "checkpoint").is_dir() or not path.is_file():
+        raise ValueError(f"run is {folder}: it must be the folder of a finished run")
+    described = json.loads(path.read_text())
+    fields = described["config"]
+    fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
+    config = Config(
+        **{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
+    )
+    env = environments.make_env(
+        described["env"],
+        **{k: described[k] for k in ("reward_delay", "obs_noise", "solver")},
+    )
+    first, count = described["first_seed"], described["seeds"]
+    seeds = list(range(first, first + count))
+    like = jax.eval_shape(
+        jax.vmap(lambda seed: train.init(env, config, jax.random.key(seed))),
+        jnp.arange(count, dtype=jnp.uint32),
+    )
+    return env, config, seeds, checkpoint.restore(folder / "checkpoint", like)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
+        if options.episodes < 1:
+            raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
+        env, config, seeds, states = load(options.run)
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    jax.config.update("jax_default_matmul_precision", "highest")
+    score = jax.jit(
+        jax.vmap(
+            lambda state, key: evaluate(
+                env,
+                config,
+                state,
+                key,
+                num_episodes=options.episodes,
+                deterministic=not options.stochastic,
+            )
+        )
+    )
+    keys = jax.random.split(jax.random.key(options.key), len(seeds))
+    scores = jax.tree.map(np.asarray, score(states, keys))
+    print("seed  episodes      return     spread  length")
+    for i, seed in enumerate(seeds):
+        returns, length = scores["episode_return"][i], scores["episode_length"][i]
+        print(
+            f"{seed:4d}  {options.episodes:8d}  {returns.mean():10.2f} "
+            f"{returns.std():10.2f}  {length.mean():6.1f}"
+        )
+    print(f"mean over seeds: {scores['episode_return'].mean():.2f}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
