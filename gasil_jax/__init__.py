@@ -1,9 +1,9 @@
 """Generative Adversarial Self-Imitation Learning in JAX (Guo, Oh, Singh, Lee 2018)."""
 
+from gasil_jax.batch import member
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.environments import make_env
 from gasil_jax.imitation import AGENTS
-from gasil_jax.sweep import member
 from gasil_jax.train import TrainState, init, iterate, make_train
 
 

@@ -106,71 +106,68 @@ def make_run_folder(options: Options) -> pathlib.Path:
     return folder
 
 
-def _use_devices(options: Options) -> None:
+def use_devices(options: Options, num_members: int) -> None:
     """Settings that must stand before JAX starts."""
     import jax
 
     count = options.devices or os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", min(count, options.seeds))
+    jax.config.update("jax_num_cpu_devices", min(count, num_members))
     # TF32 has ruined PPO runs on Ampere and later GPUs.
     jax.config.update("jax_default_matmul_precision", "highest")
 
 
-def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
-    """Train, log and save; returns the summary."""
-    import jax
+def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
+    """Write config.json: every option, the config's fields under "config"."""
+    from gasil_jax import logging
 
-    from gasil_jax import checkpoint, environments, logging, plotting, sweep
-    from gasil_jax.progress import Progress
-
-    config = options.config
-    seeds = range(options.first_seed, options.first_seed + options.seeds)
     described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    described |= {"out": str(folder), "config": dataclasses.asdict(config)}
-    logging.write_json(folder / "config.json", described)
-    env = environments.make_env(
+    described |= {"out": str(folder), "config": dataclasses.asdict(options.config)}
+    logging.write_json(folder / "config.json", described | more)
+
+
+def make_env(options: Options) -> Any:
+    """The environment that the options ask for."""
+    from gasil_jax import environments
+
+    return environments.make_env(
         options.env,
         reward_delay=options.reward_delay,
         obs_noise=options.obs_noise,
         solver=options.solver,
     )
-    chunk = max(1, min(100, config.num_iterations // 50))
+
+
+def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
+    """Train, log and save; returns the summary."""
+    from gasil_jax import batch, checkpoint, logging, plotting
+    from gasil_jax.progress import Progress
+
+    config = options.config
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
+    write_config(options, folder)
+    env = make_env(options)
     total_steps = config.num_iterations * config.batch_steps * options.seeds
     writer = logging.MetricsWriter(folder / "metrics.csv", seeds)
     history: list[dict[str, np.ndarray]] = []
     with Progress(f"{options.env} {config.agent}", total_steps) as progress:
         progress.phase("compiling")
         started = time.monotonic()
-        batch = sweep.make_seed_batch(env, config, seeds, chunk=chunk)
-        states = jax.block_until_ready(batch.init(batch.seeds))
-        advance = batch.advance.lower(states, np.int32(0)).compile()
+        runs = batch.make_batch(env, config, seeds)
+        states, advance = runs.compile()
         compile_seconds = time.monotonic() - started
 
         progress.phase("training")
         started = time.monotonic()
-        done = 0
-        while done < config.num_iterations:
-            count = min(chunk, config.num_iterations - done)
-            states, metrics = advance(states, np.int32(count))
-            metrics = {
-                name: np.asarray(value)[: options.seeds, :count]
-                for name, value in metrics.items()
-            }
-            # float32 counts exactly only to 2**24.
-            steps = (np.arange(done, done + count) + 1) * config.batch_steps
-            metrics["env_steps"] = np.broadcast_to(steps, (options.seeds, count))
+        for latest in runs.run(states, advance):
+            states, metrics = latest
             writer.write(metrics)
             history.append(metrics)
-            done += count
             progress.update(
-                done * config.batch_steps * options.seeds,
-                metrics["episode_return"],
+                int(metrics["env_steps"][:, -1].sum()), metrics["episode_return"]
             )
         train_seconds = time.monotonic() - started
     writer.close()
-    checkpoint.save(
-        folder / "checkpoint", jax.tree.map(lambda x: x[: options.seeds], states)
-    )
+    checkpoint.save(folder / "checkpoint", runs.trim(states))
 
     returns = np.concatenate([m["episode_return"] for m in history], axis=1)
     steps = np.concatenate([m["env_steps"][0] for m in history])
@@ -196,7 +193,7 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
         "compile_seconds": compile_seconds,
         "train_seconds": train_seconds,
         "env_steps_per_second": total_steps / train_seconds,
-        "device": f"{len(batch.devices)} x {batch.devices[0].device_kind}",
+        "device": f"{len(runs.devices)} x {runs.devices[0].device_kind}",
         "versions": logging.versions(),
     }
     logging.write_json(folder / "summary.json", summary)
@@ -223,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    _use_devices(options)
+    use_devices(options, options.seeds)
     summary = train(options, folder)
     mean = summary["final_return_mean"]
     print(

@@ -1,95 +1,265 @@
-"""Many seeds in one program: vmapped, and sharded over devices."""
+"""Sweeps: ``python -m gasil_jax.sweep --env hopper --seeds 5 --grid alpha=0.02,0.1``.
 
+Points that differ only in `Hyperparameters` run in one compiled program, seeds x
+points vmapped and sharded; those that differ in a field of `Config` (buffer size,
+discriminator updates) are grouped, and each group compiles once.
+"""
+
+import csv
 import dataclasses
-from collections.abc import Callable, Sequence
+import itertools
+import math
+import pathlib
+import sys
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding
-from jax.sharding import PartitionSpec as P
 
-from gasil_jax import train
-from gasil_jax.config import Config
+from gasil_jax import command_line, run
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters, nearest
 
+Point = Mapping[str, Any]
 
-def member(states: Any, index: int) -> Any:
-    """One run out of a batch of them: the leading axis of every leaf is taken away."""
-    return jax.tree.map(lambda x: x[index], states)
+_HYPERPARAMETERS = {f.name: float for f in dataclasses.fields(Hyperparameters)}
+_CONFIG = {
+    f.name: int
+    for f in dataclasses.fields(Config)
+    if f.type in (int, "int") and f.name not in ("total_steps", "num_envs")
+}
+
+#: The ranges of the paper's appendix, from which `--random` draws.
+PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
+    "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
+    "discriminator_updates": (1, 5, 10, 20),
+    "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+    "buffer_steps": (1000, 10000),
+    "alpha": (0.02, 0.1, 0.2, 1.0),
+}
 
 
 @dataclasses.dataclass(frozen=True)
-class SeedBatch:
-    """Compiled functions that train a batch of seeds on all devices.
+class Options(run.Options):
+    """Train every point of a grid, or random points, with many seeds each.
 
     Attributes:
-      num_seeds: seeds asked for; batches are padded to a multiple of the devices.
-      init: (seeds uint32 (padded,)) -> states.
-      advance: (states, num_iterations) -> states, metrics (seeds, chunk), of which
-        the first `num_iterations` are written.
-      seeds: uint32 (padded,), the absolute seed numbers, padding at the end.
-      devices: what the seeds are sharded over.
+      grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
+      random: draw so many points, from the grid's values or, without one, from the
+        ranges of the paper's appendix.
     """
 
-    num_seeds: int
-    init: Callable[[jax.Array], Any]
-    advance: Callable[[Any, int], Any]
-    seeds: np.ndarray
-    devices: Sequence[jax.Device]
+    grid: tuple[str, ...] = ()
+    random: int | None = None
 
 
-def make_seed_batch(
-    env: Any,
-    config: Config,
-    seeds: Sequence[int],
-    *,
-    chunk: int,
-    devices: Sequence[jax.Device] | None = None,
-) -> SeedBatch:
-    """Prepare to train `seeds` side by side, sharded over `devices`.
+def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """From NAME=VALUE,VALUE,... to values by name.
 
-    A seed's key is ``jax.random.key(seed)``, whatever its place in the batch and
-    the device it runs on. Nothing is compiled yet: `init` and `advance` are jitted.
-
-    Args:
-      env: one environment.
-      config: what to run.
-      seeds: absolute seed numbers.
-      chunk: most iterations in one call of `advance`.
-      devices: default all; no more of them are used than there are seeds.
+    Raises:
+      InputError: no such name, or not a number.
     """
-    train.validate(config, tuple(train.AGENTS))
-    devices = list(devices or jax.devices())[: len(seeds)]
-    padding = -len(seeds) % len(devices)
-    padded = np.array([*seeds, *([seeds[-1]] * padding)], np.uint32)
-    mesh = Mesh(np.array(devices), ("seeds",))
-
-    def init_one(seed: jax.Array) -> train.TrainState:
-        return train.init(env, config, jax.random.key(seed))
-
-    def advance(states: Any, num_iterations: jax.Array) -> Any:
-        step = jax.vmap(lambda state: train.iterate(env, config, state))
-        metrics = jax.eval_shape(step, states)[1]
-        metrics = jax.tree.map(
-            lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype), metrics
-        )
-
-        def body(index: jax.Array, carry: Any) -> Any:
-            states, metrics = carry
-            states, new = step(states)
-            write = lambda all_, one: jax.lax.dynamic_update_index_in_dim(
-                all_, one, index, 1
+    kinds = {**_HYPERPARAMETERS, **_CONFIG}
+    values = {}
+    for entry in grid:
+        name, _, listed = entry.partition("=")
+        name = name.replace("-", "_")
+        if name not in kinds:
+            raise InputError(
+                f"grid has {name!r}, which can't vary: did you mean "
+                f"{nearest(name, tuple(kinds))!r}? (one of {', '.join(kinds)})"
             )
-            return states, jax.tree.map(write, metrics, new)
+        try:
+            values[name] = tuple(kinds[name](value) for value in listed.split(","))
+        except ValueError:
+            kind = "numbers" if kinds[name] is float else "whole numbers"
+            raise InputError(
+                f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
+            ) from None
+    return values
 
-        return jax.lax.fori_loop(0, num_iterations, body, (states, metrics))
 
-    # No collective in the loop: each device trains its share of the seeds alone.
-    shard = lambda function, in_specs: jax.shard_map(
-        function, mesh=mesh, in_specs=in_specs, out_specs=P("seeds"), check_vma=False
+def make_points(options: Options) -> list[dict[str, Any]]:
+    """The points of a sweep, without repetitions.
+
+    Raises:
+      InputError: there is nothing to vary.
+    """
+    values = parse_grid(options.grid)
+    if options.random is None:
+        if not values:
+            raise InputError("grid is empty: it must be NAME=VALUE,... or use --random")
+        return [
+            dict(zip(values, point, strict=True))
+            for point in itertools.product(*values.values())
+        ]
+    if options.random < 1:
+        raise InputError(f"random is {options.random}: it must be 1 or more")
+    values = values or PAPER_RANGES
+    every = list(itertools.product(*values.values()))
+    count = min(options.random, len(every))
+    chosen = np.random.default_rng(options.first_seed).choice(
+        len(every), count, replace=False
     )
-    sharding = NamedSharding(mesh, P("seeds"))
-    init = jax.jit(shard(jax.vmap(init_one), P("seeds")), in_shardings=sharding)
-    advance = jax.jit(shard(advance, (P("seeds"), P())), donate_argnums=0)
-    return SeedBatch(len(seeds), init, advance, padded, devices)
+    return [dict(zip(values, every[i], strict=True)) for i in chosen]
+
+
+def configure(config: Config, point: Point) -> Config:
+    """The configuration of a point."""
+    static = {name: value for name, value in point.items() if name in _CONFIG}
+    traced = {name: value for name, value in point.items() if name in _HYPERPARAMETERS}
+    return config.replace(
+        **static, hyperparameters=config.hyperparameters.replace(**traced)
+    )
+
+
+def group(config: Config, points: Sequence[Point]) -> dict[Config, list[int]]:
+    """Indices of points by the program that they share."""
+    groups: dict[Config, list[int]] = {}
+    for index, point in enumerate(points):
+        shared = configure(config, point).replace(
+            hyperparameters=config.hyperparameters
+        )
+        groups.setdefault(shared, []).append(index)
+    return groups
+
+
+def sweep(options: Options, points: Sequence[Point], folder: pathlib.Path) -> Any:
+    """Train all points, log and save; returns the summary."""
+    from gasil_jax import batch, logging
+    from gasil_jax.progress import Progress
+
+    run.write_config(options, folder, points=points)
+    env = run.make_env(options)
+    config, num_seeds = options.config, options.seeds
+    seeds = list(range(options.first_seed, options.first_seed + num_seeds))
+    members = len(points) * num_seeds
+    total = config.num_iterations * config.batch_steps * members
+    returns: dict[int, np.ndarray] = {}
+    diverged: dict[int, np.ndarray] = {}
+    done = 0
+    with Progress(f"{options.env} {config.agent} sweep", total) as progress:
+        for number, (shared, indices) in enumerate(group(config, points).items()):
+            progress.phase(f"compiling program {number + 1}")
+            runs = batch.make_batch(
+                env,
+                shared,
+                seeds * len(indices),
+                [
+                    configure(config, points[i]).hyperparameters
+                    for i in indices
+                    for _ in seeds
+                ],
+            )
+            states, advance = runs.compile()
+            progress.phase("training")
+            history, losses = [], []
+            for _, metrics in runs.run(states, advance):
+                history.append(metrics["episode_return"])
+                losses.append(np.isfinite(metrics["policy_loss"]))
+                steps = int(metrics["env_steps"][:, -1].sum())
+                progress.update(done + steps, metrics["episode_return"])
+            done += steps
+            shape = (len(indices), num_seeds, -1)
+            by_point = np.concatenate(history, axis=1).reshape(shape)
+            fine = np.concatenate(losses, axis=1).all(axis=1).reshape(shape[:2])
+            for place, index in enumerate(indices):
+                returns[index] = by_point[place]
+                diverged[index] = ~fine[place]
+
+    final = {i: run.final_returns(returns[i]) for i in returns}
+    names = sorted({name for point in points for name in point})
+    with (folder / "results.csv").open("x", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["point", "seed", *names, "final_return", "diverged"])
+        for index, point in enumerate(points):
+            for seed, value, bad in zip(seeds, final[index], diverged[index]):
+                cell = "" if math.isnan(value) else f"{value:.7g}"
+                row = [index, seed, *(point[name] for name in names), cell, int(bad)]
+                writer.writerow(row)
+    np.savez_compressed(
+        folder / "curves.npz",
+        episode_return=np.stack([returns[i] for i in range(len(points))]),
+    )
+    fine = [i for i in final if not diverged[i].any() and np.isfinite(final[i]).all()]
+    best = lambda score: max(fine, key=score) if fine else None
+    summary = {
+        "points": [
+            {
+                **point,
+                "mean": _finite(final[i].mean()),
+                "worst_seed": _finite(final[i].min()),
+                "diverged_seeds": int(diverged[i].sum()),
+            }
+            for i, point in enumerate(points)
+        ],
+        "best_by_mean": best(lambda i: final[i].mean()),
+        "best_by_worst_seed": best(lambda i: final[i].min()),
+        "versions": logging.versions(),
+    }
+    logging.write_json(folder / "summary.json", summary)
+    _plot(folder / "sweep.png", points, final)
+    return summary
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def _label(point: Point) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+
+
+def _plot(
+    path: pathlib.Path, points: Sequence[Point], final: Mapping[int, np.ndarray]
+) -> None:
+    """Every seed's final return and their mean, a row for each point."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    size = (8.0, 1.0 + 0.35 * len(points))
+    figure, axes = plt.subplots(figsize=size, layout="constrained")
+    for row in range(len(points)):
+        axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
+        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
+    axes.set_yticks(range(len(points)), [_label(point) for point in points])
+    axes.set(xlabel="final return (each seed; the bar is their mean)")
+    axes.invert_yaxis()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = command_line.parse(Options, arguments, "gasil_jax.sweep")
+        run.check(options)
+        points = make_points(options)
+        for point in points:
+            run.check(
+                dataclasses.replace(options, config=configure(options.config, point))
+            )
+        folder = run.make_run_folder(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    run.use_devices(options, len(points) * options.seeds)
+    summary = sweep(options, points, folder)
+    for title in ("best_by_mean", "best_by_worst_seed"):
+        best = summary[title]
+        if best is None:
+            print(f"{title}: none, every point has a seed that diverged or never ended")
+            continue
+        scores = summary["points"][best]
+        print(
+            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
+            f"worst seed {scores['worst_seed']:.1f})"
+        )
+    print(f"in {folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,152 @@
+"""Many runs in one program: vmapped, and sharded over devices."""
+
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+from gasil_jax import train
+from gasil_jax.config import Config, Hyperparameters
+
+
+def member(states: Any, index: int) -> Any:
+    """One run out of a batch of them: the leading axis of every leaf is taken away."""
+    return jax.tree.map(lambda x: x[index], states)
+
+
+@dataclasses.dataclass(frozen=True)
+class Batch:
+    """Functions that train many members, each a seed with its hyperparameters.
+
+    Attributes:
+      num_members: asked for; arrays are padded to a multiple of the devices.
+      config: what runs.
+      chunk: most iterations in one call of `advance`.
+      init: () -> states, (padded, ...) each leaf.
+      advance: (states, num_iterations) -> states, metrics (padded, chunk), of which
+        the first `num_iterations` are written. Takes the states' memory.
+      devices: what the members are sharded over.
+    """
+
+    num_members: int
+    config: Config
+    chunk: int
+    init: Callable[[], Any]
+    advance: Callable[[Any, Any], Any]
+    devices: Sequence[jax.Device]
+
+    def compile(self) -> tuple[Any, Callable[[Any, Any], Any]]:
+        """The first states, and `advance`, compiled."""
+        states = jax.block_until_ready(self.init())
+        return states, self.advance.lower(states, np.int32(0)).compile()
+
+    def run(
+        self, states: Any, advance: Callable[[Any, Any], Any]
+    ) -> Iterator[tuple[Any, dict[str, np.ndarray]]]:
+        """Train to the end, chunk by chunk.
+
+        Yields:
+          states, not valid once the next chunk is asked for, and the chunk's
+          metrics, (members, iterations) each; "env_steps" are whole numbers.
+        """
+        config = self.config
+        for done in range(0, config.num_iterations, self.chunk):
+            count = min(self.chunk, config.num_iterations - done)
+            states, metrics = advance(states, np.int32(count))
+            metrics = {
+                name: np.asarray(value)[: self.num_members, :count]
+                for name, value in metrics.items()
+            }
+            # float32 counts exactly only to 2**24.
+            steps = (np.arange(done, done + count) + 1) * config.batch_steps
+            metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
+            yield states, metrics
+
+    def trim(self, states: Any) -> Any:
+        """States without the padding: (members, ...)."""
+        return jax.tree.map(lambda x: x[: self.num_members], states)
+
+
+def chunk_size(config: Config) -> int:
+    """Iterations between two looks at a run: about 50 looks, 100 iterations at most."""
+    return max(1, min(100, config.num_iterations // 50))
+
+
+def make_batch(
+    env: Any,
+    config: Config,
+    seeds: Sequence[int],
+    hyperparameters: Sequence[Hyperparameters] | None = None,
+    *,
+    devices: Sequence[jax.Device] | None = None,
+) -> Batch:
+    """Prepare to train members side by side, sharded over `devices`.
+
+    A member's key is ``jax.random.key(seed)``, whatever its place in the batch and
+    the device it runs on. Nothing is compiled yet.
+
+    Args:
+      env: one environment.
+      config: what to run.
+      seeds: absolute seed number of each member.
+      hyperparameters: of each member; default the config's for all.
+      devices: default all; no more of them are used than there are members.
+
+    Raises:
+      ValueError: a bad configuration.
+    """
+    train.validate(config, tuple(train.AGENTS))
+    if hyperparameters is None:
+        hyperparameters = [config.hyperparameters] * len(seeds)
+    devices = list(devices or jax.devices())[: len(seeds)]
+    padding = -len(seeds) % len(devices)
+    pad = lambda values: [*values, *([values[-1]] * padding)]
+    members = (
+        np.array(pad(seeds), np.uint32),
+        jax.tree.map(lambda *x: np.array(x, np.float32), *pad(hyperparameters)),
+    )
+    chunk = chunk_size(config)
+    mesh = Mesh(np.array(devices), ("members",))
+
+    def init_one(member: tuple[jax.Array, Hyperparameters]) -> train.TrainState:
+        seed, hyperparameters = member
+        return train.init(env, config, jax.random.key(seed), hyperparameters)
+
+    def advance(states: Any, num_iterations: jax.Array) -> Any:
+        step = jax.vmap(lambda state: train.iterate(env, config, state))
+        metrics = jax.eval_shape(step, states)[1]
+        metrics = jax.tree.map(
+            lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype), metrics
+        )
+
+        def body(index: jax.Array, carry: Any) -> Any:
+            states, metrics = carry
+            states, new = step(states)
+            write = lambda all_, one: jax.lax.dynamic_update_index_in_dim(
+                all_, one, index, 1
+            )
+            return states, jax.tree.map(write, metrics, new)
+
+        return jax.lax.fori_loop(0, num_iterations, body, (states, metrics))
+
+    # No collective in the loop: each device trains its share of the members alone.
+    spec = P("members")
+    shard = lambda function, in_specs: jax.shard_map(
+        function, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
+    )
+    init = jax.jit(
+        shard(jax.vmap(init_one), (spec,)), in_shardings=NamedSharding(mesh, spec)
+    )
+    return Batch(
+        num_members=len(seeds),
+        config=config,
+        chunk=chunk,
+        init=lambda: init(members),
+        advance=jax.jit(shard(advance, (spec, P())), donate_argnums=0),
+        devices=devices,
+    )

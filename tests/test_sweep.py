@@ -1,0 +1,90 @@
+"""Sweeps: what runs, what is refused, and that a point is what it is alone."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from gasil_jax import command_line, run, sweep
+from gasil_jax.config import Config
+
+SMALL = (
+    *("--env", "point_mass", "--total-steps", "512", "--batch-steps", "256"),
+    *("--num-envs", "4", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--num-epochs", "2", "--buffer-steps", "300"),
+)
+
+
+def options(*arguments):
+    return command_line.parse(sweep.Options, ["--env", "point_mass", *arguments], "x")
+
+
+def test_a_grid_is_every_combination():
+    points = sweep.make_points(
+        options("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
+    )
+    assert points == [
+        {"alpha": 0.1, "discriminator_updates": 1},
+        {"alpha": 0.1, "discriminator_updates": 5},
+        {"alpha": 1.0, "discriminator_updates": 1},
+        {"alpha": 1.0, "discriminator_updates": 5},
+    ]
+    groups = sweep.group(Config(), points)
+    assert sorted(groups.values()) == [[0, 2], [1, 3]]
+
+
+def test_random_points_are_distinct_and_of_the_papers_ranges():
+    points = sweep.make_points(options("--random", "16"))
+    assert len({tuple(point.items()) for point in points}) == 16
+    for point in points:
+        assert set(point) == set(sweep.PAPER_RANGES)
+        assert all(value in sweep.PAPER_RANGES[name] for name, value in point.items())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--grid alhpa=1", "did you mean 'alpha'"),
+        ("--grid alpha=1,big", "commas between"),
+        ("--grid buffer_steps=1.5", "whole numbers"),
+        ("--grid alpha=0.1,-1", "alpha is -1.0"),
+        ("--grid minibatch_size=64,60", "minibatch_size is 60"),
+        ("--random 0", "random is 0"),
+        ("", "grid is empty"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
+    assert sweep.main(["--env", "point_mass", *arguments.split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
+    out = tmp_path / "sweep"
+    arguments = (*SMALL, "--seeds", "2", "--out", str(out))
+    # The last point's first step is beyond float32: it must not harm the others.
+    grid = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=1,3")
+    assert sweep.main([*arguments, *grid]) == 0
+    assert "best_by_mean: learning_rate=0.0003" in capsys.readouterr().out
+
+    rows = list(csv.DictReader((out / "results.csv").open()))
+    assert [(row["point"], row["seed"]) for row in rows] == [
+        (str(point), str(seed)) for point in range(4) for seed in range(2)
+    ]
+    assert [int(row["diverged"]) for row in rows] == [0] * 4 + [1] * 4
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["best_by_mean"] in (0, 1)
+    assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+
+    for point, updates in enumerate(("1", "3")):
+        alone = tmp_path / f"alone{updates}"
+        more = ("--discriminator-updates", updates, "--out", str(alone))
+        assert run.main([*SMALL, "--seeds", "2", *more]) == 0
+        expected = json.loads((alone / "summary.json").read_text())["final_return"]
+        mine = [row for row in rows if row["point"] == str(point)]
+        found = {row["seed"]: float(row["final_return"]) for row in mine}
+        assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    curves = np.load(out / "curves.npz")["episode_return"]
+    assert curves.shape == (4, 2, 2)
