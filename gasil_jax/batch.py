@@ -100,7 +100,7 @@ def make_batch(
     Raises:
       ValueError: a bad configuration.
     """
-    train.validate(config, tuple(train.AGENTS))
+    train.check(env, config)
     if hyperparameters is None:
         hyperparameters = [config.hyperparameters] * len(seeds)
     devices = list(devices or jax.devices())[: len(seeds)]

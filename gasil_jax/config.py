@@ -70,6 +70,8 @@ class Config:
       sil_updates: gradient steps of PPO+SIL's own an iteration.
       sil_minibatch_size: replayed steps in each.
       sil_buffer_steps: capacity of PPO+SIL's replay, in steps.
+      expert: what GAIL imitates: an .npz file with arrays "observation" and
+        "action", or "minari:" and the name of a data set.
       max_episode_steps: an episode is truncated after so many steps; None takes
         the environment's own limit, or 1000 if it has none.
       hyperparameters: the floats; `make_train` can replace them under a trace.
@@ -91,6 +93,7 @@ class Config:
     sil_updates: int = 10
     sil_minibatch_size: int = 512
     sil_buffer_steps: int = 100_000
+    expert: str | None = None
     max_episode_steps: int | None = None
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
@@ -154,7 +157,7 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
         )
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name in ("agent", "hyperparameters") or value is None:
+        if field.name in ("agent", "expert", "hyperparameters") or value is None:
             continue
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool) or not isinstance(number, int) or number < 1:

@@ -3,6 +3,7 @@
 Parses, drives the training loop in chunks, logs and saves. No algorithm is here.
 """
 
+import contextlib
 import dataclasses
 import os
 import pathlib
@@ -51,7 +52,7 @@ class Options:
 
 
 def check(options: Options) -> None:
-    """Refuse bad input before anything compiles.
+    """Refuse bad input before anything is built or compiled.
 
     Raises:
       InputError: the value and what is allowed.
@@ -111,7 +112,9 @@ def use_devices(options: Options, num_members: int) -> None:
     import jax
 
     count = options.devices or os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", min(count, num_members))
+    # In a program that has used JAX already, its devices stay as they are.
+    with contextlib.suppress(RuntimeError):
+        jax.config.update("jax_num_cpu_devices", min(count, num_members))
     # TF32 has ruined PPO runs on Ampere and later GPUs.
     jax.config.update("jax_default_matmul_precision", "highest")
 
@@ -126,18 +129,28 @@ def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
 
 
 def make_env(options: Options) -> Any:
-    """The environment that the options ask for."""
-    from gasil_jax import environments
+    """The environment that the options ask for.
 
-    return environments.make_env(
+    Raises:
+      InputError: the agent can't run in it.
+    """
+    from gasil_jax import environments
+    from gasil_jax import train as training
+
+    env = environments.make_env(
         options.env,
         reward_delay=options.reward_delay,
         obs_noise=options.obs_noise,
         solver=options.solver,
     )
+    try:
+        training.check(env, options.config)
+    except ValueError as error:
+        raise InputError(str(error)) from None
+    return env
 
 
-def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
+def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
     """Train, log and save; returns the summary."""
     from gasil_jax import batch, checkpoint, logging, plotting
     from gasil_jax.progress import Progress
@@ -145,7 +158,6 @@ def train(options: Options, folder: pathlib.Path) -> dict[str, Any]:
     config = options.config
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     write_config(options, folder)
-    env = make_env(options)
     total_steps = config.num_iterations * config.batch_steps * options.seeds
     writer = logging.MetricsWriter(folder / "metrics.csv", seeds)
     history: list[dict[str, np.ndarray]] = []
@@ -216,12 +228,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = command_line.parse(Options, arguments, "gasil_jax.run")
         check(options)
+        use_devices(options, options.seeds)
+        env = make_env(options)
         folder = make_run_folder(options)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    use_devices(options, options.seeds)
-    summary = train(options, folder)
+    summary = train(options, env, folder)
     mean = summary["final_return_mean"]
     print(
         f"final return {'none ended' if mean is None else format(mean, '.1f')} "

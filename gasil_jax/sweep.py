@@ -124,13 +124,14 @@ def group(config: Config, points: Sequence[Point]) -> dict[Config, list[int]]:
     return groups
 
 
-def sweep(options: Options, points: Sequence[Point], folder: pathlib.Path) -> Any:
+def sweep(
+    options: Options, env: Any, points: Sequence[Point], folder: pathlib.Path
+) -> Any:
     """Train all points, log and save; returns the summary."""
     from gasil_jax import batch, logging
     from gasil_jax.progress import Progress
 
     run.write_config(options, folder, points=points)
-    env = run.make_env(options)
     config, num_seeds = options.config, options.seeds
     seeds = list(range(options.first_seed, options.first_seed + num_seeds))
     members = len(points) * num_seeds
@@ -241,12 +242,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run.check(
                 dataclasses.replace(options, config=configure(options.config, point))
             )
+        run.use_devices(options, len(points) * options.seeds)
+        env = run.make_env(options)
         folder = run.make_run_folder(options)
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    run.use_devices(options, len(points) * options.seeds)
-    summary = sweep(options, points, folder)
+    summary = sweep(options, env, points, folder)
     for title in ("best_by_mean", "best_by_worst_seed"):
         best = summary[title]
         if best is None:

@@ -221,6 +221,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     return state, jax.tree.map(lambda x: x.astype(jnp.float32), metrics)
 
 
+def check(env: Any, config: Config) -> None:
+    """Raise `ValueError` for what can't run, before anything compiles."""
+    validate(config, tuple(AGENTS))
+    AGENTS[config.agent].check(config, env.observation_size, env.action_size)
+
+
 def make_train(
     env: Any, config: Config
 ) -> Callable[[jax.Array, Hyperparameters | None], tuple[TrainState, Metrics]]:
@@ -238,7 +244,7 @@ def make_train(
     Raises:
       ValueError: a bad configuration, before anything compiles.
     """
-    validate(config, tuple(AGENTS))
+    check(env, config)
 
     def train(
         key: jax.Array, hyperparameters: Hyperparameters | None = None

@@ -13,6 +13,7 @@ AGENTS: dict[str, Imitation] = {
     "ppo+sil": self_imitation.PPO_SIL,
     "gasil": adversarial.GASIL,
     "ppo+gasil": adversarial.PPO_GASIL,
+    "gail": adversarial.GAIL,
 }
 
 __all__ = ["AGENTS", "Imitation"]

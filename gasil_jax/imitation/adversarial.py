@@ -10,11 +10,12 @@ like the buffer. Everything is computed from the logit l of D:
 log D = -softplus(-l), log(1 - D) = -softplus(l). The bonus is never negative, which
 favours long episodes (survival bias); the paper has it so.
 
-While the buffer is empty D does not train and the bonus is 0.
+While the buffer is empty D does not train and the bonus is 0. GAIL is the same with a
+fixed set of expert pairs in the buffer's place.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from flax import struct
 
 from gasil_jax import good_trajectories, normalization
 from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.imitation import expert
 from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
 from gasil_jax.networks import Discriminator
 
@@ -81,10 +83,42 @@ def _init(
     return AdversarialState(params, optax.scale_by_adam().init(params))
 
 
+class Source(NamedTuple):
+    """Where the pairs come from that the policy is to be like.
+
+    Attributes:
+      sample: (key, context, n) -> observation (n, obs), action (n, action).
+      is_ready: context -> bool (), whether there is anything to sample.
+    """
+
+    sample: Callable[[jax.Array, Context, int], tuple[jax.Array, jax.Array]]
+    is_ready: Callable[[Context], jax.Array]
+
+
+def _sample_good(
+    key: jax.Array, context: Context, num_samples: int
+) -> tuple[jax.Array, jax.Array]:
+    return good_trajectories.sample(key, context.good_trajectories, num_samples)
+
+
+def _sample_expert(
+    key: jax.Array, context: Context, num_samples: int
+) -> tuple[jax.Array, jax.Array]:
+    observation, action = expert.load(context.config.expert)
+    rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
+    return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
+
+
+_GOOD_TRAJECTORIES = Source(
+    _sample_good, lambda context: context.good_trajectories.size > 0
+)
+_EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
+
+
 def _train_discriminator(
-    state: AdversarialState, context: Context, key: jax.Array
+    state: AdversarialState, source: Source, context: Context, key: jax.Array
 ) -> tuple[AdversarialState, Metrics]:
-    """`discriminator_updates` gradient steps, none of which count while B is empty."""
+    """`discriminator_updates` gradient steps; none count while there is no source."""
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters
     network, transform = _network(config), optax.scale_by_adam()
@@ -106,9 +140,7 @@ def _train_discriminator(
             policy_key, (minibatch_size,), 0, observation.shape[0]
         )
         normalize = lambda x: normalization.normalize(context.normalizer, x)
-        good_observation, good_action = good_trajectories.sample(
-            good_key, context.good_trajectories, minibatch_size
-        )
+        good_observation, good_action = source.sample(good_key, context, minibatch_size)
         gradient, metrics = jax.grad(objective, has_aux=True)(
             state.params,
             (normalize(observation[rows]), action[rows]),
@@ -125,29 +157,30 @@ def _train_discriminator(
     trained, metrics = jax.lax.scan(
         step, state, jax.random.split(key, config.discriminator_updates)
     )
-    has_good = context.good_trajectories.size > 0
-    state = jax.tree.map(lambda a, b: jnp.where(has_good, a, b), trained, state)
+    ready = source.is_ready(context)
+    state = jax.tree.map(lambda a, b: jnp.where(ready, a, b), trained, state)
     metrics = {
-        name: jnp.where(has_good, jnp.mean(value), jnp.nan)
+        name: jnp.where(ready, jnp.mean(value), jnp.nan)
         for name, value in metrics.items()
     }
     return state, metrics
 
 
 def _update_and_reward(
+    source: Source,
     combine: Callable[[jax.Array, jax.Array], jax.Array],
 ) -> Callable[[AdversarialState, Context, jax.Array], Any]:
     def update_and_reward(
         state: AdversarialState, context: Context, key: jax.Array
     ) -> tuple[AdversarialState, jax.Array, Metrics]:
-        state, metrics = _train_discriminator(state, context, key)
+        state, metrics = _train_discriminator(state, source, context, key)
         rollout = context.rollout
         observation = normalization.normalize(context.normalizer, rollout.observation)
         logit = _network(context.config).apply(
             state.params, observation, rollout.action
         )
         shaped = jnp.where(
-            context.good_trajectories.size > 0,
+            source.is_ready(context),
             bonus(logit, context.hyperparameters.alpha),
             0.0,
         )
@@ -157,9 +190,22 @@ def _update_and_reward(
     return update_and_reward
 
 
+def _check_expert(config: Config, observation_size: int, action_size: int) -> None:
+    expert.check(config.expert, observation_size, action_size)
+
+
+_reward_and_bonus = lambda reward, bonus: reward + bonus
+_bonus_alone = lambda reward, bonus: bonus
+
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(
-    _init, _update_and_reward(lambda reward, bonus: reward + bonus), leave_policy
+    _init, _update_and_reward(_GOOD_TRAJECTORIES, _reward_and_bonus), leave_policy
 )
 #: -alpha log D alone (Algorithm 1).
-GASIL = Imitation(_init, _update_and_reward(lambda reward, bonus: bonus), leave_policy)
+GASIL = Imitation(
+    _init, _update_and_reward(_GOOD_TRAJECTORIES, _bonus_alone), leave_policy
+)
+#: -alpha log D alone, D against expert trajectories (section 3.2).
+GAIL = Imitation(
+    _init, _update_and_reward(_EXPERT, _bonus_alone), leave_policy, _check_expert
+)

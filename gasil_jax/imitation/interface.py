@@ -49,6 +49,8 @@ class Imitation(NamedTuple):
       update_policy: (state, params, optimizer state, learning rate, context, key)
         -> state, params, optimizer state, metrics. Gradient steps of its own on
         the policy and value after PPO's.
+      check: (config, observation size, action size), raises `ValueError` for what
+        the agent can't run with, before anything compiles.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -59,6 +61,7 @@ class Imitation(NamedTuple):
         [Any, Any, Any, jax.Array, Context, jax.Array],
         tuple[Any, Any, Any, Metrics],
     ]
+    check: Callable[[Config, int, int], None] = lambda config, observation, action: None
 
 
 def leave_policy(

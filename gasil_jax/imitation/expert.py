@@ -1,0 +1,84 @@
+"""Expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
+
+import functools
+import pathlib
+
+import numpy as np
+
+_MINARI = "minari:"
+
+
+@functools.cache
+def load(source: str) -> tuple[np.ndarray, np.ndarray]:
+    """Observations (steps, obs) and actions (steps, action), float32.
+
+    Args:
+      source: the path of an ``.npz`` file with arrays "observation" and "action", or
+        "minari:" and the name of a data set of Minari, which must be installed and
+        have it.
+
+    Raises:
+      ValueError: it can't be read, or is not that.
+    """
+    if source.startswith(_MINARI):
+        observation, action = _load_minari(source.removeprefix(_MINARI))
+    else:
+        observation, action = _load_file(pathlib.Path(source))
+    observation = np.asarray(observation, np.float32)
+    action = np.asarray(action, np.float32)
+    if observation.ndim != 2 or action.ndim != 2 or len(observation) != len(action):
+        raise ValueError(
+            f"expert {source!r} has observations {observation.shape} and actions "
+            f"{action.shape}: they must be (steps, obs) and (steps, action)"
+        )
+    if not (
+        len(action) and np.isfinite(observation).all() and np.isfinite(action).all()
+    ):
+        raise ValueError(
+            f"expert {source!r} is empty or has numbers that aren't finite"
+        )
+    return observation, action
+
+
+def _load_file(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        with np.load(path) as arrays:
+            return arrays["observation"], arrays["action"]
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(
+            f"expert is {str(path)!r}: it must be an .npz file with arrays "
+            f"'observation' and 'action' ({error})"
+        ) from None
+
+
+def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
+    try:
+        import minari
+
+        episodes = list(minari.load_dataset(name).iterate_episodes())
+    except ImportError:
+        raise ValueError(
+            f"expert is 'minari:{name}': it needs the package minari, which isn't here"
+        ) from None
+    except (OSError, ValueError, KeyError) as error:
+        raise ValueError(
+            f"expert is 'minari:{name}', not a data set: {error}"
+        ) from None
+    # An episode has one observation more than actions.
+    return (
+        np.concatenate([e.observations[: len(e.actions)] for e in episodes]),
+        np.concatenate([e.actions for e in episodes]),
+    )
+
+
+def check(source: str | None, observation_size: int, action_size: int) -> None:
+    """Raise `ValueError` if `source` is not for such an environment."""
+    if source is None:
+        raise ValueError("expert is missing: agent 'gail' needs a file or data set")
+    observation, action = load(source)
+    found = (observation.shape[1], action.shape[1])
+    if found != (observation_size, action_size):
+        raise ValueError(
+            f"expert {source!r} has {found[0]} observations and {found[1]} actions a "
+            f"step: the environment has {observation_size} and {action_size}"
+        )

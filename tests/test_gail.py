@@ -1,0 +1,91 @@
+"""GAIL: a scripted expert is imitated; what is no expert is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax.run import main
+
+# Between two distractors, and along the three green objects.
+WAYPOINTS = np.array([(0.2, 0.2), (0.2, 0.55), (0.4, 0.6), (0.0, 0.75), (-0.4, 0.6)])
+
+
+def expert_episodes(env, count):
+    """Observations, actions and mean return of the script."""
+    step, reset = jax.jit(env.step), jax.jit(env.reset)
+    observations, actions, total = [], [], 0.0
+    for seed in range(count):
+        state, target = reset(jax.random.key(seed)), 0
+        while not state.done:
+            position = np.asarray(state.obs[:2])
+            if np.hypot(*(WAYPOINTS[target] - position)) < 0.05:
+                target = min(target + 1, len(WAYPOINTS) - 1)
+            action = np.clip((WAYPOINTS[target] - position) / 0.1, -1.0, 1.0)
+            observations.append(np.asarray(state.obs))
+            actions.append(action)
+            state = step(state, jnp.asarray(action, jnp.float32))
+            total += float(state.reward)
+    return np.array(observations), np.array(actions), total / count
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory):
+    env = gasil_jax.make_env("point_mass")
+    observation, action, mean_return = expert_episodes(env, 8)
+    path = tmp_path_factory.mktemp("expert") / "expert.npz"
+    np.savez(path, observation=observation, action=action)
+    return env, str(path), mean_return
+
+
+def test_a_scripted_expert_is_imitated(expert):
+    env, path, expert_return = expert
+    assert expert_return > 25.0
+    config = gasil_jax.Config(
+        agent="gail",
+        expert=path,
+        total_steps=60 * 2048,
+        discriminator_updates=20,
+        hyperparameters=gasil_jax.Hyperparameters(
+            alpha=1.0, discriminator_learning_rate=3e-4
+        ),
+    )
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+    train = jax.jit(jax.vmap(gasil_jax.make_train(env, config)))
+    returns = np.asarray(train(keys)[1]["episode_return"])
+    # At random about -1, with the blue object alone 5.
+    assert np.all(returns[:, 0] < 3.0)
+    assert np.all(returns[:, -3:].mean(1) > 10.0)
+
+
+def test_an_expert_of_another_size_is_refused(expert, tmp_path):
+    env, path, _ = expert
+    with np.load(path) as arrays:
+        np.savez(
+            tmp_path / "other.npz",
+            observation=arrays["observation"][:, :3],
+            action=arrays["action"],
+        )
+    config = gasil_jax.Config(agent="gail", expert=str(tmp_path / "other.npz"))
+    with pytest.raises(ValueError, match="3 observations and 2 actions a step"):
+        gasil_jax.make_train(env, config)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "expert is missing"),
+        ("--expert nowhere.npz", "it must be an .npz file"),
+        ("--expert minari:nothing/there-v0", "minari:nothing/there-v0"),
+    ],
+)
+def test_no_expert_is_one_line_and_status_2(
+    arguments, message, capsys, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    command = ["--env", "point_mass", "--agent", "gail", *arguments.split()]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
