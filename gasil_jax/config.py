@@ -10,6 +10,10 @@ import math
 
 from flax import struct
 
+#: (environment steps, factor) points: linear between them, constant beyond; a
+#: hyperparameter is multiplied by the factor.
+Schedule = tuple[tuple[float, float], ...]
+
 
 @struct.dataclass
 class Hyperparameters:
@@ -70,6 +74,11 @@ class Config:
       sil_updates: gradient steps of PPO+SIL's own an iteration.
       sil_minibatch_size: replayed steps in each.
       sil_buffer_steps: capacity of PPO+SIL's replay, in steps.
+      learning_rate_schedule: (env steps, factor) points that the learning rate is
+        multiplied by, linear between them; none is 1 throughout.
+      clip_epsilon_schedule: the same for PPO's clip range.
+      alpha_schedule: the same for alpha. The paper's rule for Humanoid, 0 for 2M
+        steps and then up to alpha until 3M, is ((2e6, 0), (3e6, 1)).
       expert: what GAIL imitates: an .npz file with arrays "observation" and
         "action", or "minari:" and the name of a data set.
       max_episode_steps: an episode is truncated after so many steps; None takes
@@ -93,6 +102,9 @@ class Config:
     sil_updates: int = 10
     sil_minibatch_size: int = 512
     sil_buffer_steps: int = 100_000
+    learning_rate_schedule: Schedule = ()
+    clip_epsilon_schedule: Schedule = ()
+    alpha_schedule: Schedule = ()
     expert: str | None = None
     max_episode_steps: int | None = None
     hyperparameters: Hyperparameters = dataclasses.field(
@@ -142,6 +154,10 @@ _HYPERPARAMETER_RANGES = {
 }
 
 
+_SCHEDULES = ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule")
+_NOT_A_COUNT = ("agent", "expert", "hyperparameters", *_SCHEDULES)
+
+
 def validate(config: Config, agents: tuple[str, ...]) -> None:
     """Raise `ValueError`, naming the value and what is allowed, for a bad config.
 
@@ -157,7 +173,7 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
         )
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name in ("agent", "expert", "hyperparameters") or value is None:
+        if field.name in _NOT_A_COUNT or value is None:
             continue
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, bool) or not isinstance(number, int) or number < 1:
@@ -172,6 +188,17 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
             raise ValueError(
                 f"{part} is {size}, which does not divide {whole} {total}: "
                 f"the nearest that does is {closest}"
+            )
+    for name in _SCHEDULES:
+        points = getattr(config, name)
+        steps = [point[0] for point in points]
+        factors = [point[1] for point in points]
+        if steps != sorted(set(steps)) or any(
+            not (math.isfinite(number) and number >= 0) for number in steps + factors
+        ):
+            raise ValueError(
+                f"{name} is {points}: it must be (steps, factor) points, all 0 or "
+                "more, steps increasing"
             )
     for name, (low, high, closed) in _HYPERPARAMETER_RANGES.items():
         value = getattr(config.hyperparameters, name)

@@ -113,6 +113,11 @@ class Options:
     key: int = 0
 
 
+def _as_tuples(value: Any) -> Any:
+    # JSON has no tuples, and a configuration is hashable.
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+
+
 def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
     """Environment, config, seed numbers and final states (seed, ...) of a run.
 
@@ -127,9 +132,7 @@ def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
     described = json.loads(path.read_text())
     fields = described["config"]
     fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
-    config = Config(
-        **{k: tuple(v) if isinstance(v, list) else v for k, v in fields.items()}
-    )
+    config = Config(**{name: _as_tuples(value) for name, value in fields.items()})
     env = environments.make_env(
         described["env"],
         **{k: described[k] for k in ("reward_delay", "obs_noise", "solver")},

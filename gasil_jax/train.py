@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_jax import good_trajectories, normalization, ppo, rollout
+from gasil_jax import good_trajectories, normalization, ppo, rollout, schedules
 from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.imitation import AGENTS
 from gasil_jax.imitation.interface import Context
@@ -109,14 +109,13 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     Returns the next state and a dict of float32 scalars. Means over the episodes
     that ended in the batch are NaN if none did.
     """
-    agent, hp = AGENTS[config.agent], state.hyperparameters
+    agent = AGENTS[config.agent]
+    hp = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
     normalize = lambda observation: normalization.normalize(
         state.normalizer, observation
     )
-    progress = state.iteration / config.num_iterations
-    learning_rate = hp.learning_rate * (1.0 - hp.learning_rate_decay * progress)
 
     # Sample policy trajectories.
     environments, batch = rollout.collect(
@@ -179,12 +178,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         ppo_key,
         policy=policy,
         value=value,
-        learning_rate=learning_rate,
+        learning_rate=hp.learning_rate,
         config=config,
         hyperparameters=hp,
     )
     imitation, params, optimizer_state, policy_metrics = agent.update_policy(
-        imitation, params, optimizer_state, learning_rate, context, policy_key
+        imitation, params, optimizer_state, hp.learning_rate, context, policy_key
     )
 
     state = TrainState(
@@ -196,7 +195,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         history=history,
         good_trajectories=buffer,
         imitation=imitation,
-        hyperparameters=hp,
+        hyperparameters=state.hyperparameters,
         key=key,
         iteration=state.iteration + 1,
     )
@@ -213,7 +212,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         "good_steps": buffer.size,
         "explained_variance": 1.0
         - jnp.var(return_ - values) / (jnp.var(return_) + 1e-8),
-        "learning_rate": learning_rate,
+        "learning_rate": hp.learning_rate,
         **ppo_metrics,
         **imitation_metrics,
         **policy_metrics,

@@ -13,6 +13,7 @@ SMALL = (
     *("--total-steps", "1000", "--batch-steps", "256", "--num-envs", "4"),
     *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
     *("--num-epochs", "2", "--alpha", "0.5", "--buffer-steps", "300"),
+    *("--alpha-schedule", "0", "0.5", "500", "1"),
 )
 
 

@@ -1,0 +1,37 @@
+"""Hyperparameters that change with the environment steps of training."""
+
+import jax
+import jax.numpy as jnp
+
+from gasil_jax.config import Config, Hyperparameters, Schedule
+
+
+def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
+    """The factor at `env_steps`, (): linear between the points, constant beyond.
+
+    Args:
+      schedule: (steps, factor) points, steps increasing; none is 1 throughout.
+      env_steps: float32 (), environment steps that a run has taken.
+    """
+    if not schedule:
+        return jnp.float32(1.0)
+    steps, factors = (jnp.array(column, jnp.float32) for column in zip(*schedule))
+    return jnp.interp(env_steps, steps, factors)
+
+
+def at(
+    config: Config, hyperparameters: Hyperparameters, iteration: jax.Array
+) -> Hyperparameters:
+    """What an iteration trains with: the learning rate annealed, schedules applied."""
+    env_steps = (iteration * config.batch_steps).astype(jnp.float32)
+    left = 1.0 - hyperparameters.learning_rate_decay * (
+        iteration / config.num_iterations
+    )
+    return hyperparameters.replace(
+        learning_rate=hyperparameters.learning_rate
+        * left
+        * factor(config.learning_rate_schedule, env_steps),
+        clip_epsilon=hyperparameters.clip_epsilon
+        * factor(config.clip_epsilon_schedule, env_steps),
+        alpha=hyperparameters.alpha * factor(config.alpha_schedule, env_steps),
+    )

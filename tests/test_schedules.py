@@ -1,0 +1,59 @@
+"""Schedules at their corners, and in a run."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax import schedules
+
+HUMANOID = ((2e6, 0.0), (3e6, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("steps", "expected"),
+    [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)],
+)
+def test_the_papers_rule_for_humanoid(steps, expected):
+    result = jax.jit(lambda steps: schedules.factor(HUMANOID, steps))(steps)
+    np.testing.assert_allclose(result, expected, atol=1e-6)
+
+
+def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
+    config = gasil_jax.Config(total_steps=4 * 2048)
+    hp = config.hyperparameters
+    at = lambda iteration: schedules.at(config, hp, jnp.int32(iteration))
+    for iteration in range(4):
+        expected = hp.learning_rate * (1 - iteration / 4)
+        np.testing.assert_allclose(at(iteration).learning_rate, expected, rtol=1e-6)
+        np.testing.assert_allclose(at(iteration).clip_epsilon, hp.clip_epsilon)
+        np.testing.assert_allclose(at(iteration).alpha, hp.alpha)
+
+
+def test_a_run_follows_its_schedules():
+    config = gasil_jax.Config(
+        total_steps=1024,
+        batch_steps=256,
+        num_envs=4,
+        num_epochs=1,
+        hidden_sizes=(8,),
+        alpha_schedule=((256, 0.0), (512, 1.0)),
+        learning_rate_schedule=((0, 1.0), (256, 0.0)),
+    )
+    env = gasil_jax.make_env("point_mass")
+    _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    bonus, rate = np.asarray(metrics["bonus"]), np.asarray(metrics["learning_rate"])
+    assert np.all(bonus[:2] == 0) and np.all(bonus[2:] > 0)
+    assert rate[0] > 0 and np.all(rate[1:] == 0)
+    # With no learning rate the policy that comes out is the one that went in.
+    np.testing.assert_array_equal(metrics["approx_kl"][1:] < 1e-9, True)
+
+
+@pytest.mark.parametrize(
+    "points", [((1.0, 0.5), (0.0, 1.0)), ((0.0, -1.0),), ((0.0, float("nan")),)]
+)
+def test_a_bad_schedule_is_refused(points):
+    env = gasil_jax.make_env("point_mass")
+    with pytest.raises(ValueError, match="alpha_schedule is"):
+        gasil_jax.make_train(env, gasil_jax.Config(alpha_schedule=points))
