@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gasil_jax import command_line, environments, normalization, train
+from gasil_jax import batch, command_line, environments, normalization, train
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.networks import Policy
 
@@ -96,6 +96,44 @@ def numpy_policy(
     return act
 
 
+def evaluate_in_gymnasium(
+    gymnasium_id: str,
+    act: Callable[[np.ndarray], np.ndarray],
+    *,
+    num_episodes: int,
+    seed: int = 0,
+) -> dict[str, np.ndarray]:
+    """Run whole episodes of a policy in Gymnasium, on C MuJoCo.
+
+    Args:
+      gymnasium_id: of the task, "Walker2d-v5".
+      act: observation -> action, as of `numpy_policy`.
+      num_episodes: one after the other.
+      seed: of the first episode's start; the next ones' follow.
+
+    Returns:
+      "episode_return" and "episode_length", (num_episodes,) each.
+    """
+    import gymnasium
+
+    env = gymnasium.make(gymnasium_id)
+    returns, lengths = [], []
+    for episode in range(num_episodes):
+        observation, _ = env.reset(seed=seed + episode)
+        total, length, running = 0.0, 0, True
+        while running:
+            observation, reward, terminated, truncated, _ = env.step(act(observation))
+            total, length = total + float(reward), length + 1
+            running = not (terminated or truncated)
+        returns.append(total)
+        lengths.append(length)
+    env.close()
+    return {
+        "episode_return": np.array(returns),
+        "episode_length": np.array(lengths),
+    }
+
+
 @dataclasses.dataclass(frozen=True)
 class Options:
     """Score the final policies of a run.
@@ -104,12 +142,15 @@ class Options:
       run: the run's folder.
       episodes: how many for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
+      gymnasium: score in Gymnasium, on C MuJoCo, instead; for locomotion, with the
+        policy's mean and without delay and noise.
       key: of the episodes' starts and actions.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
     episodes: int = 20
     stochastic: bool = False
+    gymnasium: bool = False
     key: int = 0
 
 
@@ -146,17 +187,9 @@ def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
     return env, config, seeds, checkpoint.restore(folder / "checkpoint", like)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
-    try:
-        options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
-        if options.episodes < 1:
-            raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
-        env, config, seeds, states = load(options.run)
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    jax.config.update("jax_default_matmul_precision", "highest")
+def _score(
+    options: Options, env: Any, config: Config, states: Any, seeds: Sequence[int]
+) -> dict[str, np.ndarray]:
     score = jax.jit(
         jax.vmap(
             lambda state, key: evaluate(
@@ -170,7 +203,45 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     )
     keys = jax.random.split(jax.random.key(options.key), len(seeds))
-    scores = jax.tree.map(np.asarray, score(states, keys))
+    return jax.tree.map(np.asarray, score(states, keys))
+
+
+def _score_in_gymnasium(
+    options: Options, env: Any, gymnasium_id: str, states: Any, seeds: Sequence[int]
+) -> dict[str, np.ndarray]:
+    scores = [
+        evaluate_in_gymnasium(
+            gymnasium_id,
+            numpy_policy(batch.member(states, index), env.action_range),
+            num_episodes=options.episodes,
+            seed=options.key,
+        )
+        for index in range(len(seeds))
+    ]
+    return jax.tree.map(lambda *x: np.stack(x), *scores)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
+        if options.episodes < 1:
+            raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
+        env, config, seeds, states = load(options.run)
+        task = getattr(env.unwrapped, "task", None)
+        if options.gymnasium and (task is None or options.stochastic):
+            raise ValueError(
+                "gymnasium is on: the run must be of a locomotion task, and "
+                "stochastic must be off"
+            )
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    jax.config.update("jax_default_matmul_precision", "highest")
+    if options.gymnasium:
+        scores = _score_in_gymnasium(options, env, task.gymnasium_id, states, seeds)
+    else:
+        scores = _score(options, env, config, states, seeds)
     print("seed  episodes      return     spread  length")
     for i, seed in enumerate(seeds):
         returns, length = scores["episode_return"][i], scores["episode_length"][i]

@@ -30,6 +30,7 @@ class Task:
     """What tells one locomotion task from another.
 
     Attributes:
+      gymnasium_id: the task that it is in Gymnasium.
       xml: file name among Gymnasium's MuJoCo assets.
       frame_skip: physics steps for each environment step.
       forward_reward: weight of the forward velocity, 1 / (m/s).
@@ -50,6 +51,7 @@ class Task:
       contact_cost: from contact forces (nbody, 6) to a cost.
     """
 
+    gymnasium_id: str
     xml: str
     frame_skip: int
     forward_reward: float = 1.0
@@ -95,6 +97,7 @@ def _body_observations(data: mjx.Data, contact_forces: jax.Array) -> jax.Array:
 TASKS: Mapping[str, Task] = types.MappingProxyType(
     {
         "hopper": Task(
+            gymnasium_id="Hopper-v5",
             xml="hopper.xml",
             frame_skip=4,
             healthy_reward=1.0,
@@ -104,6 +107,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             max_velocity=10.0,
         ),
         "walker2d": Task(
+            gymnasium_id="Walker2d-v5",
             xml="walker2d_v5.xml",
             frame_skip=4,
             healthy_reward=1.0,
@@ -112,6 +116,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             max_velocity=10.0,
         ),
         "halfcheetah": Task(
+            gymnasium_id="HalfCheetah-v5",
             xml="half_cheetah.xml",
             frame_skip=5,
             control_cost=0.1,
@@ -119,6 +124,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             normal_velocity_noise=True,
         ),
         "swimmer": Task(
+            gymnasium_id="Swimmer-v5",
             xml="swimmer.xml",
             frame_skip=4,
             control_cost=1e-4,
@@ -126,6 +132,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             hidden_positions=2,
         ),
         "ant": Task(
+            gymnasium_id="Ant-v5",
             xml="ant.xml",
             frame_skip=5,
             control_cost=0.5,
@@ -140,6 +147,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
         ),
         "humanoid": Task(
+            gymnasium_id="Humanoid-v5",
             xml="humanoid.xml",
             frame_skip=5,
             forward_reward=1.25,
