@@ -5,10 +5,26 @@ import pathlib
 import numpy as np
 
 
+def smooth(curve: np.ndarray, window: int) -> np.ndarray:
+    """Mean of the last `window` entries that are not NaN: (..., n) -> (..., n).
+
+    NaN where there are none.
+    """
+    finite = np.isfinite(curve)
+    pad = lambda x: np.concatenate([np.zeros((*x.shape[:-1], window)), x], axis=-1)
+    total = np.cumsum(pad(np.where(finite, curve, 0.0)), axis=-1)
+    count = np.cumsum(pad(finite.astype(float)), axis=-1)
+    total = total[..., window:] - total[..., :-window]
+    count = count[..., window:] - count[..., :-window]
+    return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+
+
 def learning_curve(
     path: pathlib.Path, env_steps: np.ndarray, episode_return: np.ndarray, title: str
 ) -> None:
     """Save mean, spread and each seed's return over environment steps as a PNG.
+
+    Each point is the mean of the last fiftieth of training.
 
     Args:
       path: where to.
@@ -21,6 +37,7 @@ def learning_curve(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    episode_return = smooth(episode_return, max(1, len(env_steps) // 50))
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
     for curve in episode_return:
         axes.plot(env_steps, curve, color="0.75", linewidth=0.8)

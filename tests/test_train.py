@@ -57,19 +57,20 @@ def test_one_seed_alone_equals_the_same_seed_in_a_batch_of_ten():
         )
 
 
-def test_vmap_over_a_hyperparameter_equals_single_runs():
+def test_vmap_over_every_hyperparameter_equals_single_runs():
     env = gasil_jax.make_env("point_mass")
     train = gasil_jax.make_train(env, SMALL)
-    key = jax.random.key(0)
-    with_alpha = lambda a: SMALL.hyperparameters.replace(alpha=a)
-    alphas = jnp.array([0.02, 1.0])
-    _, swept = jax.jit(jax.vmap(lambda a: train(key, with_alpha(a))))(alphas)
-    for i, alpha in enumerate(alphas):
-        _, single = trainer()(key, with_alpha(float(alpha)))
-        np.testing.assert_allclose(
-            swept["bonus"][i], single["bonus"], rtol=1e-3, atol=1e-5
-        )
-    assert np.all(swept["bonus"][1] > swept["bonus"][0])
+    key, plain = jax.random.key(0), SMALL.hyperparameters
+    both = (plain, jax.tree.map(lambda x: 0.5 * x, plain))
+    stacked = jax.tree.map(lambda *x: jnp.array(x), *both)
+    _, swept = jax.jit(jax.vmap(train, in_axes=(None, 0)))(key, stacked)
+    for i, hyperparameters in enumerate(both):
+        _, single = trainer()(key, hyperparameters)
+        for name in ("bonus", "policy_loss", "value_loss", "learning_rate"):
+            np.testing.assert_allclose(
+                swept[name][i], single[name], rtol=1e-3, atol=1e-5, err_msg=name
+            )
+    assert np.all(swept["bonus"][0] > swept["bonus"][1])
 
 
 def test_it_trains_an_environment_of_brax():
