@@ -4,6 +4,7 @@ from gasil_jax.batch import member
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.environments import make_env
 from gasil_jax.imitation import AGENTS
+from gasil_jax.presets import preset
 from gasil_jax.train import TrainState, init, iterate, make_train
 
 
@@ -22,4 +23,5 @@ __all__ = [
     "make_env",
     "make_train",
     "member",
+    "preset",
 ]

@@ -15,13 +15,19 @@ class InputError(ValueError):
     """Bad input, in one line that names the value and what is allowed."""
 
 
-def parse(options: type[T], arguments: Sequence[str] | None, program: str) -> T:
+def parse(
+    options: type[T],
+    arguments: Sequence[str] | None,
+    program: str,
+    default: T | None = None,
+) -> T:
     """Options from the command line; prints help and exits where that is asked for.
 
     Args:
       options: a dataclass.
       arguments: default what the program was started with.
       program: the module that was started.
+      default: what stands where no flag is given; default the dataclass' own.
 
     Raises:
       InputError: what tyro refuses, its message in one line.
@@ -33,6 +39,7 @@ def parse(options: type[T], arguments: Sequence[str] | None, program: str) -> T:
                 tyro.conf.OmitArgPrefixes[options],
                 args=arguments,
                 prog=f"python -m {program}",
+                **({} if default is None else {"default": default}),
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):

@@ -7,6 +7,8 @@ which the paper's code was built.
 import dataclasses
 import difflib
 import math
+from collections.abc import Mapping
+from typing import Any
 
 from flax import struct
 
@@ -129,6 +131,14 @@ class Config:
     def replace(self, **changes: object) -> "Config":
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
+
+    def updated(self, values: Mapping[str, Any]) -> "Config":
+        """A copy with some values changed, of its own fields or of hyperparameters."""
+        own = {field.name for field in dataclasses.fields(self)}
+        floats = {name: x for name, x in values.items() if name not in own}
+        changes = {name: x for name, x in values.items() if name in own}
+        hyperparameters = self.hyperparameters.replace(**floats)
+        return self.replace(hyperparameters=hyperparameters, **changes)
 
 
 def nearest(name: str, allowed: tuple[str, ...]) -> str:

@@ -10,14 +10,14 @@ import pathlib
 import sys
 import time
 from collections.abc import Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import tyro
 
-from gasil_jax import command_line
+from gasil_jax import command_line, presets
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, validate
+from gasil_jax.config import Config, nearest, validate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +34,8 @@ class Options:
       reward_delay: give the accumulated reward every so many steps.
       obs_noise: standard deviation of Gaussian noise on the observations.
       solver: of the contacts, small (ours, faster) or mjx.
+      preset: where the hyperparameters start from: tuned, by environment and agent,
+        or paper; flags override it.
       devices: host devices that the seeds are sharded over; default the cores.
       config: the algorithm.
     """
@@ -45,10 +47,32 @@ class Options:
     reward_delay: int = 1
     obs_noise: float = 0.0
     solver: str = "small"
+    preset: str = "tuned"
     devices: int | None = None
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Config
     )
+
+
+T = TypeVar("T", bound=Options)
+
+
+def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
+    """Options from the command line, on top of the preset that they name.
+
+    Raises:
+      InputError: a flag or value that is unknown.
+    """
+    given = command_line.parse(kind, arguments, program)
+    if given.preset not in presets.names():
+        raise InputError(
+            f"preset {given.preset!r} is unknown: did you mean "
+            f"{nearest(given.preset, presets.names())!r}? "
+            f"(one of {', '.join(presets.names())})"
+        )
+    config = presets.preset(given.env, given.config.agent, given.preset)
+    default = kind(env=given.env, config=config)
+    return command_line.parse(kind, arguments, program, default)
 
 
 def check(options: Options) -> None:
@@ -226,7 +250,7 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     try:
-        options = command_line.parse(Options, arguments, "gasil_jax.run")
+        options = parse(Options, arguments, "gasil_jax.run")
         check(options)
         use_devices(options, options.seeds)
         env = make_env(options)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import command_line, run
+from gasil_jax import run
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters, nearest
 
@@ -104,21 +104,12 @@ def make_points(options: Options) -> list[dict[str, Any]]:
     return [dict(zip(values, every[i], strict=True)) for i in chosen]
 
 
-def configure(config: Config, point: Point) -> Config:
-    """The configuration of a point."""
-    static = {name: value for name, value in point.items() if name in _CONFIG}
-    traced = {name: value for name, value in point.items() if name in _HYPERPARAMETERS}
-    return config.replace(
-        **static, hyperparameters=config.hyperparameters.replace(**traced)
-    )
-
-
 def group(config: Config, points: Sequence[Point]) -> dict[Config, list[int]]:
     """Indices of points by the program that they share."""
     groups: dict[Config, list[int]] = {}
     for index, point in enumerate(points):
-        shared = configure(config, point).replace(
-            hyperparameters=config.hyperparameters
+        shared = config.updated(
+            {name: value for name, value in point.items() if name in _CONFIG}
         )
         groups.setdefault(shared, []).append(index)
     return groups
@@ -147,7 +138,7 @@ def sweep(
                 shared,
                 seeds * len(indices),
                 [
-                    configure(config, points[i]).hyperparameters
+                    config.updated(points[i]).hyperparameters
                     for i in indices
                     for _ in seeds
                 ],
@@ -235,13 +226,12 @@ def _plot(
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     try:
-        options = command_line.parse(Options, arguments, "gasil_jax.sweep")
+        options = run.parse(Options, arguments, "gasil_jax.sweep")
         run.check(options)
         points = make_points(options)
         for point in points:
-            run.check(
-                dataclasses.replace(options, config=configure(options.config, point))
-            )
+            config = options.config.updated(point)
+            run.check(dataclasses.replace(options, config=config))
         run.use_devices(options, len(points) * options.seeds)
         env = run.make_env(options)
         folder = run.make_run_folder(options)

@@ -36,8 +36,10 @@ SELF_TAUGHT = [name for name in gasil_jax.agents() if name != "gail"]
 
 
 @pytest.mark.parametrize("agent", SELF_TAUGHT)
-def test_every_agent_trains_without_a_nan(agent):
-    state, metrics = trainer(agent)(jax.random.key(0), SMALL.hyperparameters)
+def test_every_agent_trains_with_delay_and_noise_without_a_nan(agent):
+    env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
+    train = jax.jit(gasil_jax.make_train(env, SMALL.replace(agent=agent)))
+    state, metrics = train(jax.random.key(0))
     assert int(state.iteration) == 2
     for leaf in jax.tree.leaves((state.params, state.imitation)):
         assert np.all(np.isfinite(leaf))
