@@ -24,6 +24,9 @@ PRESETS: Mapping[str, Mapping[tuple[str, str], Overrides]] = {
         ("point_mass", "gasil"): _STRONG_DISCRIMINATOR,
         ("point_mass", "ppo+gasil"): _STRONG_DISCRIMINATOR,
         ("point_mass", "gail"): _STRONG_DISCRIMINATOR,
+        ("hopper", "ppo+gasil"): {"alpha": 1.0},
+        # Measured with delayed reward only.
+        ("walker2d", "ppo+gasil"): {"alpha": 1.0},
     },
     "paper": {
         # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.
