@@ -39,7 +39,9 @@ class Impedance:
     power: np.ndarray
 
     @classmethod
-    def of(cls, model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray):
+    def of(
+        cls, model: mujoco.MjModel, solref: np.ndarray, solimp: np.ndarray
+    ) -> "Impedance":
         """From (n, 2) solref and (n, 5) solimp."""
         time, damping_ratio = np.asarray(solref, np.float64).reshape(-1, 2).T
         lowest, highest, width, midpoint, power = (

@@ -16,6 +16,8 @@ dynamic).
 """
 
 import functools
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -75,21 +77,21 @@ def linear_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return batched((matrix[..., None], right[..., None]))[..., 0]
 
 
-def _batch_last(function):
+def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """`function` of a tree with trailing batch axes, vmapped by making them longer."""
     function = jax.custom_batching.custom_vmap(function)
 
     @function.def_vmap
-    def rule(axis_size, in_batched, tree):
+    def rule(axis_size: int, in_batched: list[Any], tree: Any) -> tuple[Any, Any]:
         is_batched = in_batched[0]
 
-        def join(x, batched):
+        def join(x: jax.Array, batched: bool) -> jax.Array:
             if not batched:
                 x = jnp.broadcast_to(x, (axis_size, *x.shape))
             x = jnp.moveaxis(x, 0, -2)
             return x.reshape(*x.shape[:-2], -1)
 
-        def part(x):
+        def part(x: jax.Array) -> jax.Array:
             x = x.reshape(*x.shape[:-1], axis_size, -1)
             return jnp.moveaxis(x, -2, 0)
 
@@ -175,7 +177,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
     weight = problem.weight
     qacc_smooth = _eliminate(inertia, force)
 
-    def cost(qacc):
+    def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
         distance = jnp.minimum(_matvec(jacobian, qacc) - reference, 0.0)
         return _dot(away, _matvec(inertia, away)) + _dot(weight, distance**2)
@@ -183,7 +185,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
     better = cost(problem.warmstart) < cost(qacc_smooth)
     start = jnp.where(better, problem.warmstart, qacc_smooth)
 
-    def iterate(_, carry):
+    def iterate(_: int, carry: tuple[jax.Array, jax.Array]) -> Any:
         qacc, distance = carry
         active = jnp.where(distance < 0.0, weight, 0.0)
         residual = _matvec(inertia, qacc) - force
@@ -197,7 +199,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
         linear = _dot(direction, residual)
         quadratic = _dot(direction, _matvec(inertia, direction))
 
-        def newton(_, search):
+        def newton(_: int, search: tuple[jax.Array, ...]) -> Any:
             step, low, high = search
             here = jnp.where(distance + step * slope < 0.0, weight * slope, 0.0)
             second = quadratic + _dot(here, slope)
