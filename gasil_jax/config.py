@@ -146,6 +146,14 @@ def nearest(name: str, allowed: tuple[str, ...]) -> str:
     return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
 
 
+def unknown(kind: str, name: str, allowed: tuple[str, ...]) -> str:
+    """What to say of a name that is none of the allowed ones."""
+    return (
+        f"{kind} {name!r} is unknown: did you mean {nearest(name, allowed)!r}? "
+        f"(one of {', '.join(allowed)})"
+    )
+
+
 # name -> (lowest, highest, whether the lowest itself is allowed)
 _HYPERPARAMETER_RANGES = {
     "learning_rate": (0.0, math.inf, False),
@@ -177,10 +185,7 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
       agents: the registered agents' names.
     """
     if config.agent not in agents:
-        raise ValueError(
-            f"agent {config.agent!r} is unknown: did you mean "
-            f"{nearest(config.agent, agents)!r}? (one of {', '.join(agents)})"
-        )
+        raise ValueError(unknown("agent", config.agent, agents))
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
         if field.name in _NOT_A_COUNT or value is None:

@@ -139,6 +139,30 @@ def descend(
     return params, optimizer_state
 
 
+def descend_each(
+    params: dict[str, Any],
+    optimizer_state: dict[str, Any],
+    gradient: dict[str, Any],
+    learning_rate: jax.Array,
+    hyperparameters: Hyperparameters,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """`descend` for every network by name, each clipped and stepped for itself."""
+    stepped = {
+        name: descend(
+            params[name],
+            optimizer_state[name],
+            gradient[name],
+            learning_rate,
+            hyperparameters,
+        )
+        for name in params
+    }
+    return (
+        {name: network for name, (network, _) in stepped.items()},
+        {name: state for name, (_, state) in stepped.items()},
+    )
+
+
 def update(
     params: Any,
     optimizer_state: Any,
@@ -177,16 +201,10 @@ def update(
             value=value,
             hyperparameters=hyperparameters,
         )
-        new_params, new_state = {}, {}
-        for name in params:
-            new_params[name], new_state[name] = descend(
-                params[name],
-                optimizer_state[name],
-                gradient[name],
-                learning_rate,
-                hyperparameters,
-            )
-        return (new_params, new_state), metrics
+        carry = descend_each(
+            params, optimizer_state, gradient, learning_rate, hyperparameters
+        )
+        return carry, metrics
 
     def epoch(carry: Any, key: jax.Array) -> Any:
         order = jax.random.permutation(key, config.batch_steps)

@@ -17,7 +17,7 @@ import tyro
 
 from gasil_jax import command_line, presets
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, nearest, validate
+from gasil_jax.config import Config, unknown, validate
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,11 +65,7 @@ def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     """
     given = command_line.parse(kind, arguments, program)
     if given.preset not in presets.names():
-        raise InputError(
-            f"preset {given.preset!r} is unknown: did you mean "
-            f"{nearest(given.preset, presets.names())!r}? "
-            f"(one of {', '.join(presets.names())})"
-        )
+        raise InputError(unknown("preset", given.preset, presets.names()))
     config = presets.preset(given.env, given.config.agent, given.preset)
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)

@@ -214,18 +214,12 @@ def _update_policy(
         gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
             params, rows, weight
         )
-        new_params, new_state = {}, {}
-        for name in params:
-            new_params[name], new_state[name] = ppo.descend(
-                params[name],
-                optimizer_state[name],
-                gradient[name],
-                learning_rate,
-                hyperparameters,
-            )
+        params, optimizer_state = ppo.descend_each(
+            params, optimizer_state, gradient, learning_rate, hyperparameters
+        )
         advantage = jnp.clip(rows.return_ - value, 0.0, _HIGHEST_ADVANTAGE)
         priority = priority.at[place].set(jnp.maximum(advantage, _LEAST_PRIORITY))
-        return (new_params, new_state, priority), fraction
+        return (params, optimizer_state, priority), fraction
 
     before = (params, optimizer_state, replay.priority)
     after, fraction = jax.lax.scan(

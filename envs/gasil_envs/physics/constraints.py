@@ -16,7 +16,8 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
-_SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
+#: Joint types with one degree of freedom.
+SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
 _PLANE_AND_CAPSULE = [
     int(mujoco.mjtGeom.mjGEOM_PLANE),
     int(mujoco.mjtGeom.mjGEOM_CAPSULE),
@@ -150,7 +151,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if model.tendon_limited.any():
         return "it has limited tendons"
     limited = model.jnt_type[model.jnt_limited.astype(bool)]
-    if not np.isin(limited, _SLIDE_AND_HINGE).all():
+    if not np.isin(limited, SLIDE_AND_HINGE).all():
         return "it has limited ball joints"
     if not np.isin(model.geom_condim, [1, 3]).all() or model.npair:
         return "it has contacts with torsional or rolling friction, or named pairs"

@@ -19,7 +19,6 @@ _JOINT_TRANSMISSION = [
     int(mujoco.mjtTrn.mjTRN_JOINT),
     int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
 ]
-_SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
 
 
 class Dynamics(NamedTuple):
@@ -53,7 +52,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         or model.actuator_forcelimited.any()
         or model.jnt_actfrclimited.any()
         or not np.isin(
-            model.jnt_type[model.actuator_trnid[:, 0]], _SLIDE_AND_HINGE
+            model.jnt_type[model.actuator_trnid[:, 0]], constraints.SLIDE_AND_HINGE
         ).all()
     ):
         return "it has actuators other than plain motors on slides and hinges"
