@@ -12,7 +12,7 @@ import sys
 import matplotlib
 import numpy as np
 
-from gasil_jax import sweep
+from gasil_jax import plotting, sweep
 
 FIGURE = pathlib.Path(__file__).parent / "figures" / "delayed_mujoco.png"
 ENVIRONMENTS = ("hopper", "walker2d")
@@ -47,16 +47,11 @@ def plot(folders: dict[str, pathlib.Path], path: pathlib.Path) -> None:
             error = np.nanstd(seeds, axis=0) / np.sqrt(len(seeds))
             alpha = point["alpha"]
             label = f"PPO+GASIL, alpha {alpha:g}" if alpha else "PPO"
-            panel.plot(steps, mean, color=color, label=label)
-            panel.fill_between(
-                steps, mean - error, mean + error, color=color, alpha=0.2, linewidth=0
-            )
+            plotting.draw_band(panel, steps, mean, error, color, label)
         panel.set(title=f"{env}, reward every 20 steps", xlabel="million steps")
     panels[0].set_ylabel("episode return")
     panels[0].legend(frameon=False, fontsize=8)
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    plotting.save(figure, path, dpi=110)
 
 
 def main() -> int:

@@ -44,15 +44,10 @@ def plot(folders: dict[str, pathlib.Path], path: pathlib.Path) -> None:
         for curve in returns:
             panel.plot(steps, curve, color="0.75", linewidth=0.8)
         mean, spread = np.nanmean(returns, axis=0), np.nanstd(returns, axis=0)
-        panel.plot(steps, mean, color="#0072B2")
-        panel.fill_between(
-            steps, mean - spread, mean + spread, color="#0072B2", alpha=0.2
-        )
+        plotting.draw_band(panel, steps, mean, spread, "#0072B2")
         panel.set(title=f"{env}, PPO", xlabel="million steps")
     panels[0].set_ylabel("episode return")
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    plotting.save(figure, path, dpi=100)
 
 
 def main() -> int:

@@ -1,6 +1,7 @@
 """Learning curves from metrics."""
 
 import pathlib
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,29 @@ def smooth(curve: np.ndarray, window: int) -> np.ndarray:
     total = total[..., window:] - total[..., :-window]
     count = count[..., window:] - count[..., :-window]
     return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+
+
+def draw_band(
+    axes: Any,
+    steps: np.ndarray,
+    mean: np.ndarray,
+    spread: np.ndarray,
+    color: str,
+    label: str | None = None,
+) -> None:
+    """A curve with `spread` shaded on both sides of it; all arrays are (n,)."""
+    low, high = mean - spread, mean + spread
+    axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+    axes.plot(steps, mean, color=color, label=label)
+
+
+def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
+    """Write a figure as a PNG, its folder too where that is missing, and close it."""
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(exist_ok=True)
+    figure.savefig(path, dpi=dpi)
+    plt.close(figure)
 
 
 def learning_curve(
@@ -45,11 +69,7 @@ def learning_curve(
     if some.any():
         seen, steps = episode_return[:, some], env_steps[some]
         mean, spread = np.nanmean(seen, axis=0), np.nanstd(seen, axis=0)
-        axes.fill_between(
-            steps, mean - spread, mean + spread, color="#0072B2", alpha=0.2
-        )
-        axes.plot(steps, mean, color="#0072B2", label="mean ± standard deviation")
+        draw_band(axes, steps, mean, spread, "#0072B2", "mean ± standard deviation")
         axes.legend(frameon=False, loc="upper left")
     axes.set(xlabel="environment steps", ylabel="episode return", title=title)
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+    save(figure, path, dpi=150)
