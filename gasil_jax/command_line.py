@@ -7,12 +7,42 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
+
+from gasil_jax.config import Schedule
 
 T = TypeVar("T")
+
+_REGISTRY = ConstructorRegistry()
 
 
 class InputError(ValueError):
     """Bad input, in one line that names the value and what is allowed."""
+
+
+@_REGISTRY.primitive_rule
+def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    # A command line names points; an Optax schedule comes from Python alone.
+    if info.type != Schedule:
+        return None
+
+    def from_words(words: list[str]) -> Schedule:
+        numbers = [float(word) for word in words]
+        if len(numbers) % 2:
+            raise ValueError(f"{len(words)} numbers: they must be STEPS FACTOR pairs")
+        return tuple(zip(numbers[::2], numbers[1::2]))
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="STEPS FACTOR ...",
+        instance_from_str=from_words,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda points: [str(x) for point in points for x in point],
+    )
 
 
 def parse(
@@ -34,7 +64,7 @@ def parse(
     """
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stderr(printed):
+        with contextlib.redirect_stderr(printed), _REGISTRY:
             return tyro.cli(
                 tyro.conf.OmitArgPrefixes[options],
                 args=arguments,

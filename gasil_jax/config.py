@@ -7,14 +7,15 @@ which the paper's code was built.
 import dataclasses
 import difflib
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from flax import struct
 
-#: (environment steps, factor) points: linear between them, constant beyond; a
-#: hyperparameter is multiplied by the factor.
-Schedule = tuple[tuple[float, float], ...]
+#: The factor that a hyperparameter is multiplied by, over environment steps: an
+#: Optax schedule (any pure function of the steps), or (steps, factor) points, linear
+#: between them and constant beyond; no points are 1 throughout.
+Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
 @struct.dataclass
@@ -76,8 +77,9 @@ class Config:
       sil_updates: gradient steps of PPO+SIL's own an iteration.
       sil_minibatch_size: replayed steps in each.
       sil_buffer_steps: capacity of PPO+SIL's replay, in steps.
-      learning_rate_schedule: (env steps, factor) points that the learning rate is
-        multiplied by, linear between them; none is 1 throughout.
+      learning_rate_schedule: a factor over env steps that the learning rate is
+        multiplied by: STEPS FACTOR pairs, linear between them (from Python also any
+        Optax schedule).
       clip_epsilon_schedule: the same for PPO's clip range.
       alpha_schedule: the same for alpha. The paper's rule for Humanoid, 0 for 2M
         steps and then up to alpha until 3M, is ((2e6, 0), (3e6, 1)).
@@ -206,6 +208,8 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
             )
     for name in _SCHEDULES:
         points = getattr(config, name)
+        if callable(points):
+            continue
         steps = [point[0] for point in points]
         factors = [point[1] for point in points]
         if steps != sorted(set(steps)) or any(

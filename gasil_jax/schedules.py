@@ -7,12 +7,14 @@ from gasil_jax.config import Config, Hyperparameters, Schedule
 
 
 def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
-    """The factor at `env_steps`, (): linear between the points, constant beyond.
+    """The factor at `env_steps`, (): linear between points, constant beyond.
 
     Args:
-      schedule: (steps, factor) points, steps increasing; none is 1 throughout.
+      schedule: (steps, factor) points, steps increasing, or an Optax schedule.
       env_steps: float32 (), environment steps that a run has taken.
     """
+    if callable(schedule):
+        return jnp.asarray(schedule(env_steps), jnp.float32)
     if not schedule:
         return jnp.float32(1.0)
     steps, factors = (jnp.array(column, jnp.float32) for column in zip(*schedule))

@@ -3,6 +3,9 @@
 Points that differ only in `Hyperparameters` run in one compiled program, seeds x
 points vmapped and sharded; those that differ in a field of `Config` (buffer size,
 discriminator updates) are grouped, and each group compiles once.
+
+The sweep's folder holds config.json, results.csv (a row for each point and seed),
+curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png.
 """
 
 import csv
@@ -127,8 +130,7 @@ def sweep(
     seeds = list(range(options.first_seed, options.first_seed + num_seeds))
     members = len(points) * num_seeds
     total = config.num_iterations * config.batch_steps * members
-    returns: dict[int, np.ndarray] = {}
-    diverged: dict[int, np.ndarray] = {}
+    curves: dict[int, dict[str, np.ndarray]] = {}
     done = 0
     with Progress(f"{options.env} {config.agent} sweep", total) as progress:
         for number, (shared, indices) in enumerate(group(config, points).items()):
@@ -145,21 +147,22 @@ def sweep(
             )
             states, advance = runs.compile()
             progress.phase("training")
-            history, losses = [], []
+            history = []
             for _, metrics in runs.run(states, advance):
-                history.append(metrics["episode_return"])
-                losses.append(np.isfinite(metrics["policy_loss"]))
+                history.append(metrics)
                 steps = int(metrics["env_steps"][:, -1].sum())
                 progress.update(done + steps, metrics["episode_return"])
             done += steps
-            shape = (len(indices), num_seeds, -1)
-            by_point = np.concatenate(history, axis=1).reshape(shape)
-            fine = np.concatenate(losses, axis=1).all(axis=1).reshape(shape[:2])
+            whole = {
+                name: np.concatenate([metrics[name] for metrics in history], axis=1)
+                for name in history[0]
+            }
             for place, index in enumerate(indices):
-                returns[index] = by_point[place]
-                diverged[index] = ~fine[place]
+                mine = slice(place * num_seeds, (place + 1) * num_seeds)
+                curves[index] = {name: value[mine] for name, value in whole.items()}
 
-    final = {i: run.final_returns(returns[i]) for i in returns}
+    final = {i: run.final_returns(curves[i]["episode_return"]) for i in curves}
+    diverged = {i: ~np.isfinite(curves[i]["policy_loss"]).all(axis=1) for i in curves}
     names = sorted({name for point in points for name in point})
     with (folder / "results.csv").open("x", newline="") as file:
         writer = csv.writer(file)
@@ -171,7 +174,10 @@ def sweep(
                 writer.writerow(row)
     np.savez_compressed(
         folder / "curves.npz",
-        episode_return=np.stack([returns[i] for i in range(len(points))]),
+        **{
+            name: np.stack([curves[i][name] for i in range(len(points))])
+            for name in curves[0]
+        },
     )
     fine = [i for i in final if not diverged[i].any() and np.isfinite(final[i]).all()]
     best = lambda score: max(fine, key=score) if fine else None

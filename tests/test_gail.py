@@ -1,11 +1,15 @@
 """GAIL: a scripted expert is imitated; what is no expert is refused."""
 
+import gymnasium
 import jax
 import jax.numpy as jnp
+import minari
 import numpy as np
 import pytest
+from minari.data_collector import EpisodeBuffer
 
 import gasil_jax
+from gasil_jax.imitation import expert as expert_module
 from gasil_jax.run import main
 
 # Between two distractors, and along the three green objects.
@@ -70,6 +74,33 @@ def test_an_expert_of_another_size_is_refused(expert, tmp_path):
     config = gasil_jax.Config(agent="gail", expert=str(tmp_path / "other.npz"))
     with pytest.raises(ValueError, match="3 observations and 2 actions a step"):
         gasil_jax.make_train(env, config)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
+def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    rng = np.random.default_rng(0)
+    lengths, space = (5, 3), lambda n: gymnasium.spaces.Box(-9.0, 9.0, (n,))
+    episodes = [
+        EpisodeBuffer(
+            id=index,
+            observations=rng.normal(size=(length + 1, 4)).astype(np.float32),
+            actions=rng.normal(size=(length, 2)).astype(np.float32),
+            rewards=[0.0] * length,
+            terminations=[False] * length,
+            truncations=[False] * (length - 1) + [True],
+        )
+        for index, length in enumerate(lengths)
+    ]
+    minari.create_dataset_from_buffers(
+        "test/expert-v0", episodes, observation_space=space(4), action_space=space(2)
+    )
+    observation, action = expert_module.load("minari:test/expert-v0")
+    for got, name in ((observation, "observations"), (action, "actions")):
+        wanted = [getattr(e, name)[:n] for e, n in zip(episodes, lengths)]
+        np.testing.assert_array_equal(got, np.concatenate(wanted))
+    with pytest.raises(ValueError, match=r"and 2 actions .* has 4 and 3"):
+        expert_module.check("minari:test/expert-v0", 4, 3)
 
 
 @pytest.mark.parametrize(

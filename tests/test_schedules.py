@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import gasil_jax
@@ -48,6 +49,24 @@ def test_a_run_follows_its_schedules():
     assert rate[0] > 0 and np.all(rate[1:] == 0)
     # With no learning rate the policy that comes out is the one that went in.
     np.testing.assert_array_equal(metrics["approx_kl"][1:] < 1e-9, True)
+
+
+def test_an_optax_schedule_is_the_factor():
+    halved = optax.piecewise_constant_schedule(1.0, {2 * 2048: 0.5})
+    config = gasil_jax.Config(
+        alpha_schedule=halved,
+        clip_epsilon_schedule=optax.linear_schedule(1.0, 0.0, 4 * 2048),
+    )
+    env = gasil_jax.make_env("point_mass")
+    gasil_jax.make_train(env, config)  # is accepted
+    hp = config.hyperparameters
+    at = jax.jit(lambda iteration: schedules.at(config, hp, iteration))
+    for iteration in range(6):
+        now = at(jnp.int32(iteration))
+        expected = hp.alpha * (1.0 if iteration < 2 else 0.5)
+        np.testing.assert_allclose(now.alpha, expected, rtol=1e-6)
+        expected = hp.clip_epsilon * max(0.0, 1 - iteration / 4)
+        np.testing.assert_allclose(now.clip_epsilon, expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -86,5 +86,6 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
         mine = [row for row in rows if row["point"] == str(point)]
         found = {row["seed"]: float(row["final_return"]) for row in mine}
         assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
-    curves = np.load(out / "curves.npz")["episode_return"]
-    assert curves.shape == (4, 2, 2)
+    curves = np.load(out / "curves.npz")
+    assert {"env_steps", "approx_kl", "bonus"} < set(curves)
+    assert all(curves[name].shape == (4, 2, 2) for name in curves)

@@ -54,21 +54,24 @@ def _load_file(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
 def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
     try:
         import minari
-
-        episodes = list(minari.load_dataset(name).iterate_episodes())
     except ImportError:
         raise ValueError(
-            f"expert is 'minari:{name}': it needs the package minari, which isn't here"
+            f"expert is 'minari:{name}': it needs the package minari "
+            '(pip install "gasil_jax[minari]")'
         ) from None
-    except (OSError, ValueError, KeyError) as error:
+    try:
+        episodes = list(minari.load_dataset(name).iterate_episodes())
+        # An episode has one observation more than actions.
+        return (
+            np.concatenate([e.observations[: len(e.actions)] for e in episodes]),
+            np.concatenate([e.actions for e in episodes]),
+        )
+    # Observations that are dicts or tuples raise a TypeError.
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
-            f"expert is 'minari:{name}', not a data set: {error}"
+            f"expert is 'minari:{name}': it must be a local data set with arrays as "
+            f"observations and actions ({error})"
         ) from None
-    # An episode has one observation more than actions.
-    return (
-        np.concatenate([e.observations[: len(e.actions)] for e in episodes]),
-        np.concatenate([e.actions for e in episodes]),
-    )
 
 
 def check(source: str | None, observation_size: int, action_size: int) -> None:
