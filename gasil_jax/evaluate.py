@@ -174,10 +174,7 @@ def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
     fields = described["config"]
     fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
     config = Config(**{name: _as_tuples(value) for name, value in fields.items()})
-    env = environments.make_env(
-        described["env"],
-        **{k: described[k] for k in ("reward_delay", "obs_noise", "solver")},
-    )
+    env = environments.make_env(described["env"], **described["settings"])
     first, count = described["first_seed"], described["seeds"]
     seeds = list(range(first, first + count))
     like = jax.eval_shape(

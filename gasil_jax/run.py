@@ -18,6 +18,7 @@ import tyro
 from gasil_jax import command_line, presets
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, unknown, validate
+from gasil_jax.environments import Settings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,12 +32,10 @@ class Options:
       first_seed: number of the first seed; a seed's result depends on its number
         alone.
       out: run folder, created here; default runs/ENV-AGENT-TIME.
-      reward_delay: give the accumulated reward every so many steps.
-      obs_noise: standard deviation of Gaussian noise on the observations.
-      solver: of the contacts, small (ours, faster) or mjx.
       preset: where the hyperparameters start from: tuned, by environment and agent,
         or paper; flags override it.
       devices: host devices that the seeds are sharded over; default the cores.
+      settings: of the environment.
       config: the algorithm.
     """
 
@@ -44,11 +43,11 @@ class Options:
     seeds: int = 1
     first_seed: int = 0
     out: pathlib.Path | None = None
-    reward_delay: int = 1
-    obs_noise: float = 0.0
-    solver: str = "small"
     preset: str = "tuned"
     devices: int | None = None
+    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=Settings
+    )
     config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Config
     )
@@ -77,16 +76,11 @@ def check(options: Options) -> None:
     Raises:
       InputError: the value and what is allowed.
     """
-    import gasil_envs.registry
+    from gasil_jax import environments
     from gasil_jax.imitation import AGENTS
 
     try:
-        gasil_envs.registry.check(
-            options.env,
-            reward_delay=options.reward_delay,
-            obs_noise=options.obs_noise,
-            solver=options.solver,
-        )
+        environments.check(options.env, options.settings)
         validate(options.config, tuple(AGENTS))
     except ValueError as error:
         raise InputError(str(error)) from None
@@ -131,10 +125,13 @@ def use_devices(options: Options, num_members: int) -> None:
     """Settings that must stand before JAX starts."""
     import jax
 
-    count = options.devices or os.cpu_count() or 1
+    from gasil_jax import environments
+
+    count = min(options.devices or os.cpu_count() or 1, num_members)
+    environments.prepare(options.settings, count)
     # In a program that has used JAX already, its devices stay as they are.
     with contextlib.suppress(RuntimeError):
-        jax.config.update("jax_num_cpu_devices", min(count, num_members))
+        jax.config.update("jax_num_cpu_devices", count)
     # TF32 has ruined PPO runs on Ampere and later GPUs.
     jax.config.update("jax_default_matmul_precision", "highest")
 
@@ -144,7 +141,7 @@ def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     from gasil_jax import logging
 
     described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    described |= {"out": str(folder), "config": dataclasses.asdict(options.config)}
+    described |= {"out": str(folder)}
     logging.write_json(folder / "config.json", described | more)
 
 
@@ -157,12 +154,7 @@ def make_env(options: Options) -> Any:
     from gasil_jax import environments
     from gasil_jax import train as training
 
-    env = environments.make_env(
-        options.env,
-        reward_delay=options.reward_delay,
-        obs_noise=options.obs_noise,
-        solver=options.solver,
-    )
+    env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
     try:
         training.check(env, options.config)
     except ValueError as error:

@@ -21,15 +21,16 @@ EACH_NAME = [
 
 
 @functools.cache
-def env_and_functions(name):
+def env_and_functions(name, physics="mjx"):
     """The environment, and its jitted and vmapped reset and step."""
-    env = gasil_envs.make(name)
+    env = gasil_envs.make(name, physics=physics)
     return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
 
 
+@pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME)
-def test_reset_and_step_under_jit_and_vmap(name):
-    env, reset, step = env_and_functions(name)
+def test_reset_and_step_under_jit_and_vmap(name, physics):
+    env, reset, step = env_and_functions(name, physics)
     state = reset(jax.random.split(jax.random.key(0), BATCH))
     assert state.obs.shape == (BATCH, env.observation_size)
     assert len(np.unique(state.obs, axis=0)) == BATCH  # each start is its own
@@ -48,7 +49,13 @@ def test_reset_and_step_under_jit_and_vmap(name):
 def gymnasium_transitions(name):
     """Steps of a random policy in Gymnasium: all falls, and others to make BATCH."""
     env = gymnasium.make(locomotion.TASKS[name].gymnasium_id).unwrapped
-    position_of = locomotion.TASKS[name].position or (lambda _, data: data.qpos[:2])
+    task = locomotion.TASKS[name]
+
+    def position_of(model, data):
+        if task.position is None:
+            return data.qpos[:2]
+        return task.position(model, {name: getattr(data, name) for name in task.fields})
+
     env.action_space.seed(0)
     env.reset(seed=0)
     steps = []
@@ -71,9 +78,10 @@ def gymnasium_transitions(name):
 
 # The largest errors are of steps in which a contact or limit begins or ends: there
 # the acceleration jumps, and a rounding of the state decides in which substep.
+@pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME[1:])
-def test_one_step_is_gymnasiums(name):
-    env, _, step = env_and_functions(name)
+def test_one_step_is_gymnasiums(name, physics):
+    env, _, step = env_and_functions(name, physics)
     transitions = gymnasium_transitions(name)
     *before, action = (jnp.asarray(x, jnp.float32) for x in transitions[:5])
     observation, reward, terminated = transitions[5:]
@@ -92,7 +100,7 @@ def test_one_step_is_gymnasiums(name):
     reward_error = np.abs(state.reward - reward) / (1.0 + np.abs(reward))
     quantiles = (0.5, 0.9, 0.99, 1.0)
     show = lambda x: np.array2string(np.quantile(x, quantiles), precision=1)
-    print(f"{name}: quantiles {quantiles} of the relative error of one step")
+    print(f"{name}, {physics}: quantiles {quantiles} of the relative error of one step")
     print("  observation", show(error))
     print("  reward", show(reward_error))
     assert np.median(error) < 1e-5

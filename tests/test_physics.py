@@ -1,4 +1,4 @@
-"""The constraint solver against plain NumPy, and the fallback to MJX's."""
+"""The constraint solver against plain NumPy, and C MuJoCo on the host."""
 
 import jax
 import jax.numpy as jnp
@@ -6,8 +6,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from gasil_envs.physics import newton
+import gasil_envs
+from gasil_envs.physics import native, newton
 from gasil_envs.physics.mjx import MjxPhysics
+from gasil_jax import rollout
 
 
 def problems(batch, size, rows, seed=0):
@@ -101,3 +103,85 @@ def test_a_model_that_the_small_solver_cant_take_falls_back(cone, caplog):
     mujoco.mj_step(model, data, 10)
     np.testing.assert_allclose(state.qpos, data.qpos, atol=2e-5)
     np.testing.assert_allclose(state.qvel, data.qvel, atol=2e-4)
+
+
+PENDULUM = """<mujoco><option timestep="0.01"/><worldbody><body>
+<joint name="hinge" axis="0 1 0"/>
+<geom type="capsule" size="0.05" fromto="0 0 0 0 0 1"/>
+</body></worldbody>
+<actuator><motor joint="hinge" gear="{gear}"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("fields", [(), ("xpos", "cfrc_ext")])
+def test_host_physics_in_nested_batches_and_a_scan_is_plain_mujoco(fields):
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=3))
+    physics = native.MujocoPhysics(model, fields, threads=2)
+    angle = jnp.linspace(-1.0, 1.0, 6).reshape(2, 3, 1)
+    state = jax.vmap(jax.vmap(physics.init))(angle, 0.5 * angle)
+    control = jnp.float32([0.7])
+
+    def body(state, _):
+        step = lambda one: physics.step(one, control, 4)
+        return jax.vmap(jax.vmap(step))(state)
+
+    end, seen = jax.jit(lambda state: jax.lax.scan(body, state, length=5))(state)
+    assert {name: x.shape for name, x in seen.items()} == {
+        name: (5, 2, 3, 2, getattr(mujoco.MjData(model), name).shape[1])
+        for name in fields
+    }
+    for index in np.ndindex(2, 3):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = angle[index], 0.5 * angle[index]
+        data.ctrl[:] = 0.7
+        mujoco.mj_step(model, data, 20)
+        np.testing.assert_allclose(end.qpos[index], data.qpos, rtol=1e-5)
+        np.testing.assert_allclose(end.qvel[index], data.qvel, rtol=1e-5)
+        if "xpos" in fields:
+            np.testing.assert_allclose(seen["xpos"][4][index], data.xpos, atol=1e-6)
+
+
+@pytest.mark.parametrize("fields", [(), ("xpos",)])
+def test_a_simulation_that_fails_is_nan_and_harms_no_other(fields):
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=1))
+    physics = native.MujocoPhysics(model, fields, threads=2)
+    state = jax.vmap(physics.init)(jnp.zeros((4, 1)), jnp.zeros((4, 1)))
+    # MuJoCo warns of both, and puts them back at the start.
+    state = state.replace(qpos=state.qpos.at[1].set(jnp.nan))
+    state = state.replace(qvel=state.qvel.at[2].set(1e12))
+    step = jax.jit(jax.vmap(lambda s: physics.step(s, jnp.ones(1), 4)))
+    for _ in range(2):  # also where a simulation is used again
+        following, given = step(state)
+        np.testing.assert_array_equal(np.isnan(following.qpos[:, 0]), [0, 1, 1, 0])
+        np.testing.assert_array_equal(following.qpos[0], following.qpos[3])
+        for value in given.values():
+            np.testing.assert_array_equal(np.isnan(value[:, 0, 0]), [0, 1, 1, 0])
+
+
+def test_a_failed_simulation_ends_its_episode_and_is_counted():
+    env = gasil_envs.make("hopper", physics="mujoco")
+    environments = rollout.init(env, jax.random.key(0), 4)
+    physics = environments.state.pipeline_state.physics
+    broken = physics.replace(qvel=physics.qvel.at[1].set(1e12))
+    inner = environments.state.pipeline_state.replace(physics=broken)
+    environments = environments.replace(
+        state=environments.state.replace(pipeline_state=inner)
+    )
+    policy = lambda observation: (jnp.zeros((4, 3)), jnp.zeros(3))
+    collect = jax.jit(
+        lambda environments, key: rollout.collect(
+            env,
+            policy,
+            environments,
+            key,
+            num_steps=3,
+            max_episode_steps=1000,
+            gamma=jnp.float32(0.99),
+        )
+    )
+    environments, batch = collect(environments, jax.random.key(1))
+    expected = np.zeros((3, 4), bool)
+    expected[0, 1] = True
+    np.testing.assert_array_equal(batch.faulty, expected)
+    np.testing.assert_array_equal(batch.terminated, expected)
+    np.testing.assert_array_equal(environments.episode_length, [3, 2, 3, 3])
+    assert np.all(np.isfinite(environments.state.obs))

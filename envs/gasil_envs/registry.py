@@ -1,26 +1,58 @@
 """Environment names and the one function that builds an environment."""
 
+import dataclasses
 import difflib
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
 
 from brax.envs import Env
 
 from gasil_envs import locomotion, point_mass, wrappers
+from gasil_envs.physics import native
 from gasil_envs.physics.mjx import SOLVERS
 
 
-def _constructors() -> dict[str, Callable[[str], Env]]:
-    constructors = {"point_mass": lambda solver: point_mass.PointMass()}
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    """How an environment is built.
+
+    Attributes:
+      reward_delay: give the accumulated reward every so many steps and when the
+        episode ends (paper, section 5.4); 1 leaves it as it is.
+      obs_noise: standard deviation of Gaussian noise on the observations (paper,
+        section 5.3); 0 leaves them as they are.
+      physics: of locomotion: mjx, pure JAX, or mujoco, C on the host's cores.
+      solver: of mjx's contacts: small (ours, faster) or mjx.
+      integrator: of locomotion: model, which is Gymnasium's, or euler, which is
+        faster and another task.
+    """
+
+    reward_delay: int = 1
+    obs_noise: float = 0.0
+    physics: str = "mjx"
+    solver: str = "small"
+    integrator: str = "model"
+
+
+def _constructors() -> dict[str, Callable[[Settings], Env]]:
+    constructors = {"point_mass": lambda settings: point_mass.PointMass()}
     for name in locomotion.TASKS:
-        constructors[name] = lambda solver, name=name: locomotion.Locomotion(
-            name, solver=solver
+        constructors[name] = lambda settings, name=name: locomotion.Locomotion(
+            name,
+            physics=settings.physics,
+            solver=settings.solver,
+            integrator=settings.integrator,
         )
     return constructors
 
 
-def _unknown(kind: str, name: str, allowed: tuple[str, ...]) -> str:
+def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
+    allowed = tuple(allowed)
+    if name in allowed:
+        return
     nearest = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
-    return (
+    raise ValueError(
         f"{kind} {name!r} is unknown: did you mean {nearest!r}? "
         f"(one of {', '.join(allowed)})"
     )
@@ -31,41 +63,47 @@ def names() -> tuple[str, ...]:
     return tuple(_constructors())
 
 
-def check(
-    name: str, *, reward_delay: int = 1, obs_noise: float = 0.0, solver: str = "small"
-) -> None:
+def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
-    if name not in names():
-        raise ValueError(_unknown("env", name, names()))
-    if solver not in SOLVERS:
-        raise ValueError(_unknown("solver", solver, SOLVERS))
-    if reward_delay < 1:
-        raise ValueError(f"reward_delay is {reward_delay}: it must be 1 or more")
-    if not 0.0 <= obs_noise < float("inf"):
-        raise ValueError(f"obs_noise is {obs_noise}: it must be finite and 0 or more")
+    _refuse_unknown("env", name, names())
+    _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
+    _refuse_unknown("solver", settings.solver, SOLVERS)
+    _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
+    if settings.physics != "mjx" and settings.solver != Settings.solver:
+        raise ValueError(
+            f"solver is {settings.solver!r}, which is of physics 'mjx': "
+            f"physics is {settings.physics!r}"
+        )
+    delay, noise = settings.reward_delay, settings.obs_noise
+    if delay < 1:
+        raise ValueError(f"reward_delay is {delay}: it must be 1 or more")
+    if not 0.0 <= noise < math.inf:
+        raise ValueError(f"obs_noise is {noise}: it must be finite and 0 or more")
 
 
-def make(
-    name: str, *, reward_delay: int = 1, obs_noise: float = 0.0, solver: str = "small"
-) -> Env:
+def prepare(settings: Settings, num_devices: int) -> None:
+    """What must be done before JAX starts for so many CPU devices."""
+    if settings.physics == "mujoco":
+        native.reserve_threads(num_devices)
+
+
+def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
       name: one of `names()`.
-      reward_delay: the reward is given, accumulated, every `reward_delay` steps
-        and when the episode ends (paper, section 5.4); 1 leaves it as it is.
-      obs_noise: standard deviation of the Gaussian noise that is added to each
-        observation (paper, section 5.3); 0 leaves it as it is.
-      solver: of the locomotion tasks' constraints, "small" (ours, faster) or "mjx".
+      **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
+        integrator.
 
     Raises:
       ValueError: an unknown name or a value out of range.
     """
-    check(name, reward_delay=reward_delay, obs_noise=obs_noise, solver=solver)
-    env = _constructors()[name](solver)
+    chosen = Settings(**settings)
+    check(name, chosen)
+    env = _constructors()[name](chosen)
     env = wrappers.EpisodeLimit(env, env.episode_length)
-    if reward_delay > 1:
-        env = wrappers.RewardDelay(env, reward_delay)
-    if obs_noise > 0:
-        env = wrappers.ObservationNoise(env, obs_noise)
+    if chosen.reward_delay > 1:
+        env = wrappers.RewardDelay(env, chosen.reward_delay)
+    if chosen.obs_noise > 0:
+        env = wrappers.ObservationNoise(env, chosen.obs_noise)
     return env

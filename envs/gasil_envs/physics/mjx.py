@@ -2,42 +2,37 @@
 
 import functools
 import logging
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
 import mujoco
-from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import dynamics
+from gasil_envs.physics.interface import Fields, PhysicsState
 
 _LOGGER = logging.getLogger(__name__)
-
-
-@struct.dataclass
-class PhysicsState:
-    """All that a later step depends on, so that replacing it resets everything.
-
-    Attributes:
-      qpos: positions, float32 (nq,).
-      qvel: velocities, float32 (nv,).
-      qacc_warmstart: where the constraint solver starts, float32 (nv,).
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    qacc_warmstart: jax.Array
-
 
 #: What `MjxPhysics` takes as `solver`.
 SOLVERS = ("small", "mjx")
 
+_FIELDS: dict[str, Callable[[mjx.Data], jax.Array]] = {
+    "xpos": lambda data: data.xpos,
+    "xipos": lambda data: data.xipos,
+    "cinert": lambda data: data._impl.cinert,
+    "cvel": lambda data: data.cvel,
+    "qfrc_actuator": lambda data: data.qfrc_actuator,
+    "cfrc_ext": lambda data: data._impl.cfrc_ext,
+}
+
 
 class MjxPhysics:
-    """Steps a MuJoCo model with MJX.
+    """Steps a MuJoCo model with MJX; see `interface.Physics`.
 
     Args:
       model: the model; its solver options are overwritten.
+      fields: names of the ``mjData`` arrays that are given.
       solver: "small" takes our constraint rows and Newton's method for small dense
         problems (`dynamics`), or, for a model that these can't take, falls back to
         "mjx" with a warning in the log; "mjx" takes MJX's own step.
@@ -51,6 +46,7 @@ class MjxPhysics:
     def __init__(
         self,
         model: mujoco.MjModel,
+        fields: Sequence[str] = (),
         solver: str = "small",
         iterations: int = 4,
         ls_iterations: int = 8,
@@ -59,6 +55,7 @@ class MjxPhysics:
         model.opt.ls_iterations = ls_iterations
         # humanoid.xml asks for PGS, which MJX lacks.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+        self._fields = tuple(fields)
         self._mjx_model = mjx.put_model(model)
         self._blank_data = mjx.make_data(model)
         reason = dynamics.unsupported(model) if solver == "small" else None
@@ -74,35 +71,31 @@ class MjxPhysics:
         """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
-    def data(self, state: PhysicsState) -> mjx.Data:
-        """MJX's data for `state`, nothing derived from it computed yet."""
+    def _data(self, state: PhysicsState) -> mjx.Data:
         return self._blank_data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
         )
 
-    def kinematics(self, state: PhysicsState) -> mjx.Data:
-        """Data with the positions and velocities of the bodies at `state`."""
-        data = mjx.kinematics(self._mjx_model, self.data(state))
+    def _pick(self, data: mjx.Data) -> Fields:
+        return {name: _FIELDS[name](data) for name in self._fields}
+
+    def kinematics(self, state: PhysicsState) -> Fields:
+        """The fields at `state`; forces are 0."""
+        data = mjx.kinematics(self._mjx_model, self._data(state))
         data = mjx.com_pos(self._mjx_model, data)
-        return mjx.com_vel(self._mjx_model, data)
+        return self._pick(mjx.com_vel(self._mjx_model, data))
 
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
-    ) -> tuple[PhysicsState, mjx.Data]:
-        """Advance `frame_skip` time steps under one control (nu,).
-
-        Returns the state and MJX's data. As in C MuJoCo, what the data derives
-        from positions and velocities belongs to the last evaluation of the
-        dynamics, not to the new state.
-        """
-        data = self.data(state).replace(ctrl=control)
+    ) -> tuple[PhysicsState, Fields]:
+        """Advance `frame_skip` time steps under one control (nu,)."""
+        data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
             lambda data, _: (self._step(data), None),
             data,
             length=frame_skip,
         )[0]
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart), data
-
-    def contact_forces(self, data: mjx.Data) -> jax.Array:
-        """External force on each body, com-based, (nbody, 6): MuJoCo's cfrc_ext."""
-        return mjx.rne_postconstraint(self._mjx_model, data)._impl.cfrc_ext
+        state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
+        if "cfrc_ext" in self._fields:
+            data = mjx.rne_postconstraint(self._mjx_model, data)
+        return state, self._pick(data)

@@ -1,0 +1,221 @@
+"""MuJoCo physics in C, on the host's cores, from inside a jitted program.
+
+One host call advances every environment of a device: `jax.pure_callback`, with the
+batch axes of all `jax.vmap`s around it. The callback is a function of its arguments
+alone and touches NumPy only; a JAX operation inside could deadlock. A simulation in
+which MuJoCo raises an error or a warning comes back as NaN, which ends its episode.
+"""
+
+import collections
+import concurrent.futures
+import copy
+import itertools
+import os
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from gasil_envs.physics.interface import Fields, PhysicsState
+from gasil_envs.physics.mjx import MjxPhysics
+
+_STATE = ("qpos", "qvel", "qacc_warmstart")
+
+# JAX copies a host call's arguments with the threads that its CPU devices compute on.
+# Before jax 0.12 large ones wait for ever if every thread is a device inside a call.
+_POOL_SIZE = "PJRT_NPROC"
+_NEEDS_THREADS = tuple(map(int, jax.__version__.split(".")[:2])) < (0, 12)
+
+
+def reserve_threads(num_devices: int) -> None:
+    """Let `num_devices` CPU devices make host calls at once; before JAX starts."""
+    if _NEEDS_THREADS and num_devices > 1:
+        os.environ.setdefault(_POOL_SIZE, str(2 * num_devices))
+
+
+def _check_threads() -> None:
+    devices = jax.local_device_count()
+    threads = int(os.environ.get(_POOL_SIZE, os.cpu_count() or 1))
+    on_cpu = jax.default_backend() == "cpu"
+    if _NEEDS_THREADS and on_cpu and devices > 1 and threads <= devices:
+        raise RuntimeError(
+            f"physics 'mujoco' on {devices} CPU devices would wait for ever in jax "
+            f"{jax.__version__}: set {_POOL_SIZE}={2 * devices} before JAX starts"
+        )
+
+
+class _Simulations(Protocol):
+    """Room for a fixed number of simulations; used by one thread at a time."""
+
+    def step(
+        self, inputs: dict[str, np.ndarray], frame_skip: int
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """From state and "ctrl" to state and fields, (n, ...) each, and faults (n,)."""
+
+
+class _BatchSimulations:
+    """On MuJoCo's own `mujoco.batch.Batch`, which gives states alone."""
+
+    def __init__(self, model: mujoco.MjModel, count: int, threads: int):
+        self._batch = mujoco.batch.Batch(model, count, threads)
+        self._bound = {name: self._batch.bind(name) for name in (*_STATE, "ctrl")}
+
+    def step(
+        self, inputs: dict[str, np.ndarray], frame_skip: int
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        for name, value in inputs.items():
+            self._bound[name][...] = value
+        self._batch.warning[...] = 0
+        try:
+            self._batch.step(nstep=frame_skip)
+        except mujoco.batch.SimulationError as error:
+            failed = np.isin(np.arange(self._batch.nsim), error.ids)
+        else:
+            failed = np.zeros(self._batch.nsim, bool)
+        warned = self._batch.warning[..., -1].any(axis=-1)
+        return {name: self._bound[name] for name in _STATE}, failed | warned
+
+
+class _ThreadedSimulations:
+    """A thread and an `mujoco.MjData` for each share; gives contact forces too.
+
+    `Batch` has none: ``cfrc_ext`` takes ``mj_rnePostConstraint`` after the step.
+    """
+
+    def __init__(
+        self, model: mujoco.MjModel, count: int, threads: int, fields: Sequence[str]
+    ):
+        self._model, self._fields = model, tuple(fields)
+        bounds = np.linspace(0, count, min(threads, count) + 1).astype(int)
+        self._shares = list(itertools.pairwise(bounds))
+        self._data = [mujoco.MjData(model) for _ in self._shares]
+        self._pool = concurrent.futures.ThreadPoolExecutor(len(self._shares))
+        shape = lambda name: (count, *getattr(self._data[0], name).shape)
+        self._results = {name: np.zeros(shape(name)) for name in _STATE + self._fields}
+        self._failed = np.zeros(count, bool)
+
+    def _advance(
+        self,
+        data: mujoco.MjData,
+        share: tuple[int, int],
+        inputs: dict[str, np.ndarray],
+        frame_skip: int,
+    ) -> None:
+        sources = [(getattr(data, name), value) for name, value in inputs.items()]
+        results = [(getattr(data, name), x) for name, x in self._results.items()]
+        warned = data.warning.number
+        for i in range(*share):
+            for array, value in sources:
+                array[...] = value[i]
+            warned[...] = 0
+            try:
+                mujoco.mj_step(self._model, data, frame_skip)
+                mujoco.mj_rnePostConstraint(self._model, data)
+            except mujoco.FatalError:
+                self._failed[i] = True
+            else:
+                self._failed[i] = warned.any()
+            for array, value in results:
+                value[i] = array
+
+    def step(
+        self, inputs: dict[str, np.ndarray], frame_skip: int
+    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        work = [
+            self._pool.submit(self._advance, data, share, inputs, frame_skip)
+            for data, share in zip(self._data, self._shares)
+        ]
+        for one in work:
+            one.result()
+        return self._results, self._failed
+
+
+class MujocoPhysics:
+    """Steps a MuJoCo model with C MuJoCo; see `interface.Physics`.
+
+    Args:
+      model: the model, with its own solver and integrator.
+      fields: names of the ``mjData`` arrays that are given.
+      threads: of one host call; default the cores that this process may use, shared
+        by the local devices of JAX's default backend.
+    """
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        fields: Sequence[str] = (),
+        threads: int | None = None,
+    ):
+        self._model, self._fields, self._threads = model, tuple(fields), threads
+        shape = lambda name: getattr(mujoco.MjData(model), name).shape
+        self._shapes = {name: shape(name) for name in (*_STATE, *self._fields)}
+        # By number of simulations. Devices call at the same time, each takes its own.
+        self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
+        # Starts are drawn far more often than they are used: no host call for them.
+        self._at_start = MjxPhysics(copy.copy(model), fields, solver="mjx")
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
+        """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
+        return self._at_start.init(qpos, qvel)
+
+    def kinematics(self, state: PhysicsState) -> Fields:
+        """The fields at `state`; forces are 0."""
+        return self._at_start.kinematics(state)
+
+    def step(
+        self, state: PhysicsState, control: jax.Array, frame_skip: int
+    ) -> tuple[PhysicsState, Fields]:
+        """Advance `frame_skip` time steps under one control (nu,)."""
+        _check_threads()
+        threads = self._threads or max(
+            1, len(os.sched_getaffinity(0)) // jax.local_device_count()
+        )
+
+        def on_host(*arrays: Any) -> dict[str, np.ndarray]:
+            return self._advance([np.asarray(x) for x in arrays], frame_skip, threads)
+
+        shapes = {
+            name: jax.ShapeDtypeStruct(shape, jnp.float32)
+            for name, shape in self._shapes.items()
+        }
+        result = jax.pure_callback(
+            on_host,
+            shapes,
+            *(state.qpos, state.qvel, state.qacc_warmstart, control),
+            vmap_method="broadcast_all",
+        )
+        state = PhysicsState(*(result[name] for name in _STATE))
+        return state, {name: result[name] for name in self._fields}
+
+    def _advance(
+        self, arrays: list[np.ndarray], frame_skip: int, threads: int
+    ) -> dict[str, np.ndarray]:
+        batch = arrays[0].shape[:-1]
+        inputs = {
+            name: x.reshape(-1, x.shape[-1])
+            for name, x in zip((*_STATE, "ctrl"), arrays, strict=True)
+        }
+        count = inputs["qpos"].shape[0]
+        idle = self._idle[count]
+        try:
+            simulations = idle.pop()
+        except IndexError:
+            simulations = self._simulations(count, threads)
+        values, failed = simulations.step(inputs, frame_skip)
+        results = {}
+        for name, shape in self._shapes.items():
+            # A copy, before the next caller takes these simulations.
+            result = np.array(values[name], np.float32)
+            result[failed] = np.nan
+            results[name] = result.reshape(batch + shape)
+        idle.append(simulations)
+        return results
+
+    def _simulations(self, count: int, threads: int) -> _Simulations:
+        if self._fields:
+            return _ThreadedSimulations(self._model, count, threads, self._fields)
+        return _BatchSimulations(self._model, count, threads)

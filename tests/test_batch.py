@@ -1,0 +1,36 @@
+"""Members side by side, over devices."""
+
+import jax
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax import batch
+
+SMALL = gasil_jax.Config(
+    total_steps=256,
+    num_envs=4,
+    batch_steps=128,
+    minibatch_size=32,
+    num_epochs=1,
+    hidden_sizes=(8,),
+    discriminator_hidden_sizes=(8,),
+)
+
+
+@pytest.mark.parametrize(
+    ("name", "physics"), [("point_mass", "mjx"), ("halfcheetah", "mujoco")]
+)
+def test_a_seed_does_not_depend_on_the_number_of_devices(name, physics):
+    env = gasil_jax.make_env(name, physics=physics)
+    results = []
+    # Three members on two devices: one is padding.
+    for devices, seeds in ((1, [5, 6, 7]), (2, [5, 6, 7]), (1, [6])):
+        runs = batch.make_batch(env, SMALL, seeds, devices=jax.devices()[:devices])
+        states, advance = runs.compile()
+        *_, (last, _) = runs.run(states, advance)
+        results.append(jax.tree.map(np.asarray, runs.trim(last).params))
+    one, two, alone = results
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+    jax.tree.map(close, one, two)
+    jax.tree.map(lambda a, b: close(a[1], b[0]), two, alone)
