@@ -1,10 +1,12 @@
-"""Joint limits and contacts as rows of a one-sided least-squares problem.
+"""Joint limits and contacts as one-sided constraints for `newton`.
 
-The rows, their order and their numbers are MJX's (``mjx.make_constraint``), which are
-C MuJoCo's; what does not depend on the state is worked out once, in NumPy. One thing
-differs from MJX and agrees with C MuJoCo: the tangent of a capsule on a plane is the
-capsule's axis however steep it is. MJX takes a fixed one above 60 degrees, and the
-pyramidal friction cone, and with it the motion, depends on the tangent.
+The numbers are those of MJX's rows (``mjx.make_constraint``), which are C MuJoCo's;
+what does not depend on the state is worked out once, in NumPy. Two things differ from
+MJX. The tangent of a capsule on a plane is the capsule's axis however steep it is, as
+in C MuJoCo; MJX takes a fixed one above 60 degrees, and the pyramidal friction cone,
+and with it the motion, depends on the tangent. And in a model that can only move in a
+plane the tangent across the plane is left out: nothing moves along it, so the two
+edges that it would make are the normal, twice.
 """
 
 import dataclasses
@@ -15,6 +17,12 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
+
+from gasil_envs.physics import newton
+
+_PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
+# Edges of normal +- tangent, and the normal with twice the weight.
+_FLAT_PYRAMID = ((1,), (-1,), (0,))
 
 #: Joint types with one degree of freedom.
 SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
@@ -102,12 +110,13 @@ class Limits:
 class Contacts:
     """Possible contacts of one condim; `index` is their place in MJX's contacts.
 
-    `mask` (n, nv) is 1 where a degree of freedom moves the second body, -1 where it
-    moves the first and 0 where it moves both or none; `root` is the body whose
-    subtree's centre of mass the motion is expressed about.
+    `edges` are those of `newton.Contacts`. `mask` (n, nv) is 1 where a degree of
+    freedom moves the second body, -1 where it moves the first and 0 where it moves both
+    or none; `root` is the body whose subtree's centre of mass the motion is expressed
+    about.
     """
 
-    condim: int
+    edges: tuple[tuple[int, ...], ...]
     index: np.ndarray
     root: np.ndarray
     mask: np.ndarray
@@ -125,19 +134,13 @@ class Layout(NamedTuple):
       contacts: by condim.
       capsule_on_plane: (2, n), which of MJX's contacts are of a capsule on a plane,
         and the capsule's geom.
+      plane: (3,), the normal of the plane that all motion is in, or None.
     """
 
     limits: Limits
     contacts: tuple[Contacts, ...]
     capsule_on_plane: np.ndarray
-
-
-class Rows(NamedTuple):
-    """Rows J (R, nv), references aref (R,) and weights D (R,)."""
-
-    jacobian: jax.Array
-    reference: jax.Array
-    weight: jax.Array
+    plane: np.ndarray | None
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -183,7 +186,12 @@ def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
         collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
         contact = collide(mjx.make_data(model))
     condim = np.asarray(contact.dim).reshape(-1)
-    contacts = [_contacts(model, contact, condim, dim) for dim in (1, 3)]
+    plane = _plane(model)
+    pyramid = _PYRAMID if plane is None else _FLAT_PYRAMID
+    contacts = [
+        _contacts(model, contact, condim, dim, edges)
+        for dim, edges in ((1, ((),)), (3, pyramid))
+    ]
     geom = np.asarray(contact.geom).reshape(-1, 2)
     kind = model.geom_type[geom]
     index = np.flatnonzero((kind == _PLANE_AND_CAPSULE).all(axis=1))
@@ -191,11 +199,31 @@ def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
         limits,
         tuple(c for c in contacts if c.index.size),
         np.stack([index, geom[index, 1]]),
+        plane,
     )
 
 
+def _plane(model: mujoco.MjModel) -> np.ndarray | None:
+    """The normal of the plane that all of the model's motion is in, or None."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
+    slide = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
+    if not hinge.any() or not (hinge | slide).all():
+        return None
+    # Turning about the normal leaves both properties as they are.
+    normal = data.xaxis[hinge][0]
+    across = np.abs(data.xaxis @ normal)
+    flat = np.allclose(across[hinge], 1.0) and np.allclose(across[slide], 0.0)
+    return normal.astype(np.float32) if flat else None
+
+
 def _contacts(
-    model: mujoco.MjModel, contact: mjx.Contact, condims: np.ndarray, condim: int
+    model: mujoco.MjModel,
+    contact: mjx.Contact,
+    condims: np.ndarray,
+    condim: int,
+    edges: tuple[tuple[int, ...], ...],
 ) -> Contacts:
     index = np.flatnonzero(condims == condim)
     geom = np.asarray(contact.geom).reshape(-1, 2)[index]
@@ -210,7 +238,7 @@ def _contacts(
         inverse_weight = inverse_weight * 2 * friction**2 / model.opt.impratio
     at = lambda x, width: np.asarray(x).reshape(-1, width)[index]
     return Contacts(
-        condim=condim,
+        edges=edges,
         index=index,
         root=model.body_rootid[body].max(axis=1),
         mask=(moves[body[:, 1]] - moves[body[:, 0]]).astype(np.float32),
@@ -221,14 +249,25 @@ def _contacts(
     )
 
 
-def make(layout: Layout, data: mjx.Data) -> Rows:
-    """The rows at the positions and velocities of `data`, after MJX's collision."""
-    parts = [_limit_rows(layout.limits, data)] if layout.limits.dof.size else []
-    parts += [_contact_rows(contacts, data) for contacts in layout.contacts]
-    if not parts:
-        nothing = jnp.zeros(0, jnp.float32)
-        return Rows(jnp.zeros((0, data.qvel.shape[0])), nothing, nothing)
-    return Rows(*map(jnp.concatenate, zip(*parts, strict=True)))
+def make(
+    layout: Layout, data: mjx.Data
+) -> tuple[newton.Limits, tuple[newton.Contacts, ...]]:
+    """The constraints at the state of `data`, after MJX's collision."""
+    return (
+        _make_limits(layout.limits, data),
+        tuple(_make_contacts(group, layout.plane, data) for group in layout.contacts),
+    )
+
+
+def row_forces(layout: Layout, solution: newton.Solution) -> jax.Array:
+    """The forces in the rows and the order that MJX and C MuJoCo have them in, (R,)."""
+    forces = [solution.limit_force[layout.limits.dof]]
+    for group, force in zip(layout.contacts, solution.edge_forces, strict=True):
+        if group.edges == _FLAT_PYRAMID:
+            half = 0.5 * force[:, 2:]
+            force = jnp.concatenate([force[:, :2], half, half], axis=1)
+        forces.append(force.ravel())
+    return jnp.concatenate(forces)
 
 
 def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
@@ -236,22 +275,22 @@ def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
     return 1.0 / jnp.maximum(resistance, mujoco.mjMINVAL)
 
 
-def _limit_rows(limits: Limits, data: mjx.Data) -> Rows:
+def _make_limits(limits: Limits, data: mjx.Data) -> newton.Limits:
     qpos = data.qpos[limits.qpos]
     above_low, below_high = qpos - limits.low, limits.high - qpos
     distance = jnp.minimum(above_low, below_high) - limits.margin
     inside = jnp.where(above_low < below_high, 1.0, -1.0)
     sign = jnp.where(distance < 0.0, inside, 0.0)
     distance = jnp.minimum(distance, 0.0)
-    select = np.eye(data.qvel.shape[0], dtype=np.float32)[limits.dof]
     impedance = limits.impedance(distance)
     pull = limits.impedance.stiffness * impedance * distance
     damp = limits.impedance.damping * sign * data.qvel[limits.dof]
-    return Rows(
-        sign[:, None] * select,
-        -damp - pull,
-        _weight(impedance, limits.inverse_weight),
-    )
+    of_limit = (sign, -damp - pull, _weight(impedance, limits.inverse_weight))
+    # Each limit in the place of its degree of freedom, without a scatter.
+    place = np.full(data.qvel.shape[0], limits.dof.size)
+    place[limits.dof] = np.arange(limits.dof.size)
+    spread = lambda x: jnp.concatenate([x, jnp.zeros(1, jnp.float32)])[place]
+    return newton.Limits(*map(spread, of_limit))
 
 
 def align_frames(layout: Layout, data: mjx.Data) -> mjx.Data:
@@ -273,34 +312,39 @@ def align_frames(layout: Layout, data: mjx.Data) -> mjx.Data:
     return data.tree_replace({"_impl.contact": contact})
 
 
-def _contact_rows(contacts: Contacts, data: mjx.Data) -> Rows:
-    contact = data._impl.contact
-    distance = contact.dist[contacts.index] - contacts.margin
-    active = distance < 0.0
-    distance = jnp.where(active, distance, 0.0)
-    arm = contact.pos[contacts.index] - data.subtree_com[contacts.root]
-    axes = contact.frame[contacts.index][:, : contacts.condim]
+def _make_contacts(
+    contacts: Contacts, plane: np.ndarray | None, data: mjx.Data
+) -> newton.Contacts:
+    contact, index = data._impl.contact, contacts.index
+    num_tangents = len(contacts.edges[0])
+    gap = contact.dist[index] - contacts.margin
+    active = gap < 0.0
+    arm = contact.pos[index] - data.subtree_com[contacts.root]
+    axes = contact.frame[index][:, : 1 + num_tangents]
+    if num_tangents and plane is not None:
+        # Which of MJX's two tangents is in the plane depends on the state.
+        axes = jnp.stack([axes[:, 0], jnp.cross(plane, axes[:, 0])], axis=1)
     # cdof is (rotation, translation) of a point at the root's centre of mass.
     wrench = jnp.concatenate([jnp.cross(arm[:, None], axes), axes], axis=-1)
-    along = wrench @ data.cdof.T * contacts.mask[:, None]  # (n, condim, nv)
+    along = wrench @ data.cdof.T * contacts.mask[:, None]  # (n, 1 + tangents, nv)
     along = jnp.where(active[:, None, None], along, 0.0)
-    speed = along @ data.qvel  # (n, condim)
-    impedance = contacts.impedance(contact.dist[contacts.index] - contacts.margin)
-    pull = contacts.impedance.stiffness * impedance * distance
+    friction = np.ones((index.size, 1 + num_tangents, 1), np.float32)
+    friction[:, 1:] = contacts.friction[:, None, None]
+    along = along * friction
+    signs = np.array([(1, *signs) for signs in contacts.edges], np.float32)
+    speed = (along @ data.qvel) @ signs.T  # (n, edges)
+    impedance = contacts.impedance(gap)
+    pull = contacts.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
     weight = _weight(impedance, contacts.inverse_weight)
-    damping = contacts.impedance.damping[:, None]
-    if contacts.condim == 1:
-        return Rows(along[:, 0], -damping[:, 0] * speed[:, 0] - pull, weight)
-
-    def edges(x: jax.Array, friction: np.ndarray) -> jax.Array:
-        normal, tangents = x[:, :1], friction * x[:, 1:]
-        pairs = jnp.stack([normal + tangents, normal - tangents], axis=2)
-        return pairs.reshape(-1, *x.shape[2:])
-
-    friction = contacts.friction[:, None]
-    speed = edges(speed, friction)
-    return Rows(
-        edges(along, friction[..., None]),
-        -jnp.repeat(contacts.impedance.damping, 4) * speed - jnp.repeat(pull, 4),
-        jnp.repeat(weight, 4),
+    # A normal that stands for two edges weighs as both.
+    count = [
+        2.0 if contacts.edges == _FLAT_PYRAMID and not any(s) else 1.0
+        for s in contacts.edges
+    ]
+    return newton.Contacts(
+        normal=along[:, 0],
+        tangents=along[:, 1:],
+        reference=-contacts.impedance.damping[:, None] * speed - pull[:, None],
+        weight=weight[:, None] * np.array(count, np.float32),
+        edges=contacts.edges,
     )

@@ -26,14 +26,14 @@ class Dynamics(NamedTuple):
 
     Attributes:
       model: MJX's.
-      rows: the layout of the constraint rows.
+      layout: of the constraints.
       motor: (nu, nv), generalized force of one unit of control.
       control_range: (2, nu).
       iterations: of the solver.
     """
 
     model: mjx.Model
-    rows: constraints.Layout
+    layout: constraints.Layout
     motor: np.ndarray
     control_range: np.ndarray
     iterations: int
@@ -95,7 +95,7 @@ def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     data = mjx.tendon(model, data)
     data = mjx.crb(model, data)
     data = mjx.tendon_armature(model, data)
-    data = constraints.align_frames(dynamics.rows, mjx.collision(model, data))
+    data = constraints.align_frames(dynamics.layout, mjx.collision(model, data))
     data = mjx.com_vel(model, data)
     data = mjx.passive(model, data)
     data = mjx.rne(model, data)
@@ -103,15 +103,14 @@ def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     control = jnp.clip(data.ctrl, *dynamics.control_range)
     actuation = control @ dynamics.motor
     force = data.qfrc_passive - data.qfrc_bias + actuation
-    rows = constraints.make(dynamics.rows, data)
+    limits, contacts = constraints.make(dynamics.layout, data)
     solution = newton.solve(
         newton.Problem(
             inertia=data._impl.M,
             force=force,
-            jacobian=rows.jacobian,
-            reference=rows.reference,
-            weight=rows.weight,
             warmstart=data.qacc_warmstart,
+            limits=limits,
+            contacts=contacts,
         ),
         dynamics.iterations,
     )
@@ -122,7 +121,7 @@ def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
             "qacc_smooth": solution.qacc_smooth,
             "qacc": solution.qacc,
             "qfrc_constraint": solution.constraint_force,
-            "_impl.efc_force": solution.row_force,
+            "_impl.efc_force": constraints.row_forces(dynamics.layout, solution),
         }
     )
 

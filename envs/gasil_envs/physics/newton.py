@@ -11,6 +11,14 @@ ends as soon as it has found the active rows. The number of iterations is fixed,
 every array has the batch as its last axis: with 5 to 30 degrees of freedom the batch
 is the only axis that is long enough to fill vector units.
 
+Rows are not stored one by one. A joint's limit is one entry of a diagonal. The rows
+of a contact are the edges of its friction pyramid, normal +- friction * tangent: with
+E the small constant matrix that makes edges of normal and tangents, J = E B, and
+
+    J q = E (B q),    J' diag(w) J = B' (E' diag(w) E) B,
+
+where B has 2 or 3 rows a contact where J has 4.
+
 Not reverse-mode differentiable (MJX's own solver is not either, its loop being
 dynamic).
 """
@@ -23,7 +31,42 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Shape letters: V degrees of freedom, R rows, B batch.
+# Shape letters: V degrees of freedom, B batch; of a group of contacts that are alike:
+# C contacts, T tangents, E edges.
+
+
+@struct.dataclass
+class Contacts:
+    """Contacts that have as many edges each; float32.
+
+    Attributes:
+      normal: (C, V), Jacobian of the normal; zero where out of play.
+      tangents: (C, T, V), of the tangents, times the friction.
+      reference: (C, E), aref of the edges.
+      weight: (C, E), D of the edges, at least 0.
+      edges: E rows of T signs: an edge is normal + signs @ tangents.
+    """
+
+    normal: jax.Array
+    tangents: jax.Array
+    reference: jax.Array
+    weight: jax.Array
+    edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Limits:
+    """At most one limit on each degree of freedom; float32.
+
+    Attributes:
+      sign: (V,), the Jacobian: 1 at a lower, -1 at an upper limit, 0 in between.
+      reference: (V,), aref.
+      weight: (V,), D, at least 0.
+    """
+
+    sign: jax.Array
+    reference: jax.Array
+    weight: jax.Array
 
 
 @struct.dataclass
@@ -33,18 +76,16 @@ class Problem:
     Attributes:
       inertia: (V, V), the joint-space inertia M.
       force: (V,), all forces but the constraints': M qacc_smooth.
-      jacobian: (R, V), zero in rows that are out of play.
-      reference: (R,), aref.
-      weight: (R,), D, at least 0.
       warmstart: (V,), where to start if that is better than qacc_smooth.
+      limits: of the joints.
+      contacts: groups of them.
     """
 
     inertia: jax.Array
     force: jax.Array
-    jacobian: jax.Array
-    reference: jax.Array
-    weight: jax.Array
     warmstart: jax.Array
+    limits: Limits
+    contacts: tuple[Contacts, ...] = ()
 
 
 @struct.dataclass
@@ -54,19 +95,21 @@ class Solution:
     Attributes:
       qacc: (V,), acceleration.
       qacc_smooth: (V,), acceleration without constraints.
-      row_force: (R,), force in each row, at least 0.
-      constraint_force: (V,), J' row_force.
+      limit_force: (V,), force of each limit, at least 0.
+      edge_forces: (C, E) for each group of contacts, force along each edge.
+      constraint_force: (V,), J' times these forces.
     """
 
     qacc: jax.Array
     qacc_smooth: jax.Array
-    row_force: jax.Array
+    limit_force: jax.Array
+    edge_forces: tuple[jax.Array, ...]
     constraint_force: jax.Array
 
 
 def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
     """Solve one problem; `jax.vmap` it for many, nested as deep as needed."""
-    batched = _batch_last(functools.partial(_solve, iterations, line_search))
+    batched = _batch_last(_in_tiles(functools.partial(_solve, iterations, line_search)))
     solution = batched(jax.tree.map(lambda x: x[..., None], problem))
     return jax.tree.map(lambda x: x[..., 0], solution)
 
@@ -89,10 +132,10 @@ def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
             if not batched:
                 x = jnp.broadcast_to(x, (axis_size, *x.shape))
             x = jnp.moveaxis(x, 0, -2)
-            return x.reshape(*x.shape[:-2], -1)
+            return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
 
         def part(x: jax.Array) -> jax.Array:
-            x = x.reshape(*x.shape[:-1], axis_size, -1)
+            x = x.reshape(*x.shape[:-1], axis_size, x.shape[-1] // axis_size)
             return jnp.moveaxis(x, -2, 0)
 
         joined = _materialize(jax.tree.map(join, tree, is_batched))
@@ -101,6 +144,25 @@ def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return result, jax.tree.map(lambda _: True, result)
 
     return function
+
+
+# With more problems at once than this a CPU's caches do not hold what they work on.
+_MOST_IN_A_TILE = 64
+
+
+def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """`function` of arrays with a trailing batch, on a CPU a part of it at a time."""
+
+    def in_tiles(tree: Any) -> Any:
+        batch = jax.tree.leaves(tree)[0].shape[-1]
+        size = max(n for n in range(1, _MOST_IN_A_TILE + 1) if batch % n == 0)
+        if jax.default_backend() != "cpu" or size < 16 or size == batch:
+            return function(tree)
+        split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -2, 0)
+        join = lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch)
+        return jax.tree.map(join, jax.lax.map(function, jax.tree.map(split, tree)))
+
+    return in_tiles
 
 
 # XLA's CPU backend fuses a chain of elementwise operations into each of its users and
@@ -112,13 +174,13 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b, axis=0)
 
 
-# Above this many entries of the Jacobian, sums are left to reductions: spelled out
-# they are up to 4 times as fast, but the time to compile them grows with the entries.
-_MOST_ENTRIES_SPELLED_OUT = 700
+# Above this many entries of a matrix, sums are left to reductions: spelled out they
+# are up to 4 times as fast, but the time to compile them grows with the entries.
+_MOST_ENTRIES_SPELLED_OUT = 1100
 
 
-def _is_small(jacobian: jax.Array) -> bool:
-    return jacobian.shape[0] * jacobian.shape[1] <= _MOST_ENTRIES_SPELLED_OUT
+def _is_small(matrix: jax.Array) -> bool:
+    return matrix.shape[0] * matrix.shape[1] <= _MOST_ENTRIES_SPELLED_OUT
 
 
 def _matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
@@ -129,20 +191,19 @@ def _matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
 
 
 def _matvec_transposed(matrix: jax.Array, vector: jax.Array) -> jax.Array:
-    """(R, V, B), (R, B) -> (V, B)."""
+    """(N, V, B), (N, B) -> (V, B)."""
     if _is_small(matrix):
-        return sum(matrix[r] * vector[r] for r in range(vector.shape[0]))
+        return sum(matrix[n] * vector[n] for n in range(vector.shape[0]))
     return jnp.sum(matrix * vector[:, None], axis=0)
 
 
-def _gram(jacobian: jax.Array, weight: jax.Array) -> jax.Array:
-    """J' diag(w) J: (R, V, B), (R, B) -> (V, V, B)."""
-    num_rows, size, _ = jacobian.shape
-    weighted = _materialize(weight[:, None] * jacobian)
-    if not _is_small(jacobian):
-        return jnp.moveaxis(jnp.einsum("rib,rjb->bij", weighted, jacobian), 0, -1)
+def _symmetric_product(left: jax.Array, right: jax.Array) -> jax.Array:
+    """left' right, known to be symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
+    num_rows, size, _ = left.shape
+    if not _is_small(left):
+        return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
     rows = [
-        sum(weighted[r, i] * jacobian[r, : i + 1] for r in range(num_rows))
+        sum(left[n, i] * right[n, : i + 1] for n in range(num_rows))
         for i in range(size)
     ]
     rows = [_materialize(row) for row in rows]
@@ -154,6 +215,112 @@ def _gram(jacobian: jax.Array, weight: jax.Array) -> jax.Array:
             for i in range(size)
         ]
     )
+
+
+class _Rows:
+    """The constraint matrix J of a `Problem` whose batch is the last axis.
+
+    A vector of one number a row is a list: (V, B) for the limits, and (E, C, B) for
+    each group of contacts.
+    """
+
+    def __init__(self, problem: Problem):
+        edges_first = lambda x: jnp.swapaxes(x, 0, 1)
+        self._sign = problem.limits.sign
+        self._edges = [group.edges for group in problem.contacts]
+        self._shapes = [group.tangents.shape[:2] for group in problem.contacts]
+        self.reference = [
+            problem.limits.reference,
+            *(edges_first(group.reference) for group in problem.contacts),
+        ]
+        self.weight = [
+            problem.limits.weight,
+            *(edges_first(group.weight) for group in problem.contacts),
+        ]
+        # B: normals, then the first tangents, then the second, of group after group.
+        parts = []
+        for group in problem.contacts:
+            parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
+        self._basis = _materialize(jnp.concatenate(parts)) if parts else None
+
+    def _split(self, along: jax.Array) -> list[list[jax.Array]]:
+        """(rows of B, ...) to [normal (C, ...), tangents...] of each group."""
+        groups, first = [], 0
+        for contacts, tangents in self._shapes:
+            bounds = [first + i * contacts for i in range(tangents + 2)]
+            groups.append([along[i : i + contacts] for i in bounds[:-1]])
+            first = bounds[-1]
+        return groups
+
+    def times(self, vector: jax.Array) -> list[jax.Array]:
+        """J vector: (V, B) -> rows."""
+        result = [self._sign * vector]
+        if self._basis is None:
+            return result
+        for edges, (normal, *tangents) in zip(
+            self._edges, self._split(_matvec(self._basis, vector)), strict=True
+        ):
+            result.append(
+                jnp.stack([_add_signed(normal, tangents, signs) for signs in edges])
+            )
+        return result
+
+    def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
+        """J' rows: -> (V, B)."""
+        of_limits, *of_groups = rows
+        result = self._sign * of_limits
+        if self._basis is None:
+            return result
+        along = []
+        for edges, of_edges, (_, tangents) in zip(
+            self._edges, of_groups, self._shapes, strict=True
+        ):
+            along.append(sum(of_edges))
+            for t in range(tangents):
+                signs = [signs[t] for signs in edges]
+                along.append(_sum_signed(of_edges, signs))
+        along = _materialize(jnp.concatenate(along))
+        return result + _matvec_transposed(self._basis, along)
+
+    def gram(self, weights: list[jax.Array]) -> jax.Array:
+        """J' diag(weights) J: -> (V, V, B)."""
+        of_limits, *of_groups = weights
+        diagonal = self._sign**2 * of_limits
+        result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
+        if self._basis is None:
+            return result
+        weighted = []
+        for edges, of_edges, basis in zip(
+            self._edges, of_groups, self._split(self._basis), strict=True
+        ):
+            signs = [(1, *signs) for signs in edges]
+            for i in range(len(basis)):
+                # Row i of E' diag(w) E, times B.
+                terms = []
+                for j, part in enumerate(basis):
+                    products = [s[i] * s[j] for s in signs]
+                    if any(products):
+                        terms.append(_sum_signed(of_edges, products)[:, None] * part)
+                weighted.append(sum(terms))
+        weighted = _materialize(jnp.concatenate(weighted))
+        return result + _symmetric_product(weighted, self._basis)
+
+
+def _add_signed(
+    first: jax.Array, others: list[jax.Array], signs: tuple[int, ...]
+) -> jax.Array:
+    for other, sign in zip(others, signs, strict=True):
+        if sign:
+            first = first + other if sign > 0 else first - other
+    return first
+
+
+def _sum_signed(values: jax.Array, signs: list[int]) -> jax.Array:
+    """Sum over the leading axis with constant signs, of which some may be 0."""
+    chosen = [
+        value if sign > 0 else -value for value, sign in zip(values, signs) if sign
+    ]
+    return sum(chosen)
 
 
 def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
@@ -173,37 +340,49 @@ def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
     """`solve` with the batch as the last axis of everything."""
     inertia, force = problem.inertia, problem.force
-    jacobian, reference = problem.jacobian, problem.reference
-    weight = problem.weight
+    rows = _Rows(problem)
+    weight = rows.weight
+    each = jax.tree.map
+    # A loop costs a GPU more than what is in it (a fifth of all on walker2d), and a CPU
+    # the time to compile it.
+    unroll = jax.default_backend() != "cpu"
+    loop = functools.partial(jax.lax.fori_loop, unroll=unroll)
+    total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
+    distance_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
     qacc_smooth = _eliminate(inertia, force)
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
-        distance = jnp.minimum(_matvec(jacobian, qacc) - reference, 0.0)
-        return _dot(away, _matvec(inertia, away)) + _dot(weight, distance**2)
+        square = lambda d, w: w * jnp.minimum(d, 0.0) ** 2
+        constraint_cost = total(each(square, distance_at(qacc), weight))
+        return _dot(away, _matvec(inertia, away)) + constraint_cost
 
     better = cost(problem.warmstart) < cost(qacc_smooth)
     start = jnp.where(better, problem.warmstart, qacc_smooth)
 
-    def iterate(_: int, carry: tuple[jax.Array, jax.Array]) -> Any:
+    def iterate(_: int, carry: tuple[jax.Array, list[jax.Array]]) -> Any:
         qacc, distance = carry
-        active = jnp.where(distance < 0.0, weight, 0.0)
+        active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), distance, weight)
         residual = _matvec(inertia, qacc) - force
-        gradient = residual + _matvec_transposed(jacobian, active * distance)
-        active, gradient = _materialize((active, gradient))
-        hessian = inertia + _gram(jacobian, active)
+        pull = rows.transposed_times(each(jnp.multiply, active, distance))
+        active, gradient = _materialize((active, residual + pull))
+        hessian = inertia + rows.gram(active)
         direction = -_eliminate(hessian, gradient)
 
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
-        slope = _materialize(_matvec(jacobian, direction))
+        slope = _materialize(rows.times(direction))
         linear = _dot(direction, residual)
         quadratic = _dot(direction, _matvec(inertia, direction))
 
         def newton(_: int, search: tuple[jax.Array, ...]) -> Any:
             step, low, high = search
-            here = jnp.where(distance + step * slope < 0.0, weight * slope, 0.0)
-            second = quadratic + _dot(here, slope)
-            first = linear + step * quadratic + _dot(here, distance + step * slope)
+            there = each(lambda d, s: d + step * s, distance, slope)
+            pushed = each(
+                lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
+            )
+            second = quadratic + total(each(jnp.multiply, pushed, slope))
+            first = linear + step * quadratic
+            first = first + total(each(jnp.multiply, pushed, there))
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
@@ -212,16 +391,16 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
 
         step = jnp.ones_like(linear)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3))
-        step = jax.lax.fori_loop(0, line_search, newton, search)[0]
-        return qacc + step * direction, distance + step * slope
+        step = loop(0, line_search, newton, search)[0]
+        moved = each(lambda d, s: d + step * s, distance, slope)
+        return qacc + step * direction, moved
 
-    qacc, distance = jax.lax.fori_loop(
-        0, iterations, iterate, (start, _matvec(jacobian, start) - reference)
-    )
-    row_force = weight * jnp.maximum(-distance, 0.0)
+    qacc, distance = loop(0, iterations, iterate, (start, distance_at(start)))
+    push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
     return Solution(
         qacc=qacc,
         qacc_smooth=qacc_smooth,
-        row_force=row_force,
-        constraint_force=_matvec_transposed(jacobian, row_force),
+        limit_force=push[0],
+        edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in push[1:]),
+        constraint_force=rows.transposed_times(push),
     )
