@@ -5,7 +5,6 @@ Parses, drives the training loop in chunks, logs and saves. No algorithm is here
 
 import contextlib
 import dataclasses
-import os
 import pathlib
 import sys
 import time
@@ -127,7 +126,7 @@ def use_devices(options: Options, num_members: int) -> None:
 
     from gasil_jax import environments
 
-    count = min(options.devices or os.cpu_count() or 1, num_members)
+    count = min(options.devices or environments.available_cores(), num_members)
     environments.prepare(options.settings, count)
     # In a program that has used JAX already, its devices stay as they are.
     with contextlib.suppress(RuntimeError):

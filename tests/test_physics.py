@@ -114,7 +114,7 @@ def test_newton_against_plain_numpy(size, groups):
 
 @pytest.mark.parametrize("batch", [(3, 4), (5, 32)])  # one tile, and more of them
 def test_a_problem_alone_equals_itself_in_nested_batches(batch):
-    _, problem = problems(batch, 6, [(4, FLAT)])
+    _, problem = problems(batch, 6, [(2, SIMPLE), (4, FLAT)])
     nested = jax.jit(jax.vmap(jax.vmap(newton.solve)))(problem)
     alone = jax.jit(newton.solve)(jax.tree.map(lambda x: x[2, 1], problem))
     jax.tree.map(

@@ -31,6 +31,13 @@ _POOL_SIZE = "PJRT_NPROC"
 _NEEDS_THREADS = tuple(map(int, jax.__version__.split(".")[:2])) < (0, 12)
 
 
+def available_cores() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def reserve_threads(num_devices: int) -> None:
     """Let `num_devices` CPU devices make host calls at once; before JAX starts."""
     if _NEEDS_THREADS and num_devices > 1:
@@ -39,7 +46,7 @@ def reserve_threads(num_devices: int) -> None:
 
 def _check_threads() -> None:
     devices = jax.local_device_count()
-    threads = int(os.environ.get(_POOL_SIZE, os.cpu_count() or 1))
+    threads = int(os.environ.get(_POOL_SIZE, available_cores()))
     on_cpu = jax.default_backend() == "cpu"
     if _NEEDS_THREADS and on_cpu and devices > 1 and threads <= devices:
         raise RuntimeError(
@@ -171,9 +178,7 @@ class MujocoPhysics:
     ) -> tuple[PhysicsState, Fields]:
         """Advance `frame_skip` time steps under one control (nu,)."""
         _check_threads()
-        threads = self._threads or max(
-            1, len(os.sched_getaffinity(0)) // jax.local_device_count()
-        )
+        threads = self._threads or max(1, available_cores() // jax.local_device_count())
 
         def on_host(*arrays: Any) -> dict[str, np.ndarray]:
             return self._advance([np.asarray(x) for x in arrays], frame_skip, threads)

@@ -158,7 +158,8 @@ def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         size = max(n for n in range(1, _MOST_IN_A_TILE + 1) if batch % n == 0)
         if jax.default_backend() != "cpu" or size < 16 or size == batch:
             return function(tree)
-        split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], -1, size), -2, 0)
+        tiles = batch // size
+        split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], tiles, size), -2, 0)
         join = lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch)
         return jax.tree.map(join, jax.lax.map(function, jax.tree.map(split, tree)))
 
