@@ -11,13 +11,16 @@ import time
 from collections.abc import Sequence
 from typing import Annotated, Any, TypeVar
 
+import jax
 import numpy as np
 import tyro
 
-from gasil_jax import command_line, presets
+from gasil_jax import command_line, environments, presets
+from gasil_jax import train as training
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, unknown, validate
 from gasil_jax.environments import Settings
+from gasil_jax.imitation import AGENTS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,9 +78,6 @@ def check(options: Options) -> None:
     Raises:
       InputError: the value and what is allowed.
     """
-    from gasil_jax import environments
-    from gasil_jax.imitation import AGENTS
-
     try:
         environments.check(options.env, options.settings)
         validate(options.config, tuple(AGENTS))
@@ -122,10 +122,6 @@ def make_run_folder(options: Options) -> pathlib.Path:
 
 def use_devices(options: Options, num_members: int) -> None:
     """Settings that must stand before JAX starts."""
-    import jax
-
-    from gasil_jax import environments
-
     count = min(options.devices or environments.available_cores(), num_members)
     environments.prepare(options.settings, count)
     # In a program that has used JAX already, its devices stay as they are.
@@ -150,9 +146,6 @@ def make_env(options: Options) -> Any:
     Raises:
       InputError: the agent can't run in it.
     """
-    from gasil_jax import environments
-    from gasil_jax import train as training
-
     env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
     try:
         training.check(env, options.config)
