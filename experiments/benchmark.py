@@ -1,21 +1,36 @@
-"""Speed and fidelity of the locomotion tasks: ``python -m experiments.benchmark``.
+"""Speed and fidelity: ``python -m experiments.benchmark``.
 
-For each way of building a task, on the default device: environment steps a second of
-random actions under jit, vmap and scan, seconds to compile, and the relative error of
-one step (the worst entry of the observation, median over the environments) against C
-MuJoCo with the model's own integrator, which is Gymnasium's.
+Two tables on the default device, and the same as JSON. "physics": each way of building
+a task, random actions under jit, vmap and scan, with the relative error of one step
+(the worst entry of the observation, median over the environments) against C MuJoCo
+with the model's own integrator, which is Gymnasium's. "training": whole PPO+GASIL, many
+seeds at once, beside the physics alone with as many environments, and beside
+Stable-Baselines3's PPO on Gymnasium's task where that is installed (the extra
+"benchmark"): one process, and one on every core.
+
+All rows of a task are compiled first and then timed in turn, again and again, so that a
+ratio is of numbers from the same minutes; a speed is the median of the repeats.
 """
 
 import argparse
+import dataclasses
+import importlib.util
+import multiprocessing
+import pathlib
 import sys
 import time
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as P
 
 import gasil_envs
+from gasil_jax import batch, logging, presets
+from gasil_jax.environments import Settings, available_cores, prepare
 
 TASKS = tuple(name for name in gasil_envs.names() if name != "point_mass")
 VARIANTS = {
@@ -25,6 +40,35 @@ VARIANTS = {
     "ours-euler": {"integrator": "euler"},
     "mujoco-euler": {"physics": "mujoco", "integrator": "euler"},
 }
+BASELINE = "stable-baselines3"
+
+
+@dataclasses.dataclass
+class Row:
+    """One line of a table.
+
+    Attributes:
+      env: the task.
+      name: what is measured.
+      num_envs: environments that are stepped at once.
+      run: does some steps and returns how many a second.
+      compile_seconds: 0 where nothing is compiled.
+      error: relative, of one step; None where it isn't measured.
+      speeds: steps a second of each repeat.
+    """
+
+    env: str
+    name: str
+    num_envs: int
+    run: Callable[[], float]
+    compile_seconds: float = 0.0
+    error: float | None = None
+    speeds: list[float] = dataclasses.field(default_factory=list)
+
+    @property
+    def speed(self) -> float:
+        """Steps a second."""
+        return float(np.median(self.speeds))
 
 
 def make_rollout(env: Any, num_envs: int, num_steps: int) -> Any:
@@ -51,22 +95,44 @@ def make_rollout(env: Any, num_envs: int, num_steps: int) -> Any:
     return rollout
 
 
-def measure(env: Any, num_envs: int, num_steps: int) -> tuple[float, float]:
-    """Environment steps a second, the best of three rollouts, and compile seconds."""
-    keys = jax.random.split(jax.random.key(0), num_envs)
-    states = jax.jit(jax.vmap(env.reset))(keys)
-    rollout = make_rollout(env, num_envs, num_steps)
+def physics_row(
+    env_name: str, name: str, settings: Any, num_envs: int, num_steps: int
+) -> Row:
+    """Random actions in `num_envs` environments, shared out over the devices."""
+    env = gasil_envs.make(env_name, **settings)
+    count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
+    mesh = Mesh(np.array(jax.devices()[:count]), ("envs",))
+    rollout = make_rollout(env, num_envs // count, num_steps)
+    each = jax.shard_map(
+        lambda states, keys: rollout(states, keys[0]),
+        mesh=mesh,
+        in_specs=(P("envs"), P("envs")),
+        out_specs=(P("envs"), P("envs")),
+        check_vma=False,
+    )
+    reset = jax.jit(
+        jax.shard_map(
+            jax.vmap(env.reset),
+            mesh=mesh,
+            in_specs=P("envs"),
+            out_specs=P("envs"),
+            check_vma=False,
+        )
+    )
+    states = reset(jax.random.split(jax.random.key(0), num_envs))
+    keys = lambda number: jax.random.split(jax.random.key(number), count)
     began = time.perf_counter()
-    compiled = jax.jit(rollout).lower(states, keys[0]).compile()
+    compiled = jax.jit(each).lower(states, keys(0)).compile()
     compile_seconds = time.perf_counter() - began
     # Not from the start: most bodies have fallen to the ground after a while.
-    states, _ = jax.block_until_ready(compiled(states, keys[0]))
-    seconds = []
-    for key in keys[1:4]:
+    states = jax.block_until_ready(compiled(states, keys(0)))[0]
+
+    def run() -> float:
         began = time.perf_counter()
-        jax.block_until_ready(compiled(states, key))
-        seconds.append(time.perf_counter() - began)
-    return num_envs * num_steps / min(seconds), compile_seconds
+        jax.block_until_ready(compiled(states, keys(1)))
+        return num_envs * num_steps / (time.perf_counter() - began)
+
+    return Row(env_name, name, num_envs, run, compile_seconds)
 
 
 def one_step_error(env: Any, reference: Any, num_envs: int, num_steps: int) -> float:
@@ -83,27 +149,187 @@ def one_step_error(env: Any, reference: Any, num_envs: int, num_steps: int) -> f
     return float(np.median(error.max(axis=1)))
 
 
-def main() -> int:
-    """Print a row for each task and variant."""
+def physics_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+    """A list of rows for each task and number of environments."""
+    for env_name in options.envs:
+        reference = gasil_envs.make(env_name, physics="mujoco")
+        errors: dict[str, float] = {}
+        for num_envs in options.num_envs:
+            rows = []
+            for name in options.variants:
+                settings = VARIANTS[name]
+                row = physics_row(env_name, name, settings, num_envs, options.num_steps)
+                if name not in errors:
+                    env = gasil_envs.make(env_name, **settings)
+                    errors[name] = one_step_error(env, reference, 64, options.num_steps)
+                rows.append(dataclasses.replace(row, error=errors[name]))
+            yield rows
+
+
+def training_row(env_name: str, name: str, options: argparse.Namespace) -> Row:
+    """PPO+GASIL with the tuned preset, `options.iterations` in a repeat."""
+    env = gasil_envs.make(env_name, **VARIANTS[name])
+    config = presets.preset(env_name, "ppo+gasil", "tuned")
+    if options.training_envs:
+        config = config.replace(num_envs=options.training_envs)
+    # As many iterations in a call as the command line does at most.
+    config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
+    runs = batch.make_batch(env, config, range(options.seeds))
+    began = time.perf_counter()
+    states, advance = runs.compile()
+    compile_seconds = time.perf_counter() - began
+    count = np.int32(options.iterations)
+    held = [jax.block_until_ready(advance(states, count))[0]]
+
+    def run() -> float:
+        began = time.perf_counter()
+        states, _ = jax.block_until_ready(advance(held.pop(), count))
+        held.append(states)
+        steps = options.iterations * config.batch_steps * options.seeds
+        return steps / (time.perf_counter() - began)
+
+    num_envs = options.seeds * config.num_envs
+    return Row(env_name, f"ppo+gasil, {name}", num_envs, run, compile_seconds)
+
+
+def _baseline(gymnasium_id: str, num_envs: int, steps: int, pipe: Any) -> None:
+    """Train Stable-Baselines3's PPO in a process of its own; send the seconds."""
+    from stable_baselines3 import PPO
+    from stable_baselines3.common.env_util import make_vec_env
+
+    env = make_vec_env(gymnasium_id, num_envs)
+    # 2048 steps, 10 epochs and minibatches of 64 are its own values, and ours.
+    model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, device="cpu")
+    model.learn(2048)
+    pipe.send("ready")
+    pipe.recv()
+    began = time.perf_counter()
+    model.learn(steps)
+    pipe.send(time.perf_counter() - began)
+
+
+def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
+    """Stable-Baselines3's PPO, as many runs at once as there are processes."""
+    gymnasium_id = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
+    steps = 3 * 2048
+    context = multiprocessing.get_context("spawn")
+
+    def run() -> float:
+        pipes = []
+        for _ in range(processes):
+            here, there = context.Pipe()
+            arguments = (gymnasium_id, num_envs, steps, there)
+            context.Process(target=_baseline, args=arguments, daemon=True).start()
+            pipes.append(here)
+        for act in (lambda pipe: pipe.recv(), lambda pipe: pipe.send("go")):
+            for pipe in pipes:
+                act(pipe)
+        return processes * steps / max(pipe.recv() for pipe in pipes)
+
+    name = f"{BASELINE} ppo, {processes} process{'es'[: 2 * (processes > 1)]}"
+    return Row(env_name, name, processes * num_envs, run)
+
+
+def training_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+    """A list of rows for each task."""
+    for env_name in options.envs:
+        config = presets.preset(env_name, "ppo+gasil", "tuned")
+        num_envs = options.seeds * (options.training_envs or config.num_envs)
+        rows = []
+        if importlib.util.find_spec("stable_baselines3"):
+            for processes in sorted({1, available_cores()}):
+                rows += [baseline_row(env_name, processes, n) for n in (1, 8)]
+        for name in options.training_variants:
+            settings = VARIANTS[name]
+            title = f"physics alone, {name}"
+            row = physics_row(env_name, name, settings, num_envs, options.num_steps)
+            rows.append(dataclasses.replace(row, name=title))
+            rows.append(training_row(env_name, name, options))
+        yield rows
+
+
+def time_in_turn(rows: Sequence[Row], repeats: int) -> None:
+    """Fill in the speeds."""
+    for _ in range(repeats):
+        for row in rows:
+            row.speeds.append(row.run())
+
+
+def show(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Print the rows of a task, ratios to the first, and return them."""
+    described = []
+    for row in rows:
+        ratio = row.speed / rows[0].speed
+        error = "" if row.error is None else f"{row.error:11.1e}"
+        print(
+            f"{row.env:11} {row.name:36} {row.num_envs:6} {row.speed:11,.0f} "
+            f"{ratio:6.2f} {row.compile_seconds:9.1f}{error}",
+            flush=True,
+        )
+        values = dataclasses.asdict(row) | {"speed": row.speed, "ratio": ratio}
+        del values["run"]
+        described.append(values)
+    return described
+
+
+_COLUMNS = "envs     steps/s  ratio compile s  error of a step"
+TABLES = {"physics": physics_table, "training": training_table}
+
+
+def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Options from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--envs", nargs="+", choices=TASKS, default=TASKS)
-    parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=VARIANTS)
-    parser.add_argument("--num-envs", type=int, default=64)
-    parser.add_argument("--num-steps", type=int, default=20)
-    options = parser.parse_args()
+    add = parser.add_argument
+    add("--tables", nargs="+", choices=TABLES, default=tuple(TABLES))
+    add("--envs", nargs="+", choices=TASKS, default=("walker2d",))
+    add("--variants", nargs="+", choices=VARIANTS, default=tuple(VARIANTS))
+    add("--num-envs", type=int, nargs="+", default=(64,), help="of the physics table")
+    add("--num-steps", type=int, default=20, help="of random actions in a repeat")
+    add("--repeats", type=int, default=5)
+    add("--devices", type=int, help="CPU devices; default the cores")
+    add("--seeds", type=int, default=10, help="of the training table")
+    add("--training-envs", type=int, help="of a seed; default the preset's")
+    add(
+        "--training-variants",
+        nargs="+",
+        choices=VARIANTS,
+        default=("ours", "mujoco"),
+    )
+    add("--iterations", type=int, default=2, help="of training in a repeat")
+    add("--out", type=pathlib.Path, help="default runs/benchmark-TIME.json")
+    return parser.parse_args(arguments)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print the tables and write them; returns the exit status."""
+    options = parse(arguments)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    out = options.out or pathlib.Path("runs", f"benchmark-{stamp}.json")
+    if out.exists():
+        print(f"error: out is {out}, which exists: name a new file", file=sys.stderr)
+        return 2
+    out.parent.mkdir(parents=True, exist_ok=True)
+    count = options.devices or available_cores()
+    prepare(Settings(physics="mujoco"), count)
+    jax.config.update("jax_num_cpu_devices", count)
     jax.config.update("jax_default_matmul_precision", "highest")
-    device = jax.devices()[0].device_kind
-    print(f"{options.num_envs} environments on {device}")
-    print("task         variant       steps/s  compile s  error of a step", flush=True)
-    size = (options.num_envs, options.num_steps)
-    for name in options.envs:
-        reference = gasil_envs.make(name, physics="mujoco")
-        for variant in options.variants:
-            env = gasil_envs.make(name, **VARIANTS[variant])
-            speed, seconds = measure(env, *size)
-            error = one_step_error(env, reference, *size)
-            row = f"{speed:9,.0f}  {seconds:9.1f}  {error:.1e}"
-            print(f"{name:12} {variant:12} {row}", flush=True)
+    devices = jax.devices()
+    result = {
+        "device": f"{len(devices)} x {devices[0].device_kind}",
+        "cores": available_cores(),
+        "options": {name: str(value) for name, value in vars(options).items()},
+        "versions": logging.versions(),
+        "tables": {name: [] for name in options.tables},
+    }
+    print(f"{result['device']}, {result['cores']} cores")
+    for table in options.tables:
+        print(f"{table:51}{_COLUMNS}", flush=True)
+        for rows in TABLES[table](options):
+            time_in_turn(rows, options.repeats)
+            result["tables"][table] += show(rows)
+            # After every task: a benchmark that is cut off has its first figures.
+            logging.write_json(out, result)
+    print(f"in {out}")
     return 0
 
 

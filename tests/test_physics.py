@@ -19,8 +19,11 @@ SIMPLE, FLAT, PYRAMID = (
 )
 
 
-def problems(batch, size, groups, seed=0):
-    """Random problems, and the same with every constraint as a row of a matrix."""
+def problems(batch, size, groups, seed=0, most_in_play=None):
+    """Random problems, and the same with every constraint as a row of a matrix.
+
+    Of each group so many contacts are in play, in places that differ; default all.
+    """
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(*batch, size, size))
     sign = rng.integers(-1, 2, size=(*batch, size)).astype(float)
@@ -30,11 +33,14 @@ def problems(batch, size, groups, seed=0):
     jacobian = [sign[..., None] * np.eye(size)]
     reference, weight, contacts = [limits.reference], [limits.weight], []
     for count, edges in groups:
+        lot = rng.permuted(np.broadcast_to(np.arange(count), (*batch, count)), axis=-1)
+        in_play = (lot < (most_in_play or count)).astype(float)[..., None]
         group = newton.Contacts(
-            normal=rng.normal(size=(*batch, count, size)),
-            tangents=0.7 * rng.normal(size=(*batch, count, len(edges[0]), size)),
-            reference=draw_reference(count, len(edges)),
-            weight=draw_weight(count, len(edges)),
+            normal=in_play * rng.normal(size=(*batch, count, size)),
+            tangents=in_play[..., None]
+            * (0.7 * rng.normal(size=(*batch, count, len(edges[0]), size))),
+            reference=in_play * draw_reference(count, len(edges)),
+            weight=in_play * draw_weight(count, len(edges)),
             edges=edges,
         )
         contacts.append(group)
@@ -80,19 +86,23 @@ def plain_newton(inertia, force, jacobian, reference, weight):
     return qacc, -weight * distance(qacc)
 
 
-# The last is above the size up to which sums are spelled out.
+# (12, 40) is above the size up to which sums are spelled out; the last three have
+# fewer contacts in play than the solver has room for, as many, and more.
 @pytest.mark.parametrize(
-    ("size", "groups"),
+    ("size", "groups", "in_play"),
     [
-        (5, []),
-        (5, [(2, SIMPLE)]),
-        (9, [(10, FLAT)]),
-        (9, [(3, SIMPLE), (8, PYRAMID)]),
-        (12, [(40, PYRAMID)]),
+        (5, [], None),
+        (5, [(2, SIMPLE)], None),
+        (9, [(10, FLAT)], None),
+        (9, [(3, SIMPLE), (8, PYRAMID)], None),
+        (12, [(40, PYRAMID)], None),
+        (9, [(30, SIMPLE), (14, PYRAMID), (2, FLAT)], 3),
+        (9, [(12, FLAT)], 8),
+        (9, [(12, FLAT)], 9),
     ],
 )
-def test_newton_against_plain_numpy(size, groups):
-    arrays, problem = problems((20,), size, groups)
+def test_newton_against_plain_numpy(size, groups, in_play):
+    arrays, problem = problems((20,), size, groups, most_in_play=in_play)
     solution = jax.jit(jax.vmap(lambda p: newton.solve(p, 20)))(problem)
     forces = [solution.limit_force, *solution.edge_forces]
     row_force = np.concatenate([x.reshape(20, -1) for x in forces], axis=1)

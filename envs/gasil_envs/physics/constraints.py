@@ -335,7 +335,7 @@ def _make_contacts(
     speed = (along @ data.qvel) @ signs.T  # (n, edges)
     impedance = contacts.impedance(gap)
     pull = contacts.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
-    weight = _weight(impedance, contacts.inverse_weight)
+    weight = jnp.where(active, _weight(impedance, contacts.inverse_weight), 0.0)
     # A normal that stands for two edges weighs as both.
     count = [
         2.0 if contacts.edges == _FLAT_PYRAMID and not any(s) else 1.0

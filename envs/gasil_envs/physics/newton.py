@@ -17,7 +17,8 @@ E the small constant matrix that makes edges of normal and tangents, J = E B, an
 
     J q = E (B q),    J' diag(w) J = B' (E' diag(w) E) B,
 
-where B has 2 or 3 rows a contact where J has 4.
+where B has 2 or 3 rows a contact where J has 4. Of the contacts that are possible the
+solver is given those in play, as long as these are few.
 
 Not reverse-mode differentiable (MJX's own solver is not either, its loop being
 dynamic).
@@ -43,7 +44,7 @@ class Contacts:
       normal: (C, V), Jacobian of the normal; zero where out of play.
       tangents: (C, T, V), of the tangents, times the friction.
       reference: (C, E), aref of the edges.
-      weight: (C, E), D of the edges, at least 0.
+      weight: (C, E), D of the edges; 0 where out of play and above 0 elsewhere.
       edges: E rows of T signs: an edge is normal + signs @ tangents.
     """
 
@@ -109,7 +110,8 @@ class Solution:
 
 def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
     """Solve one problem; `jax.vmap` it for many, nested as deep as needed."""
-    batched = _batch_last(_in_tiles(functools.partial(_solve, iterations, line_search)))
+    function = functools.partial(_solve, iterations, line_search)
+    batched = _batch_last(_in_tiles(_without_idle_contacts(function)))
     solution = batched(jax.tree.map(lambda x: x[..., None], problem))
     return jax.tree.map(lambda x: x[..., 0], solution)
 
@@ -164,6 +166,61 @@ def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return jax.tree.map(join, jax.lax.map(function, jax.tree.map(split, tree)))
 
     return in_tiles
+
+
+# Bodies touch little of what they could: humanoid has 138 possible contacts and, short
+# of lying on the floor with its arms folded, no more than 8 of a kind at once.
+_MOST_IN_PLAY = 8
+
+
+def _without_idle_contacts(
+    function: Callable[[Problem], Solution],
+) -> Callable[[Problem], Solution]:
+    """`function` of problems, batch last, with the contacts in play moved together.
+
+    Where one of the problems has more of them than there is room for, all are solved
+    as they are.
+    """
+
+    def few(problem: Problem) -> Solution:
+        moved, restore = zip(*map(_together, problem.contacts), strict=True)
+        solution = function(problem.replace(contacts=moved))
+        forces = [f(x) for f, x in zip(restore, solution.edge_forces, strict=True)]
+        return solution.replace(edge_forces=tuple(forces))
+
+    def solve(problem: Problem) -> Solution:
+        large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
+        if not large:
+            return function(problem)
+        fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
+        return jax.lax.cond(jnp.all(jnp.stack(fits)), few, function, problem)
+
+    return solve
+
+
+def _together(
+    contacts: Contacts,
+) -> tuple[Contacts, Callable[[jax.Array], jax.Array]]:
+    """The contacts in play in `_MOST_IN_PLAY` places, and how their forces go back."""
+    num_contacts = contacts.normal.shape[0]
+    if num_contacts <= _MOST_IN_PLAY:
+        return contacts, lambda forces: forces
+    in_play = contacts.weight[:, 0] > 0  # (C, B)
+    place = jnp.cumsum(in_play, axis=0, dtype=jnp.int32) - 1
+    number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
+    chosen = in_play & (place == jnp.arange(_MOST_IN_PLAY)[:, None, None])  # (P, C, B)
+    index = jnp.max(jnp.where(chosen, number, -1), axis=1)  # (P, B), -1 for none
+
+    def move(x: jax.Array) -> jax.Array:
+        at = index.reshape(_MOST_IN_PLAY, *(1,) * (x.ndim - 2), -1)
+        moved = jnp.take_along_axis(x, jnp.maximum(at, 0), axis=0)
+        return jnp.where(at < 0, 0.0, moved)
+
+    def restore(forces: jax.Array) -> jax.Array:
+        at = jnp.clip(place, 0, _MOST_IN_PLAY - 1)[:, None]
+        return jnp.where(in_play[:, None], jnp.take_along_axis(forces, at, axis=0), 0.0)
+
+    return jax.tree.map(move, contacts), restore
 
 
 # XLA's CPU backend fuses a chain of elementwise operations into each of its users and
