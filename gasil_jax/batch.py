@@ -1,7 +1,7 @@
 """Many runs in one program: vmapped, and sharded over devices."""
 
 import dataclasses
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -31,6 +31,7 @@ class Batch:
       advance: (states, num_iterations) -> states, metrics (padded, chunk), of which
         the first `num_iterations` are written. Takes the states' memory.
       devices: what the members are sharded over.
+      sharding: of the states.
     """
 
     num_members: int
@@ -39,33 +40,49 @@ class Batch:
     init: Callable[[], Any]
     advance: Callable[[Any, Any], Any]
     devices: Sequence[jax.Device]
+    sharding: NamedSharding
 
-    def compile(self) -> tuple[Any, Callable[[Any, Any], Any]]:
-        """The first states, and `advance`, compiled."""
-        states = jax.block_until_ready(self.init())
+    def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
+        """The states to start from, and `advance`, compiled.
+
+        Args:
+          states: of the members, (members, ...), to go on from; default the first.
+        """
+        if states is None:
+            states = self.init()
+        else:
+            padding = -self.num_members % len(self.devices)
+            states = jax.tree.map(
+                lambda x: jnp.concatenate([x, *[x[-1:]] * padding]), states
+            )
+            states = jax.device_put(states, self.sharding)
+        states = jax.block_until_ready(states)
         return states, self.advance.lower(states, np.int32(0)).compile()
 
-    def run(
-        self, states: Any, advance: Callable[[Any, Any], Any]
-    ) -> Iterator[tuple[Any, dict[str, np.ndarray]]]:
-        """Train to the end, chunk by chunk.
+    def train(
+        self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
+    ) -> tuple[Any, dict[str, np.ndarray]]:
+        """Some iterations, no more than a chunk.
 
-        Yields:
-          states, not valid once the next chunk is asked for, and the chunk's
-          metrics, (members, iterations) each; "env_steps" are whole numbers.
+        Args:
+          advance: compiled.
+          states: before them; their memory is taken.
+          first: iterations done already.
+          count: how many to do.
+
+        Returns:
+          the states after them, and their metrics, (members, iterations) each;
+          "env_steps" are whole numbers.
         """
-        config = self.config
-        for done in range(0, config.num_iterations, self.chunk):
-            count = min(self.chunk, config.num_iterations - done)
-            states, metrics = advance(states, np.int32(count))
-            metrics = {
-                name: np.asarray(value)[: self.num_members, :count]
-                for name, value in metrics.items()
-            }
-            # float32 counts exactly only to 2**24.
-            steps = (np.arange(done, done + count) + 1) * config.batch_steps
-            metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
-            yield states, metrics
+        states, metrics = advance(states, np.int32(count))
+        metrics = {
+            name: np.asarray(value)[: self.num_members, :count]
+            for name, value in metrics.items()
+        }
+        # float32 counts exactly only to 2**24.
+        steps = (np.arange(first, first + count) + 1) * self.config.batch_steps
+        metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
+        return states, metrics
 
     def trim(self, states: Any) -> Any:
         """States without the padding: (members, ...)."""
@@ -149,4 +166,5 @@ def make_batch(
         init=lambda: init(members),
         advance=jax.jit(shard(advance, (spec, P())), donate_argnums=0),
         devices=devices,
+        sharding=NamedSharding(mesh, spec),
     )

@@ -1,12 +1,31 @@
-"""Save and load training states with Orbax."""
+"""Save and load training states with Orbax.
 
+`save` and `restore` are of one state. `write`, `latest`, `best` and `prune` keep a
+folder of checkpoints, each a folder named by its iteration:
+
+    00000490/state/          the state, written by Orbax
+    00000490/manifest.json   SHA-256 of every file of it, and a record
+
+A checkpoint is written under another name and renamed when it is whole and on the
+disk, so a process that is killed at any moment leaves the ones before it as they were.
+One that was damaged later is told by its hashes.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
 import pathlib
-from typing import Any
+import shutil
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+
+_STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
 
 
 def _is_key(leaf: Any) -> bool:
@@ -58,3 +77,148 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
         for path, x in leaves
     ]
     return jax.tree.unflatten(structure, values)
+
+
+class Checkpoint(NamedTuple):
+    """One that is whole.
+
+    Attributes:
+      folder: where it is.
+      iteration: after which it was written.
+      record: what `write` was given.
+    """
+
+    folder: pathlib.Path
+    iteration: int
+    record: Mapping[str, Any]
+
+    def restore(self, like: Any) -> Any:
+        """Its state; see `restore`."""
+        return restore(self.folder / _STATE, like)
+
+
+class WriteError(OSError):
+    """A checkpoint could not be written; those before it are as they were."""
+
+
+def write(
+    root: pathlib.Path, iteration: int, state: Any, record: Mapping[str, Any]
+) -> None:
+    """Add a checkpoint to the folder `root`, if a whole one is not there already.
+
+    Args:
+      root: made where it is missing.
+      iteration: its number.
+      state: a pytree of arrays.
+      record: what is to be known of it without reading the state; goes into JSON.
+
+    Raises:
+      WriteError: the disk is full, or the folder can't be written.
+    """
+    whole = root / f"{iteration:08d}"
+    partial = root / f"{iteration:08d}{_PARTIAL}"
+    with contextlib.suppress(ValueError):
+        read(whole)
+        return
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        # What a process left that was killed here.
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        save(partial / _STATE, state)
+        manifest = {"files": _hashes(partial), "record": record}
+        (partial / _MANIFEST).write_text(json.dumps(manifest, allow_nan=False))
+        for path in [*partial.rglob("*"), partial]:
+            _to_disk(path)
+        shutil.rmtree(whole, ignore_errors=True)  # damaged
+        partial.rename(whole)
+        _to_disk(root)
+    # Orbax reports a full disk as an error of several types.
+    except Exception as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        reason = str(error).splitlines()[0][:300] if str(error) else repr(error)
+        raise WriteError(f"{root} can't be written: {reason}") from error
+
+
+def _hashes(folder: pathlib.Path) -> dict[str, str]:
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.name != _MANIFEST:
+            with path.open("rb") as file:
+                digest = hashlib.file_digest(file, "sha256").hexdigest()
+            found[path.relative_to(folder).as_posix()] = digest
+    return found
+
+
+def _to_disk(path: pathlib.Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _folders(root: pathlib.Path) -> list[pathlib.Path]:
+    """Every finished checkpoint's folder, oldest first, whole or damaged."""
+    if not root.is_dir():
+        return []
+    return sorted(
+        path for path in root.iterdir() if path.name.isdecimal() and path.is_dir()
+    )
+
+
+def read(folder: pathlib.Path) -> Checkpoint:
+    """The checkpoint in `folder`, its hashes compared.
+
+    Raises:
+      ValueError: it is damaged.
+    """
+    try:
+        manifest = json.loads((folder / _MANIFEST).read_text())
+        files, record = manifest["files"], dict(manifest["record"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise ValueError(f"{folder} is damaged: its manifest can't be read") from None
+    found = _hashes(folder)
+    if found != files:
+        name = min(
+            name for name in {*found, *files} if found.get(name) != files.get(name)
+        )
+        raise ValueError(f"{folder} is damaged: {name} is not what was written")
+    return Checkpoint(folder, int(folder.name), record)
+
+
+def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
+    """The newest checkpoint that is whole, and what is wrong with newer ones."""
+    damages = []
+    for folder in reversed(_folders(root)):
+        try:
+            return read(folder), damages
+        except ValueError as error:
+            damages.append(str(error))
+    return None, damages
+
+
+def best(root: pathlib.Path) -> Checkpoint | None:
+    """The whole checkpoint with the highest "score" in its record, if one has any."""
+    scored = [folder for folder in _folders(root) if _score(folder) is not None]
+    for folder in sorted(scored, key=_score, reverse=True):
+        with contextlib.suppress(ValueError):
+            return read(folder)
+    return None
+
+
+def _score(folder: pathlib.Path) -> float | None:
+    try:
+        return json.loads((folder / _MANIFEST).read_text())["record"].get("score")
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def prune(root: pathlib.Path, keep: int) -> None:
+    """Delete all but the newest `keep` and the best one."""
+    folders = _folders(root)
+    scored = [folder for folder in folders if _score(folder) is not None]
+    kept = {*folders[-keep:], *([max(scored, key=_score)] if scored else [])}
+    for folder in folders:
+        if folder not in kept:
+            shutil.rmtree(folder)

@@ -1,19 +1,25 @@
 """Score policies: as a function, and ``python -m gasil_jax.evaluate RUN``."""
 
 import dataclasses
-import json
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gasil_jax import batch, command_line, environments, normalization, train
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax import (
+    batch,
+    command_line,
+    environments,
+    normalization,
+    run_folder,
+    train,
+)
+from gasil_jax.config import Config
 from gasil_jax.networks import Policy
 
 
@@ -136,10 +142,11 @@ def evaluate_in_gymnasium(
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Score the final policies of a run.
+    """Score the policies of a run.
 
     Attributes:
       run: the run's folder.
+      checkpoint: which policies: last, or best by mean return in training.
       episodes: how many for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
       gymnasium: score in Gymnasium, on C MuJoCo, instead; for locomotion, with the
@@ -148,40 +155,46 @@ class Options:
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
+    checkpoint: Literal["last", "best"] = "last"
     episodes: int = 20
     stochastic: bool = False
     gymnasium: bool = False
     key: int = 0
 
 
-def _as_tuples(value: Any) -> Any:
-    # JSON has no tuples, and a configuration is hashable.
-    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+def load(
+    folder: pathlib.Path, which: str = "last"
+) -> tuple[Any, Config, list[int], Any]:
+    """Environment, config, seed numbers and states (seed, ...) of a run.
 
-
-def load(folder: pathlib.Path) -> tuple[Any, Config, list[int], Any]:
-    """Environment, config, seed numbers and final states (seed, ...) of a run.
+    Args:
+      folder: of the run, finished or not.
+      which: of its checkpoints, "last" or "best" (the highest mean return).
 
     Raises:
-      ValueError: it is not the folder of a finished run.
+      ValueError: it is not the folder of a run, or has no whole checkpoint.
     """
     from gasil_jax import checkpoint
 
-    path = folder / "config.json"
-    if not (folder / "checkpoint").is_dir() or not path.is_file():
-        raise ValueError(f"run is {folder}: it must be the folder of a finished run")
-    described = json.loads(path.read_text())
-    fields = described["config"]
-    fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
-    config = Config(**{name: _as_tuples(value) for name, value in fields.items()})
-    env = environments.make_env(described["env"], **described["settings"])
+    described = run_folder.read(folder)
+    root = folder / "checkpoints"
+    found, damages = checkpoint.latest(root)
+    for damage in damages:
+        print(f"warning: {damage}", file=sys.stderr)
+    if which == "best":
+        found = checkpoint.best(root)
+    if found is None:
+        raise ValueError(f"run is {folder}: it has no whole checkpoint")
+    config = described["config"]
+    settings = dataclasses.asdict(described["settings"])
+    env = environments.make_env(described["env"], **settings)
     first, count = described["first_seed"], described["seeds"]
     seeds = list(range(first, first + count))
     like = jax.eval_shape(
         jax.vmap(lambda seed: train.init(env, config, jax.random.key(seed))),
         jnp.arange(count, dtype=jnp.uint32),
     )
-    return env, config, seeds, checkpoint.restore(folder / "checkpoint", like)
+    return env, config, seeds, found.restore(like)
 
 
 def _score(
@@ -224,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
         if options.episodes < 1:
             raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
-        env, config, seeds, states = load(options.run)
+        env, config, seeds, states = load(options.run, options.checkpoint)
         task = getattr(env.unwrapped, "task", None)
         if options.gymnasium and (task is None or options.stochastic):
             raise ValueError(

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import importlib.metadata
 import json
+import os
 import pathlib
 import platform
 from collections.abc import Mapping, Sequence
@@ -12,9 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
-#: Columns of metrics.csv that every run has, in this order; an agent's own follow.
+#: Metrics that every metrics.csv has, in this order; an agent's own follow.
 COLUMNS = (
-    "seed",
     "env_steps",
     "episode_return",
     "episode_length",
@@ -61,39 +61,108 @@ def _to_json(value: Any) -> Any:
 
 
 class MetricsWriter:
-    """Appends a row for each seed and iteration to metrics.csv.
+    """Appends a row for each member and iteration to metrics.csv.
 
-    A value that is not finite (no episode ended yet, no discriminator) is left empty.
+    A value that is not finite (no episode ended yet, no discriminator) is left empty;
+    the others are written so that float32 reads them back unchanged.
+
+    Args:
+      path: of the file.
+      labels: columns that tell the members apart, (members,) each: "seed" and others.
+      size: where to go on: the file is cut there and the rest is kept beside it;
+        None for a new file.
+
+    Raises:
+      FileExistsError: a new file would replace one.
+      ValueError: the file that is to go on is missing or shorter than `size`.
     """
 
-    def __init__(self, path: pathlib.Path, seeds: Sequence[int]):
-        self._file = path.open("x", newline="")
-        self._writer = csv.writer(self._file)
-        self._seeds = seeds
+    def __init__(
+        self,
+        path: pathlib.Path,
+        labels: Mapping[str, Sequence[Any]],
+        size: int | None = None,
+    ):
         self._columns: tuple[str, ...] | None = None
+        self._labels = labels
+        if size is None:
+            self._file = path.open("x", newline="")
+        else:
+            if not path.is_file() or path.stat().st_size < size:
+                raise ValueError(f"{path} lacks rows that the checkpoint has seen")
+            _cut(path, size)
+            with path.open(newline="") as file:
+                self._columns = tuple(next(csv.reader(file), ())) or None
+            self._file = path.open("a", newline="")
+        self._writer = csv.writer(self._file)
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
-        """Write (seeds, iterations) arrays, one for each metric."""
+        """Write (members, iterations) arrays, one for each metric."""
         if self._columns is None:
             own = tuple(sorted(set(metrics) - set(COLUMNS)))
-            self._columns = COLUMNS + own
+            self._columns = (*self._labels, *COLUMNS, *own)
             self._writer.writerow(self._columns)
-        iterations = metrics["env_steps"].shape[1]
+        members, iterations = metrics["env_steps"].shape
+        labels = list(zip(*self._labels.values(), strict=True))
+        names = self._columns[len(self._labels) :]
         for iteration in range(iterations):
-            for index, seed in enumerate(self._seeds):
-                row = [seed]
-                for name in self._columns[1:]:
-                    value = metrics[name][index, iteration] if name in metrics else None
-                    row.append(_cell(value))
-                self._writer.writerow(row)
+            for member in range(members):
+                cells = (
+                    _cell(metrics[name][member, iteration]) if name in metrics else ""
+                    for name in names
+                )
+                self._writer.writerow([*labels[member], *cells])
         self._file.flush()
+
+    def size(self) -> int:
+        """Bytes of the file, all of them on the disk."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return os.fstat(self._file.fileno()).st_size
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
 
 
-def _cell(value: float | None) -> str:
-    if value is None or not np.isfinite(value):
+def _cut(path: pathlib.Path, size: int) -> None:
+    """Shorten a file; what is cut off goes into a new file beside it."""
+    with path.open("rb+") as file:
+        file.seek(size)
+        rest = file.read()
+        if not rest:
+            return
+        number = 1
+        while True:
+            beside = path.with_name(f"{path.stem}-cut-{number}{path.suffix}")
+            try:
+                beside.open("xb").write(rest)
+                break
+            except FileExistsError:
+                number += 1
+        file.truncate(size)
+
+
+def _cell(value: Any) -> str:
+    if not np.isfinite(value):
         return ""
-    return str(int(value)) if value == int(value) else f"{value:.7g}"
+    return str(int(value)) if value == int(value) else str(np.float32(value))
+
+
+def read_metrics(
+    path: pathlib.Path, labels: Sequence[str], num_members: int
+) -> dict[str, np.ndarray]:
+    """Every metric of a metrics.csv, (members, iterations) each; NaN where empty.
+
+    Args:
+      path: of the file.
+      labels: names of the columns that are not metrics.
+      num_members: rows of an iteration.
+    """
+    with path.open(newline="") as file:
+        header, *rows = csv.reader(file)
+    first = len(labels)
+    values = np.array(
+        [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
+    ).reshape(-1, num_members, len(header) - first)
+    return {name: values[:, :, i].T for i, name in enumerate(header[first:])}

@@ -28,6 +28,7 @@ class Progress:
         self._total = total_steps
         self._live = self._console.is_terminal
         self._training_since = self._last_line = time.monotonic()
+        self._steps_before = 0
         self._return = np.nan
         self._spread = np.nan
         self._bar = RichProgress(
@@ -54,9 +55,10 @@ class Progress:
     ) -> None:
         self._bar.stop()
 
-    def phase(self, name: str) -> None:
-        """Say what is happening now."""
+    def phase(self, name: str, steps: int = 0) -> None:
+        """Say what is happening now, from so many environment steps on."""
         self._training_since = self._last_line = time.monotonic()
+        self._steps_before = steps
         self._bar.update(self._task, status=name)
         if not self._live:
             self._line(name)
@@ -73,7 +75,7 @@ class Progress:
         if per_seed:
             self._return, self._spread = np.mean(per_seed), np.std(per_seed)
         now = time.monotonic()
-        speed = steps / max(now - self._training_since, 1e-9)
+        speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
         status = (
             f"{steps:,}/{self._total:,} steps, "
             f"return {self._return:.1f} ± {self._spread:.1f}, {speed:,.0f} steps/s"

@@ -3,24 +3,27 @@
 Parses, drives the training loop in chunks, logs and saves. No algorithm is here.
 """
 
+import argparse
 import contextlib
 import dataclasses
 import pathlib
+import shlex
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
 import jax
 import numpy as np
 import tyro
 
-from gasil_jax import command_line, environments, presets
+from gasil_jax import command_line, environments, presets, run_folder
 from gasil_jax import train as training
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, unknown, validate
 from gasil_jax.environments import Settings
 from gasil_jax.imitation import AGENTS
+from gasil_jax.interruption import Interrupted, Interruption
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +37,12 @@ class Options:
       first_seed: number of the first seed; a seed's result depends on its number
         alone.
       out: run folder, created here; default runs/ENV-AGENT-TIME.
+      resume: go on with the run in the folder out from its last checkpoint, with its
+        settings; total_steps alone may grow. Where no run has begun, begin one.
+      checkpoint_every: environment steps of a seed between two checkpoints; default
+        ten minutes.
+      keep_checkpoints: how many of the newest checkpoints are kept, besides the one
+        with the best returns.
       preset: where the hyperparameters start from: tuned, by environment and agent,
         or paper; flags override it.
       devices: host devices that the seeds are sharded over; default the cores.
@@ -45,6 +54,9 @@ class Options:
     seeds: int = 1
     first_seed: int = 0
     out: pathlib.Path | None = None
+    resume: bool = False
+    checkpoint_every: int | None = None
+    keep_checkpoints: int = 2
     preset: str = "tuned"
     devices: int | None = None
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
@@ -61,15 +73,45 @@ T = TypeVar("T", bound=Options)
 def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     """Options from the command line, on top of the preset that they name.
 
+    Where a run is to go on, on top of its own.
+
     Raises:
-      InputError: a flag or value that is unknown.
+      InputError: a flag or value that is unknown, or that the run does not have.
     """
+    began = _begun_run(arguments)
+    if began is not None:
+        described = run_folder.read(began)
+        names = {field.name for field in dataclasses.fields(kind)}
+        if not names <= set(described):
+            raise InputError(f"out is {began}, which another program has written")
+        before = kind(**{name: described[name] for name in names - {"out"}})
+        options = command_line.parse(kind, arguments, program, before)
+        changed = run_folder.differences(vars(before), vars(options))
+        if changed:
+            raise InputError(
+                f"resume goes on with {began}, where {'; '.join(changed)}: only "
+                "total_steps may differ, and grow"
+            )
+        return options
     given = command_line.parse(kind, arguments, program)
     if given.preset not in presets.names():
         raise InputError(unknown("preset", given.preset, presets.names()))
     config = presets.preset(given.env, given.config.agent, given.preset)
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)
+
+
+def _begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
+    """The folder of the run that is to go on, if there is one."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", action="store_true")
+    parser.add_argument("--out", type=pathlib.Path, nargs="?")
+    given, _ = parser.parse_known_args(arguments)
+    if not given.resume:
+        return None
+    if given.out is None:
+        raise InputError("resume needs --out and the folder of the run to go on with")
+    return given.out if run_folder.is_described(given.out) else None
 
 
 def check(options: Options) -> None:
@@ -83,41 +125,40 @@ def check(options: Options) -> None:
         validate(options.config, tuple(AGENTS))
     except ValueError as error:
         raise InputError(str(error)) from None
-    if options.seeds < 1:
-        raise InputError(f"seeds is {options.seeds}: it must be 1 or more")
+    for name in ("seeds", "devices", "checkpoint_every", "keep_checkpoints"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            raise InputError(f"{name} is {value}: it must be 1 or more")
     last = 2**32 - options.seeds
     if not 0 <= options.first_seed <= last:
         raise InputError(
             f"first_seed is {options.first_seed}: it must be from 0 to {last}"
         )
-    if options.devices is not None and options.devices < 1:
-        raise InputError(f"devices is {options.devices}: it must be 1 or more")
 
 
-def make_run_folder(options: Options) -> pathlib.Path:
-    """Create the run folder; one that holds anything is refused.
+@contextlib.contextmanager
+def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
+    """The run's folder, made where it is missing, locked while this is entered.
+
+    An `Interrupted` that passes is told how `program` goes on.
 
     Raises:
-      InputError: it is used or can't be written.
+      InputError: it is used, in use, or can't be written.
     """
-    folder = options.out
-    if folder is None:
-        stamp = time.strftime("%Y%m%d-%H%M%S")
-        folder = pathlib.Path("runs", f"{options.env}-{options.config.agent}-{stamp}")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if any(folder.iterdir()):
-            raise InputError(
-                f"out is {folder}, which is not empty: name a new or an empty folder"
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{options.env}-{options.config.agent}-{stamp}"
+    folder = run_folder.create(options.out, name)
+    with run_folder.lock(folder):
+        if not (options.resume and run_folder.is_described(folder)):
+            run_folder.refuse_used(folder)
+        try:
+            yield folder
+        except Interrupted as interrupted:
+            where = shlex.quote(str(folder))
+            interrupted.add_note(
+                f"go on with: python -m {program} --resume --out {where}"
             )
-        probe = folder / ".writable"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(
-            f"out is {folder}, which can't be written: {error.strerror}"
-        ) from None
-    return folder
+            raise
 
 
 def use_devices(options: Options, num_members: int) -> None:
@@ -133,11 +174,8 @@ def use_devices(options: Options, num_members: int) -> None:
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     """Write config.json: every option, the config's fields under "config"."""
-    from gasil_jax import logging
-
     described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    described |= {"out": str(folder)}
-    logging.write_json(folder / "config.json", described | more)
+    run_folder.describe(folder, described | {"out": str(folder)} | more)
 
 
 def make_env(options: Options) -> Any:
@@ -155,60 +193,62 @@ def make_env(options: Options) -> Any:
 
 
 def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
-    """Train, log and save; returns the summary."""
-    from gasil_jax import batch, checkpoint, logging, plotting
+    """Train, log and save; returns the summary.
+
+    Raises:
+      Interrupted: by a signal.
+      OSError: the folder can't be written any more.
+      ValueError: what is there to go on with does not fit.
+    """
+    from gasil_jax import batch, driver, logging, plotting
     from gasil_jax.progress import Progress
 
     config = options.config
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     write_config(options, folder)
     total_steps = config.num_iterations * config.batch_steps * options.seeds
-    writer = logging.MetricsWriter(folder / "metrics.csv", seeds)
-    history: list[dict[str, np.ndarray]] = []
-    with Progress(f"{options.env} {config.agent}", total_steps) as progress:
-        progress.phase("compiling")
-        started = time.monotonic()
+    title = f"{options.env} {config.agent}"
+    with Interruption() as interruption, Progress(title, total_steps) as progress:
         runs = batch.make_batch(env, config, seeds)
-        states, advance = runs.compile()
-        compile_seconds = time.monotonic() - started
-
-        progress.phase("training")
-        started = time.monotonic()
-        for latest in runs.run(states, advance):
-            states, metrics = latest
-            writer.write(metrics)
-            history.append(metrics)
-            progress.update(
-                int(metrics["env_steps"][:, -1].sum()), metrics["episode_return"]
-            )
-        train_seconds = time.monotonic() - started
-    writer.close()
-    checkpoint.save(folder / "checkpoint", runs.trim(states))
-
-    returns = np.concatenate([m["episode_return"] for m in history], axis=1)
-    steps = np.concatenate([m["env_steps"][0] for m in history])
-    faulty = sum(m["faulty_steps"].sum(axis=1) for m in history)
+        outcome = driver.drive(
+            runs,
+            folder,
+            {"seed": seeds},
+            schedule=driver.Schedule(
+                options.checkpoint_every, options.keep_checkpoints
+            ),
+            progress=progress,
+            interruption=interruption,
+        )
+    metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), options.seeds)
+    returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     plotting.learning_curve(
         folder / "learning_curve.png", steps, returns, f"{options.env}, {config.agent}"
     )
     final = final_returns(returns)
+    faulty = np.nansum(metrics["faulty_steps"], axis=1)
+    skipped = np.nansum(metrics["skipped_updates"], axis=1)
+    by_seed = lambda values, kind: {
+        str(seed): kind(value)
+        for seed, value in zip(seeds, values, strict=True)
+        if np.isfinite(value)
+    }
     summary = {
         "env": options.env,
         "agent": config.agent,
         "env_steps_per_seed": int(steps[-1]),
-        "final_return": {
-            str(seed): None if np.isnan(value) else float(value)
-            for seed, value in zip(seeds, final, strict=True)
-        },
+        "final_return": {str(seed): None for seed in seeds} | by_seed(final, float),
         "final_return_mean": None
         if np.isnan(final).all()
         else float(np.nanmean(final)),
-        "faulty_steps": {
-            str(seed): int(n) for seed, n in zip(seeds, faulty, strict=True)
-        },
-        "compile_seconds": compile_seconds,
-        "train_seconds": train_seconds,
-        "env_steps_per_second": total_steps / train_seconds,
+        "faulty_steps": by_seed(faulty, int),
+        "skipped_updates": by_seed(skipped, int),
+        "unhealthy_seeds": [
+            seed for seed, bad in zip(seeds, (faulty > 0) | (skipped > 0)) if bad
+        ],
+        "compile_seconds": outcome.compile_seconds,
+        "train_seconds": outcome.train_seconds,
+        "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
         "device": f"{len(runs.devices)} x {runs.devices[0].device_kind}",
         "versions": logging.versions(),
     }
@@ -227,25 +267,49 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
+def exit_status(work: Callable[[], None]) -> int:
+    """Do the work of a command line; its errors become lines on stderr.
+
+    Returns:
+      0: done; 1: the folder can't be written any more; 2: bad input; 128 and the
+      signal's number: interrupted, and saved.
+    """
+    try:
+        work()
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    except Interrupted as interrupted:
+        print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
+        return 128 + interrupted.signal
+    return 0
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = parse(Options, arguments, "gasil_jax.run")
-        check(options)
-        use_devices(options, options.seeds)
-        env = make_env(options)
-        folder = make_run_folder(options)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    summary = train(options, env, folder)
+    return exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = parse(Options, arguments, "gasil_jax.run")
+    check(options)
+    use_devices(options, options.seeds)
+    env = make_env(options)
+    with open_folder(options, "gasil_jax.run") as folder:
+        summary = train(options, env, folder)
     mean = summary["final_return_mean"]
     print(
         f"final return {'none ended' if mean is None else format(mean, '.1f')} "
         f"(mean over {options.seeds} seeds), "
         f"{summary['env_steps_per_second']:,.0f} steps/s, in {folder}"
     )
-    return 0
+    if summary["unhealthy_seeds"]:
+        print(
+            f"warning: numbers that were not finite in seeds "
+            f"{summary['unhealthy_seeds']}: see faulty_steps (simulation) and "
+            f"skipped_updates (learning) in {folder / 'summary.json'}",
+            file=sys.stderr,
+        )
 
 
 if __name__ == "__main__":

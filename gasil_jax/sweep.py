@@ -5,7 +5,8 @@ points vmapped and sharded; those that differ in a field of `Config` (buffer siz
 discriminator updates) are grouped, and each group compiles once.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
-curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png.
+curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png, and
+for each program a folder under programs/ with its metrics.csv and checkpoints.
 """
 
 import csv
@@ -121,50 +122,66 @@ def group(config: Config, points: Sequence[Point]) -> dict[Config, list[int]]:
 def sweep(
     options: Options, env: Any, points: Sequence[Point], folder: pathlib.Path
 ) -> Any:
-    """Train all points, log and save; returns the summary."""
-    from gasil_jax import batch, logging
+    """Train all points, log and save; returns the summary.
+
+    Raises:
+      Interrupted: by a signal.
+      OSError: the folder can't be written any more.
+      ValueError: what is there to go on with does not fit.
+    """
+    from gasil_jax import batch, driver, logging
+    from gasil_jax.interruption import Interruption
     from gasil_jax.progress import Progress
 
     run.write_config(options, folder, points=points)
     config, num_seeds = options.config, options.seeds
     seeds = list(range(options.first_seed, options.first_seed + num_seeds))
-    members = len(points) * num_seeds
-    total = config.num_iterations * config.batch_steps * members
+    steps_of = lambda points: (
+        config.num_iterations * config.batch_steps * num_seeds * points
+    )
+    schedule = driver.Schedule(options.checkpoint_every, options.keep_checkpoints)
     curves: dict[int, dict[str, np.ndarray]] = {}
-    done = 0
-    with Progress(f"{options.env} {config.agent} sweep", total) as progress:
+    title = f"{options.env} {config.agent} sweep"
+    with (
+        Interruption() as interruption,
+        Progress(title, steps_of(len(points))) as progress,
+    ):
         for number, (shared, indices) in enumerate(group(config, points).items()):
-            progress.phase(f"compiling program {number + 1}")
+            hyperparameters = [
+                config.updated(points[i]).hyperparameters for i in indices
+            ]
             runs = batch.make_batch(
                 env,
                 shared,
                 seeds * len(indices),
-                [
-                    config.updated(points[i]).hyperparameters
-                    for i in indices
-                    for _ in seeds
-                ],
+                [floats for floats in hyperparameters for _ in seeds],
             )
-            states, advance = runs.compile()
-            progress.phase("training")
-            history = []
-            for _, metrics in runs.run(states, advance):
-                history.append(metrics)
-                steps = int(metrics["env_steps"][:, -1].sum())
-                progress.update(done + steps, metrics["episode_return"])
-            done += steps
-            whole = {
-                name: np.concatenate([metrics[name] for metrics in history], axis=1)
-                for name in history[0]
+            labels = {
+                "point": [index for index in indices for _ in seeds],
+                "seed": seeds * len(indices),
             }
-            for place, index in enumerate(indices):
-                mine = slice(place * num_seeds, (place + 1) * num_seeds)
-                curves[index] = {name: value[mine] for name, value in whole.items()}
+            place = folder / "programs" / str(number)
+            place.mkdir(parents=True, exist_ok=True)
+            driver.drive(
+                runs,
+                place,
+                labels,
+                schedule=schedule,
+                progress=progress,
+                interruption=interruption,
+                steps_before=steps_of(len(curves)),
+            )
+            metrics = logging.read_metrics(
+                place / "metrics.csv", tuple(labels), runs.num_members
+            )
+            for position, index in enumerate(indices):
+                mine = slice(position * num_seeds, (position + 1) * num_seeds)
+                curves[index] = {name: value[mine] for name, value in metrics.items()}
 
     final = {i: run.final_returns(curves[i]["episode_return"]) for i in curves}
-    diverged = {i: ~np.isfinite(curves[i]["policy_loss"]).all(axis=1) for i in curves}
+    diverged = {i: (curves[i]["skipped_updates"] > 0).any(axis=1) for i in curves}
     names = sorted({name for point in points for name in point})
-    with (folder / "results.csv").open("x", newline="") as file:
+    with (folder / "results.csv").open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(["point", "seed", *names, "final_return", "diverged"])
         for index, point in enumerate(points):
@@ -231,20 +248,20 @@ def _plot(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = run.parse(Options, arguments, "gasil_jax.sweep")
-        run.check(options)
-        points = make_points(options)
-        for point in points:
-            config = options.config.updated(point)
-            run.check(dataclasses.replace(options, config=config))
-        run.use_devices(options, len(points) * options.seeds)
-        env = run.make_env(options)
-        folder = run.make_run_folder(options)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    summary = sweep(options, env, points, folder)
+    return run.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = run.parse(Options, arguments, "gasil_jax.sweep")
+    run.check(options)
+    points = make_points(options)
+    for point in points:
+        config = options.config.updated(point)
+        run.check(dataclasses.replace(options, config=config))
+    run.use_devices(options, len(points) * options.seeds)
+    env = run.make_env(options)
+    with run.open_folder(options, "gasil_jax.sweep") as folder:
+        summary = sweep(options, env, points, folder)
     for title in ("best_by_mean", "best_by_worst_seed"):
         best = summary[title]
         if best is None:
@@ -256,7 +273,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"worst seed {scores['worst_seed']:.1f})"
         )
     print(f"in {folder}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -103,6 +103,11 @@ def init(
     )
 
 
+def _is_finite(tree: Any) -> jax.Array:
+    floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats]))
+
+
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """One iteration of Algorithm 1: a batch of experience and the updates from it.
 
@@ -186,6 +191,14 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         imitation, params, optimizer_state, hp.learning_rate, context, policy_key
     )
 
+    # An update that is not finite is as if it had not been.
+    learned = (params, optimizer_state, imitation)
+    healthy = _is_finite(learned)
+    params, optimizer_state, imitation = jax.tree.map(
+        lambda new, old: jnp.where(healthy, new, old),
+        learned,
+        (state.params, state.optimizer_state, state.imitation),
+    )
     state = TrainState(
         params=params,
         optimizer_state=optimizer_state,
@@ -208,6 +221,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         "episode_length": mean_of_ended(batch.episode_length),
         "episodes": jnp.sum(batch.ended),
         "faulty_steps": jnp.sum(batch.faulty),
+        "skipped_updates": ~healthy,
         "good_return": good_trajectories.mean_return(buffer),
         "good_steps": buffer.size,
         "explained_variance": 1.0

@@ -1,0 +1,158 @@
+"""A run's folder: made, locked, described in config.json, and read again."""
+
+import contextlib
+import dataclasses
+import fcntl
+import json
+import os
+import pathlib
+import socket
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.environments import Settings
+
+_LOCK = ".lock"
+_CONFIG = "config.json"
+
+
+def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
+    """Make the folder `out`, or else a new one of that name under runs/.
+
+    Raises:
+      InputError: it can't be written.
+    """
+    try:
+        if out is not None:
+            out.mkdir(parents=True, exist_ok=True)
+            probe = out / f".writable-{os.getpid()}"
+            probe.touch()
+            probe.unlink()
+            return out
+        number = 1
+        while True:
+            folder = pathlib.Path("runs", name if number == 1 else f"{name}-{number}")
+            with contextlib.suppress(FileExistsError):
+                folder.mkdir(parents=True)
+                return folder
+            number += 1
+    except OSError as error:
+        where = folder if out is None else out
+        raise InputError(
+            f"out is {where}, which can't be written: {error.strerror}"
+        ) from None
+
+
+@contextlib.contextmanager
+def lock(folder: pathlib.Path) -> Iterator[None]:
+    """Keep every other process from writing into the folder.
+
+    The operating system takes the lock away from a process that ends, however it ends.
+
+    Raises:
+      InputError: another process has it.
+    """
+    with (folder / _LOCK).open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise InputError(
+                f"out is {folder}, which {file.read() or 'another process'} is "
+                "writing to: name another folder or wait"
+            ) from None
+        file.truncate(0)
+        file.write(f"process {os.getpid()} on {socket.gethostname()}")
+        file.flush()
+        yield
+
+
+def refuse_used(folder: pathlib.Path) -> None:
+    """Raise `InputError` if there is anything in the folder but a lock."""
+    if any(path.name != _LOCK for path in folder.iterdir()):
+        raise InputError(
+            f"out is {folder}, which is not empty: name a new or an empty folder, or "
+            "go on with what is there with --resume"
+        )
+
+
+def is_described(folder: pathlib.Path) -> bool:
+    """Whether a run has begun in the folder."""
+    return (folder / _CONFIG).is_file()
+
+
+def describe(folder: pathlib.Path, content: Mapping[str, Any]) -> None:
+    """Write config.json."""
+    from gasil_jax import logging
+
+    logging.write_json(folder / _CONFIG, content)
+
+
+def read(folder: pathlib.Path) -> dict[str, Any]:
+    """What config.json holds, "config" and "settings" as the dataclasses they are.
+
+    Raises:
+      InputError: there is none, or it is not of a run.
+    """
+    path = folder / _CONFIG
+    try:
+        content = json.loads(path.read_text())
+        fields = dict(content["config"])
+        fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
+        described = {name: _as_tuples(value) for name, value in content.items()}
+        described["config"] = Config(**_tuples_in(fields))
+        described["settings"] = Settings(**content["settings"])
+        for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
+            if type(described[name]) is not kind:
+                raise TypeError(f"{name} is {described[name]!r}")
+    except OSError:
+        raise InputError(f"run is {folder}: it must be the folder of a run") from None
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"{path} is damaged or of another program: {error}") from None
+    return described
+
+
+def _tuples_in(fields: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: _as_tuples(value) for name, value in fields.items()}
+
+
+def _as_tuples(value: Any) -> Any:
+    # JSON has no tuples, and a configuration is hashable.
+    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+
+
+#: What may differ between a run and its continuation.
+_FREE = ("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset")
+
+
+def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+    """Fields that may not change between a run and its continuation, and do.
+
+    Args:
+      before: of `read`.
+      now: the same of what is asked for. "total_steps" may have grown.
+
+    Returns:
+      "NAME was A, is B" for each.
+    """
+    found = []
+    for name, old in _flat(before).items():
+        new = _flat(now).get(name)
+        grown = name == "total_steps" and new is not None and new >= old
+        if old != new and not grown:
+            found.append(f"{name} was {old}, is {new}")
+    return found
+
+
+def _flat(described: Mapping[str, Any]) -> dict[str, Any]:
+    """Every field by its own name, those in dataclasses too."""
+    flat = {}
+    for name, value in described.items():
+        if dataclasses.is_dataclass(value):
+            fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+            flat |= _flat(fields)
+        elif name not in _FREE:
+            flat[name] = value
+    return flat
