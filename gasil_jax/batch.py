@@ -48,14 +48,7 @@ class Batch:
         Args:
           states: of the members, (members, ...), to go on from; default the first.
         """
-        if states is None:
-            states = self.init()
-        else:
-            padding = -self.num_members % len(self.devices)
-            states = jax.tree.map(
-                lambda x: jnp.concatenate([x, *[x[-1:]] * padding]), states
-            )
-            states = jax.device_put(states, self.sharding)
+        states = self.init() if states is None else self.place(states)
         states = jax.block_until_ready(states)
         return states, self.advance.lower(states, np.int32(0)).compile()
 
@@ -83,6 +76,12 @@ class Batch:
         steps = (np.arange(first, first + count) + 1) * self.config.batch_steps
         metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
         return states, metrics
+
+    def place(self, states: Any) -> Any:
+        """States of the members, (members, ...), padded and on their devices."""
+        padding = -self.num_members % len(self.devices)
+        pad = lambda x: jnp.concatenate([x, *[x[-1:]] * padding])
+        return jax.device_put(jax.tree.map(pad, states), self.sharding)
 
     def trim(self, states: Any) -> Any:
         """States without the padding: (members, ...)."""

@@ -6,7 +6,10 @@ Parses, drives the training loop in chunks, logs and saves. No algorithm is here
 import argparse
 import contextlib
 import dataclasses
+import hashlib
+import os
 import pathlib
+import platform
 import shlex
 import sys
 import time
@@ -14,6 +17,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
 import jax
+import jaxlib
 import numpy as np
 import tyro
 
@@ -168,8 +172,30 @@ def use_devices(options: Options, num_members: int) -> None:
     # In a program that has used JAX already, its devices stay as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", count)
+    _keep_compiled_programs()
     # TF32 has ruined PPO runs on Ampere and later GPUs.
     jax.config.update("jax_default_matmul_precision", "highest")
+
+
+def _keep_compiled_programs() -> None:
+    """Have JAX keep them in the user's cache, unless its own variable says where.
+
+    By the version of jaxlib and the processor: a program for another one may crash.
+    """
+    if jax.config.jax_compilation_cache_dir is not None:
+        return
+    with contextlib.suppress(OSError):
+        described = pathlib.Path("/proc/cpuinfo")
+        lines = described.read_text().splitlines() if described.exists() else []
+        features = {
+            x for x in lines if x.startswith(("flags", "Features", "model name"))
+        }
+        processor = "".join([platform.node(), platform.machine(), *sorted(features)])
+        key = hashlib.sha256(processor.encode()).hexdigest()[:16]
+        home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
+        folder = pathlib.Path(home, "gasil_jax", f"jaxlib-{jaxlib.__version__}-{key}")
+        folder.mkdir(parents=True, exist_ok=True)
+        jax.config.update("jax_compilation_cache_dir", str(folder))
 
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
