@@ -171,6 +171,8 @@ def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 # Bodies touch little of what they could: humanoid has 138 possible contacts and, short
 # of lying on the floor with its arms folded, no more than 8 of a kind at once.
 _MOST_IN_PLAY = 8
+# A GPU's host looks at every decision: that pays from this many possible contacts on.
+_FEWEST_WORTH_A_DECISION = 20
 
 
 def _without_idle_contacts(
@@ -190,7 +192,9 @@ def _without_idle_contacts(
 
     def solve(problem: Problem) -> Solution:
         large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
-        if not large:
+        most = max((x.normal.shape[0] for x in large), default=0)
+        on_cpu = jax.default_backend() == "cpu"
+        if not large or not (on_cpu or most >= _FEWEST_WORTH_A_DECISION):
             return function(problem)
         fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
         return jax.lax.cond(jnp.all(jnp.stack(fits)), few, function, problem)
