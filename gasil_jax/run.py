@@ -140,6 +140,30 @@ def check(options: Options) -> None:
         )
 
 
+def check_resources(
+    options: Options, env: Any, config: Config, num_members: int
+) -> None:
+    """Refuse what does not fit the devices or the disk.
+
+    Raises:
+      InputError: the numbers.
+    """
+    from gasil_jax import resources
+
+    try:
+        resources.check(
+            env,
+            config,
+            num_members,
+            jax.devices(),
+            options.out or pathlib.Path("runs"),
+            # The best one, and one that is being written.
+            options.keep_checkpoints + 2,
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
 @contextlib.contextmanager
 def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     """The run's folder, made where it is missing, locked while this is entered.
@@ -321,6 +345,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     check(options)
     use_devices(options, options.seeds)
     env = make_env(options)
+    check_resources(options, env, options.config, options.seeds)
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, folder)
     mean = summary["final_return_mean"]

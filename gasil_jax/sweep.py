@@ -260,6 +260,8 @@ def _main(arguments: Sequence[str] | None) -> None:
         run.check(dataclasses.replace(options, config=config))
     run.use_devices(options, len(points) * options.seeds)
     env = run.make_env(options)
+    for shared, indices in group(options.config, points).items():
+        run.check_resources(options, env, shared, len(indices) * options.seeds)
     with run.open_folder(options, "gasil_jax.sweep") as folder:
         summary = sweep(options, env, points, folder)
     for title in ("best_by_mean", "best_by_worst_seed"):
