@@ -1,5 +1,6 @@
 """Generative Adversarial Self-Imitation Learning in JAX (Guo, Oh, Singh, Lee 2018)."""
 
+from gasil_jax import compatibility as compatibility
 from gasil_jax.batch import member
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.environments import make_env

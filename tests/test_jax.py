@@ -2,6 +2,12 @@
 
 import jax
 import jax.numpy as jnp
+import jaxlib
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax import compatibility, good_trajectories, ppo
 
 
 def test_batched_reduction_is_right_on_cpu():
@@ -23,3 +29,88 @@ def test_many_batched_orthogonal_matrices_do_not_deadlock():
     for matrix in jax.jit(jax.vmap(six))(jnp.arange(8)):
         product = jnp.einsum("bij,bik->bjk", matrix, matrix)
         assert float(jnp.max(jnp.abs(product - jnp.eye(64)))) < 1e-4
+
+
+def test_the_release_that_miscompiles_is_refused_at_import():
+    with pytest.raises(ImportError, match=r"0\.10\.2 gives wrong numbers"):
+        compatibility.check("0.10.2")
+    compatibility.check(jaxlib.__version__)
+
+
+CONFIG = gasil_jax.Config(
+    num_envs=2,
+    batch_steps=8,
+    total_steps=16,
+    minibatch_size=4,
+    num_epochs=1,
+    hidden_sizes=(4,),
+    discriminator_hidden_sizes=(4,),
+    discriminator_updates=1,
+    discriminator_minibatch_size=8,
+    buffer_steps=5,
+    max_episode_steps=3,
+)
+
+
+def assert_close(compiled, eager):
+    plain = lambda x: (
+        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(
+            plain(a), plain(b), rtol=1e-4, atol=1e-5
+        ),
+        compiled,
+        eager,
+    )
+
+
+def test_a_compiled_iteration_equals_an_eager_one():
+    """Two of them: rollout, insertion, advantages, discriminator and PPO."""
+    env = gasil_jax.make_env("point_mass", reward_delay=2)
+    iterate = lambda state: gasil_jax.iterate(env, CONFIG, state)
+    state, _ = jax.jit(iterate)(gasil_jax.init(env, CONFIG, jax.random.key(0)))
+    assert int(state.good_trajectories.size) == 5
+    compiled = jax.jit(iterate)(state)
+    with jax.disable_jit():
+        eager = iterate(state)
+    assert_close(compiled, eager)
+
+
+def test_a_compiled_insertion_equals_an_eager_one():
+    key = jax.random.key(0)
+    history = good_trajectories.init_history(3, 8, 8, 2, 1)
+    buffer = good_trajectories.init(10, 2, 1)
+    for number in range(4):
+        keys = jax.random.split(jax.random.fold_in(key, number), 4)
+        ended = jax.random.bernoulli(keys[0], 0.4, (8, 3))
+        history = good_trajectories.record(
+            history,
+            jax.random.normal(keys[1], (8, 3, 2)),
+            jax.random.normal(keys[2], (8, 3, 1)),
+            jnp.zeros((8, 3)),
+            ended,
+        )
+        length = jnp.broadcast_to(jnp.arange(1, 9)[:, None], (8, 3))
+        return_ = jax.random.normal(keys[3], (8, 3))
+        episodes = good_trajectories.ended_episodes(history, ended, return_, length)
+        compiled = jax.jit(good_trajectories.insert)(buffer, history, episodes)
+        with jax.disable_jit():
+            eager = good_trajectories.insert(buffer, history, episodes)
+        assert_close(compiled, eager)
+        buffer = compiled
+    assert int(buffer.size) == 10
+
+
+def test_compiled_advantages_equal_eager_ones():
+    keys = jax.random.split(jax.random.key(0), 5)
+    shape = (64, 8)
+    arrays = [jax.random.normal(key, shape) for key in keys[:3]]
+    flags = [jax.random.bernoulli(key, 0.1, shape) for key in keys[3:]]
+    flags[1] = flags[0] | flags[1]
+    estimate = lambda *x: ppo.generalized_advantage_estimation(
+        *x, gamma=0.99, gae_lambda=0.95
+    )
+    compiled = jax.jit(estimate)(*arrays, *flags)
+    with jax.disable_jit():
+        assert_close(compiled, estimate(*arrays, *flags))

@@ -2,6 +2,8 @@
 
 import functools
 import pathlib
+import zipfile
+import zlib
 
 import numpy as np
 
@@ -42,13 +44,21 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _load_file(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     try:
-        with np.load(path) as arrays:
+        with np.load(path, allow_pickle=False) as arrays:
             return arrays["observation"], arrays["action"]
-    except (OSError, ValueError, KeyError) as error:
+    # A single array, a file cut off and one with wrong bits raise an error each.
+    except (
+        *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError),
+        *(zipfile.BadZipFile, zlib.error),
+    ) as error:
         raise ValueError(
             f"expert is {str(path)!r}: it must be an .npz file with arrays "
-            f"'observation' and 'action' ({error})"
+            f"'observation' and 'action' ({_first_line(error)})"
         ) from None
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__
 
 
 def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +80,7 @@ def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
             f"expert is 'minari:{name}': it must be a local data set with arrays as "
-            f"observations and actions ({error})"
+            f"observations and actions ({_first_line(error)})"
         ) from None
 
 

@@ -1,0 +1,18 @@
+"""Refuses, when it is imported, a release of JAX that can't be used."""
+
+import jaxlib
+
+#: Wrong numbers from batched reductions on a CPU (jax issue 39103).
+_MISCOMPILES = ("0.10.2",)
+
+
+def check(jaxlib_version: str) -> None:
+    """Raise `ImportError` for a release that is known to compute wrong numbers."""
+    if jaxlib_version in _MISCOMPILES:
+        raise ImportError(
+            f"jaxlib {jaxlib_version} gives wrong numbers on a CPU (jax issue 39103): "
+            "install another one, 0.10.1 or 0.12 and later"
+        )
+
+
+check(jaxlib.__version__)
