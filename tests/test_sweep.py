@@ -2,9 +2,13 @@
 
 import csv
 import json
+import signal
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from test_resume import finish, wait_for
 
 from gasil_jax import command_line, run, sweep
 from gasil_jax.config import Config
@@ -89,3 +93,33 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
     assert all(curves[name].shape == (4, 2, 2) for name in curves)
+
+
+def test_an_interrupted_sweep_goes_on(tmp_path):
+    long = (*SMALL, "--total-steps", str(200 * 256), "--seeds", "2")
+    grid = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
+    results = []
+    for name in ("whole", "interrupted"):
+        out = tmp_path / name
+        command = [sys.executable, "-m", "gasil_jax.sweep", *long, *grid]
+        child = subprocess.Popen(
+            [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
+        )
+        if name == "interrupted":
+            second = out / "programs" / "1" / "metrics.csv"
+            wait_for(lambda: second.exists() and second.stat().st_size > 5000, child)  # noqa: B023
+            child.terminate()
+            status, _, err = finish(child)
+            assert status == 128 + signal.SIGTERM, err
+            assert f"gasil_jax.sweep --resume --out {out}" in err
+            assert not (out / "results.csv").exists()
+            command = [sys.executable, "-m", "gasil_jax.sweep", "--resume"]
+            child = subprocess.Popen(
+                [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
+            )
+        status, _, err = finish(child)
+        assert status == 0, err
+        results.append((out / "results.csv").read_bytes())
+    assert results[0] == results[1]
+    more = ["--resume", "--out", str(out), "--grid", "alpha=3"]
+    assert sweep.main(more) == 2

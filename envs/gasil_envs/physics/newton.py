@@ -158,7 +158,7 @@ def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     def in_tiles(tree: Any) -> Any:
         batch = jax.tree.leaves(tree)[0].shape[-1]
         size = max(n for n in range(1, _MOST_IN_A_TILE + 1) if batch % n == 0)
-        if jax.default_backend() != "cpu" or size < 16 or size == batch:
+        if not _on_cpu() or size < 16 or size == batch:
             return function(tree)
         tiles = batch // size
         split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], tiles, size), -2, 0)
@@ -193,8 +193,7 @@ def _without_idle_contacts(
     def solve(problem: Problem) -> Solution:
         large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
         most = max((x.normal.shape[0] for x in large), default=0)
-        on_cpu = jax.default_backend() == "cpu"
-        if not large or not (on_cpu or most >= _FEWEST_WORTH_A_DECISION):
+        if not large or not (_on_cpu() or most >= _FEWEST_WORTH_A_DECISION):
             return function(problem)
         fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
         return jax.lax.cond(jnp.all(jnp.stack(fits)), few, function, problem)
@@ -237,12 +236,20 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
 
 
 # Above this many entries of a matrix, sums are left to reductions: spelled out they
-# are up to 4 times as fast, but the time to compile them grows with the entries.
-_MOST_ENTRIES_SPELLED_OUT = 1100
+# are up to 4 times as fast, but the time to compile them grows with the entries, on a
+# GPU faster (ant: 89 s for MJX's 20).
+_MOST_ENTRIES_SPELLED_OUT = {"cpu": 1100, "gpu": 300}
+# Of these systems a GPU's compiler unrolls the loops in bearable time.
+_MOST_DEGREES_UNROLLED = 10
+
+
+def _on_cpu() -> bool:
+    return jax.default_backend() == "cpu"
 
 
 def _is_small(matrix: jax.Array) -> bool:
-    return matrix.shape[0] * matrix.shape[1] <= _MOST_ENTRIES_SPELLED_OUT
+    most = _MOST_ENTRIES_SPELLED_OUT["cpu" if _on_cpu() else "gpu"]
+    return matrix.shape[0] * matrix.shape[1] <= most
 
 
 def _matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
@@ -407,7 +414,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
     each = jax.tree.map
     # A loop costs a GPU more than what is in it (a fifth of all on walker2d), and a CPU
     # the time to compile it.
-    unroll = jax.default_backend() != "cpu"
+    unroll = not _on_cpu() and force.shape[0] <= _MOST_DEGREES_UNROLLED
     loop = functools.partial(jax.lax.fori_loop, unroll=unroll)
     total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
     distance_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
