@@ -192,11 +192,16 @@ def training_row(env_name: str, name: str, options: argparse.Namespace) -> Row:
     return Row(env_name, f"ppo+gasil, {name}", num_envs, run, compile_seconds)
 
 
-def _baseline(gymnasium_id: str, num_envs: int, steps: int, pipe: Any) -> None:
+def _baseline(
+    gymnasium_id: str, num_envs: int, steps: int, threads: int, pipe: Any
+) -> None:
     """Train Stable-Baselines3's PPO in a process of its own; send the seconds."""
+    import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
 
+    # More threads than cores, and each waits for the others.
+    torch.set_num_threads(threads)
     env = make_vec_env(gymnasium_id, num_envs)
     # 2048 steps, 10 epochs and minibatches of 64 are its own values, and ours.
     model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, device="cpu")
@@ -218,7 +223,8 @@ def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
         pipes = []
         for _ in range(processes):
             here, there = context.Pipe()
-            arguments = (gymnasium_id, num_envs, steps, there)
+            threads = max(1, available_cores() // processes)
+            arguments = (gymnasium_id, num_envs, steps, threads, there)
             context.Process(target=_baseline, args=arguments, daemon=True).start()
             pipes.append(here)
         for act in (lambda pipe: pipe.recv(), lambda pipe: pipe.send("go")):

@@ -16,6 +16,8 @@ from gasil_jax import (
     command_line,
     environments,
     normalization,
+    numpy_policy,
+    policy,
     run_folder,
     train,
 )
@@ -48,13 +50,13 @@ def evaluate(
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
     """
-    policy = Policy(config.hidden_sizes, env.action_size)
+    network = Policy(config.hidden_sizes, env.action_size)
     low, high = getattr(env, "action_range", (-1.0, 1.0))
     reset_key, act_key = jax.random.split(key)
 
     def act(observation: jax.Array, key: jax.Array) -> jax.Array:
         observation = normalization.normalize(state.normalizer, observation)
-        mean, log_std = policy.apply(state.params["policy"], observation)
+        mean, log_std = network.apply(state.params["policy"], observation)
         noise = jax.random.normal(key, mean.shape, mean.dtype)
         action = mean if deterministic else mean + jnp.exp(log_std) * noise
         return jnp.clip(action, low, high)
@@ -79,29 +81,6 @@ def evaluate(
     return {"episode_return": return_, "episode_length": length}
 
 
-def numpy_policy(
-    state: train.TrainState, action_range: tuple[Any, Any] = (-1.0, 1.0)
-) -> Callable[[np.ndarray], np.ndarray]:
-    """The deterministic policy of one training state, in NumPy alone.
-
-    For Gymnasium and other programs without JAX: (..., obs) -> (..., action), clipped
-    to `action_range`.
-    """
-    params = jax.tree.map(np.asarray, state.params["policy"]["params"])
-    normalizer = jax.tree.map(np.asarray, state.normalizer)
-    layers = [params["MLP_0"][f"Dense_{i}"] for i in range(len(params["MLP_0"]))]
-
-    def act(observation: np.ndarray) -> np.ndarray:
-        variance = normalizer.m2 / max(normalizer.count, 1.0)
-        x = (observation - normalizer.mean) / np.sqrt(variance + 1e-8)
-        x = np.clip(x, -10.0, 10.0)
-        for layer in layers[:-1]:
-            x = np.tanh(x @ layer["kernel"] + layer["bias"])
-        return np.clip(x @ layers[-1]["kernel"] + layers[-1]["bias"], *action_range)
-
-    return act
-
-
 def evaluate_in_gymnasium(
     gymnasium_id: str,
     act: Callable[[np.ndarray], np.ndarray],
@@ -113,7 +92,7 @@ def evaluate_in_gymnasium(
 
     Args:
       gymnasium_id: of the task, "Walker2d-v5".
-      act: observation -> action, as of `numpy_policy`.
+      act: observation -> action, as of `numpy_policy.load`.
       num_episodes: one after the other.
       seed: of the first episode's start; the next ones' follow.
 
@@ -222,7 +201,7 @@ def _score_in_gymnasium(
     scores = [
         evaluate_in_gymnasium(
             gymnasium_id,
-            numpy_policy(batch.member(states, index), env.action_range),
+            numpy_policy.make(policy.weights(batch.member(states, index), env)),
             num_episodes=options.episodes,
             seed=options.key,
         )

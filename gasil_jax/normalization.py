@@ -49,12 +49,16 @@ def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
     )
 
 
+def moments(normalizer: Normalizer) -> tuple[jax.Array, jax.Array]:
+    """What `normalize` subtracts and divides by, (..., obs) each."""
+    count = normalizer.count[..., None]
+    variance = jnp.where(count > 0, normalizer.m2 / jnp.maximum(count, 1.0), 1.0)
+    return normalizer.mean, jnp.sqrt(variance + 1e-8)
+
+
 def normalize(
     normalizer: Normalizer, observation: jax.Array, clip: float = 10.0
 ) -> jax.Array:
     """Observations (..., obs) at mean 0 and variance 1, clipped to +-`clip`."""
-    variance = jnp.where(
-        normalizer.count > 0, normalizer.m2 / jnp.maximum(normalizer.count, 1.0), 1.0
-    )
-    scaled = (observation - normalizer.mean) * jax.lax.rsqrt(variance + 1e-8)
-    return jnp.clip(scaled, -clip, clip)
+    mean, scale = moments(normalizer)
+    return jnp.clip((observation - mean) / scale, -clip, clip)

@@ -250,7 +250,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
-    from gasil_jax import batch, driver, logging, plotting
+    from gasil_jax import batch, driver, logging, plotting, policy
     from gasil_jax.progress import Progress
 
     config = options.config
@@ -276,6 +276,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
         folder / "learning_curve.png", steps, returns, f"{options.env}, {config.agent}"
     )
     final = final_returns(returns)
+    policy.save(folder / "policy.npz", outcome.states, env, seeds, final)
     faulty = np.nansum(metrics["faulty_steps"], axis=1)
     skipped = np.nansum(metrics["skipped_updates"], axis=1)
     by_seed = lambda values, kind: {

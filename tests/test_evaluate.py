@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import checkpoint, evaluate
-from gasil_jax.networks import Policy
+from gasil_jax import checkpoint, evaluate, numpy_policy, policy
 
 CONFIG = gasil_jax.Config(
     agent="ppo+gasil",
@@ -58,7 +57,7 @@ def test_scores_are_those_of_a_plain_loop(trained):
     scores = jax.jit(lambda s: evaluate.evaluate(env, CONFIG, s, key, num_episodes=3))(
         state
     )
-    act = evaluate.numpy_policy(state)
+    act = numpy_policy.make(policy.weights(state, env))
     step = jax.jit(env.step)
     for i, reset_key in enumerate(jax.random.split(jax.random.split(key)[0], 3)):
         running, total, length = env.reset(reset_key), 0.0, 0
@@ -68,18 +67,6 @@ def test_scores_are_those_of_a_plain_loop(trained):
             length += 1
         np.testing.assert_allclose(scores["episode_return"][i], total, rtol=1e-3)
         assert int(scores["episode_length"][i]) == length == 50
-
-
-def test_the_numpy_policy_is_the_networks_mean(trained):
-    env, states = trained
-    state = gasil_jax.member(states, 0)
-    observation = np.asarray(env.reset(jax.random.key(0)).obs)
-    normalized = gasil_jax.normalization.normalize(state.normalizer, observation)
-    policy = Policy(CONFIG.hidden_sizes, env.action_size)
-    mean, _ = policy.apply(state.params["policy"], normalized)
-    np.testing.assert_allclose(
-        evaluate.numpy_policy(state)(observation), np.clip(mean, -1, 1), atol=1e-5
-    )
 
 
 def test_stochastic_scores_vary_more(trained):

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import batch, checkpoint, run
+from gasil_jax import batch, checkpoint, run, run_folder
 
 ITERATIONS = 400
 SMALL = (
@@ -254,7 +254,7 @@ def test_a_folder_in_use_is_refused_until_its_process_dies(tmp_path, capsys):
     assert f"process {child.pid}" in capsys.readouterr().err
     child.kill()
     finish(child)
-    with gasil_jax.run_folder.lock(out):
+    with run_folder.lock(out):
         pass
 
 

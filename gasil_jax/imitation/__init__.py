@@ -16,4 +16,10 @@ AGENTS: dict[str, Imitation] = {
     "gail": adversarial.GAIL,
 }
 
-__all__ = ["AGENTS", "Imitation"]
+
+def agents() -> tuple[str, ...]:
+    """The names that `Config.agent` takes."""
+    return tuple(AGENTS)
+
+
+__all__ = ["AGENTS", "Imitation", "agents"]

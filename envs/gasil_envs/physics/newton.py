@@ -111,7 +111,9 @@ class Solution:
 def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
     """Solve one problem; `jax.vmap` it for many, nested as deep as needed."""
     function = functools.partial(_solve, iterations, line_search)
-    batched = _batch_last(_in_tiles(_without_idle_contacts(function)))
+    batched = _batch_last(
+        _in_tiles(functools.partial(_without_idle_contacts, function))
+    )
     solution = batched(jax.tree.map(lambda x: x[..., None], problem))
     return jax.tree.map(lambda x: x[..., 0], solution)
 
@@ -176,29 +178,28 @@ _FEWEST_WORTH_A_DECISION = 20
 
 
 def _without_idle_contacts(
-    function: Callable[[Problem], Solution],
-) -> Callable[[Problem], Solution]:
-    """`function` of problems, batch last, with the contacts in play moved together.
+    solve: Callable[[Problem, bool], Solution], problem: Problem
+) -> Solution:
+    """Solve problems, batch last, with the contacts in play moved together.
 
-    Where one of the problems has more of them than there is room for, all are solved
-    as they are.
+    Where one of them has more of these than there is room for, all are solved as they
+    are, which is rare enough to be compiled for brevity.
     """
+    large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
+    most = max((x.normal.shape[0] for x in large), default=0)
+    if not large or not (_on_cpu() or most >= _FEWEST_WORTH_A_DECISION):
+        return solve(problem, True)
 
     def few(problem: Problem) -> Solution:
         moved, restore = zip(*map(_together, problem.contacts), strict=True)
-        solution = function(problem.replace(contacts=moved))
+        solution = solve(problem.replace(contacts=moved), True)
         forces = [f(x) for f, x in zip(restore, solution.edge_forces, strict=True)]
         return solution.replace(edge_forces=tuple(forces))
 
-    def solve(problem: Problem) -> Solution:
-        large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
-        most = max((x.normal.shape[0] for x in large), default=0)
-        if not large or not (_on_cpu() or most >= _FEWEST_WORTH_A_DECISION):
-            return function(problem)
-        fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
-        return jax.lax.cond(jnp.all(jnp.stack(fits)), few, function, problem)
-
-    return solve
+    fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
+    return jax.lax.cond(
+        jnp.all(jnp.stack(fits)), few, lambda problem: solve(problem, False), problem
+    )
 
 
 def _together(
@@ -247,29 +248,31 @@ def _on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
-def _is_small(matrix: jax.Array) -> bool:
+def _spells_out(matrix: jax.Array) -> bool:
     most = _MOST_ENTRIES_SPELLED_OUT["cpu" if _on_cpu() else "gpu"]
     return matrix.shape[0] * matrix.shape[1] <= most
 
 
-def _matvec(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+def _matvec(matrix: jax.Array, vector: jax.Array, spell_out: bool) -> jax.Array:
     """(N, V, B), (V, B) -> (N, B)."""
-    if _is_small(matrix):
+    if spell_out:
         return sum(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
     return jnp.sum(matrix * vector, axis=1)
 
 
-def _matvec_transposed(matrix: jax.Array, vector: jax.Array) -> jax.Array:
+def _matvec_transposed(
+    matrix: jax.Array, vector: jax.Array, spell_out: bool
+) -> jax.Array:
     """(N, V, B), (N, B) -> (V, B)."""
-    if _is_small(matrix):
+    if spell_out:
         return sum(matrix[n] * vector[n] for n in range(vector.shape[0]))
     return jnp.sum(matrix * vector[:, None], axis=0)
 
 
-def _symmetric_product(left: jax.Array, right: jax.Array) -> jax.Array:
+def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> jax.Array:
     """left' right, known to be symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
     num_rows, size, _ = left.shape
-    if not _is_small(left):
+    if not spell_out:
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
     rows = [
         sum(left[n, i] * right[n, : i + 1] for n in range(num_rows))
@@ -293,7 +296,7 @@ class _Rows:
     each group of contacts.
     """
 
-    def __init__(self, problem: Problem):
+    def __init__(self, problem: Problem, for_speed: bool):
         edges_first = lambda x: jnp.swapaxes(x, 0, 1)
         self._sign = problem.limits.sign
         self._edges = [group.edges for group in problem.contacts]
@@ -311,6 +314,7 @@ class _Rows:
         for group in problem.contacts:
             parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
         self._basis = _materialize(jnp.concatenate(parts)) if parts else None
+        self._spell_out = bool(parts) and for_speed and _spells_out(self._basis)
 
     def _split(self, along: jax.Array) -> list[list[jax.Array]]:
         """(rows of B, ...) to [normal (C, ...), tangents...] of each group."""
@@ -327,7 +331,9 @@ class _Rows:
         if self._basis is None:
             return result
         for edges, (normal, *tangents) in zip(
-            self._edges, self._split(_matvec(self._basis, vector)), strict=True
+            self._edges,
+            self._split(_matvec(self._basis, vector, self._spell_out)),
+            strict=True,
         ):
             result.append(
                 jnp.stack([_add_signed(normal, tangents, signs) for signs in edges])
@@ -349,7 +355,7 @@ class _Rows:
                 signs = [signs[t] for signs in edges]
                 along.append(_sum_signed(of_edges, signs))
         along = _materialize(jnp.concatenate(along))
-        return result + _matvec_transposed(self._basis, along)
+        return result + _matvec_transposed(self._basis, along, self._spell_out)
 
     def gram(self, weights: list[jax.Array]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""
@@ -372,7 +378,7 @@ class _Rows:
                         terms.append(_sum_signed(of_edges, products)[:, None] * part)
                 weighted.append(sum(terms))
         weighted = _materialize(jnp.concatenate(weighted))
-        return result + _symmetric_product(weighted, self._basis)
+        return result + _symmetric_product(weighted, self._basis, self._spell_out)
 
 
 def _add_signed(
@@ -406,10 +412,13 @@ def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     return table[:, 0]
 
 
-def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
+def _solve(
+    iterations: int, line_search: int, problem: Problem, for_speed: bool
+) -> Solution:
     """`solve` with the batch as the last axis of everything."""
     inertia, force = problem.inertia, problem.force
-    rows = _Rows(problem)
+    rows = _Rows(problem, for_speed)
+    spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
     each = jax.tree.map
     # A loop costs a GPU more than what is in it (a fifth of all on walker2d), and a CPU
@@ -424,7 +433,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
         away = qacc - qacc_smooth
         square = lambda d, w: w * jnp.minimum(d, 0.0) ** 2
         constraint_cost = total(each(square, distance_at(qacc), weight))
-        return _dot(away, _matvec(inertia, away)) + constraint_cost
+        return _dot(away, _matvec(inertia, away, spell_out)) + constraint_cost
 
     better = cost(problem.warmstart) < cost(qacc_smooth)
     start = jnp.where(better, problem.warmstart, qacc_smooth)
@@ -432,7 +441,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
     def iterate(_: int, carry: tuple[jax.Array, list[jax.Array]]) -> Any:
         qacc, distance = carry
         active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), distance, weight)
-        residual = _matvec(inertia, qacc) - force
+        residual = _matvec(inertia, qacc, spell_out) - force
         pull = rows.transposed_times(each(jnp.multiply, active, distance))
         active, gradient = _materialize((active, residual + pull))
         hessian = inertia + rows.gram(active)
@@ -441,7 +450,7 @@ def _solve(iterations: int, line_search: int, problem: Problem) -> Solution:
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
         slope = _materialize(rows.times(direction))
         linear = _dot(direction, residual)
-        quadratic = _dot(direction, _matvec(inertia, direction))
+        quadratic = _dot(direction, _matvec(inertia, direction, spell_out))
 
         def newton(_: int, search: tuple[jax.Array, ...]) -> Any:
             step, low, high = search

@@ -1,0 +1,109 @@
+"""A saved policy in NumPy alone: this module and what it imports need no JAX.
+
+    act = gasil_jax.numpy_policy.load("runs/hopper")
+    action = act(observation)
+
+The file is an ``.npz`` of plain arrays, never unpickled:
+
+    seeds (S,)  final_return (S,)  mean, scale (S, obs)  log_std (S, action)
+    kernel_0 (S, obs, width), bias_0 (S, width), kernel_1 ...  low, high (action,)
+
+An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
+the last is followed by tanh; the output is the mean of a Gaussian.
+"""
+
+import pathlib
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+#: Normalized observations are clipped to plus and minus this.
+CLIP = 10.0
+
+
+def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
+    """The arrays of one seed's policy.
+
+    Args:
+      path: the file, or the folder of a finished run.
+      seed: its number; default the one with the highest final return.
+
+    Raises:
+      ValueError: it is not a policy's file, or has no such seed.
+    """
+    path = pathlib.Path(path)
+    if path.is_dir():
+        path = path / "policy.npz"
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        seeds = arrays.pop("seeds").tolist()
+        returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
+        shared = {name: arrays.pop(name) for name in ("low", "high")}
+        needed = ("mean", "scale", "log_std", "kernel_0", "bias_0")
+        if missing := [name for name in needed if name not in arrays]:
+            raise KeyError(f"{missing[0]} is missing")
+    # A single array, a file cut off and one with wrong bits raise an error each.
+    except (
+        *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError),
+        *(zipfile.BadZipFile, zlib.error),
+    ) as error:
+        reason = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"{path} is not a saved policy ({reason})") from None
+    if seed is None:
+        seed = seeds[int(np.argmax(returns))]
+    if seed not in seeds:
+        raise ValueError(f"seed is {seed}: {path} has {', '.join(map(str, seeds))}")
+    index = seeds.index(seed)
+    return {name: value[index] for name, value in arrays.items()} | shared
+
+
+def mean_and_log_std(
+    weights: Mapping[str, Any], observation: Any, xp: Any = np
+) -> tuple[Any, Any]:
+    """The policy's Gaussian at observations (..., obs): (..., action), (action,).
+
+    Args:
+      weights: of `read`.
+      observation: not normalized.
+      xp: numpy or jax.numpy.
+    """
+    x = (observation - weights["mean"]) / weights["scale"]
+    x = xp.clip(x, -CLIP, CLIP)
+    last = sum(name.startswith("kernel_") for name in weights) - 1
+    for i in range(last + 1):
+        x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
+        x = xp.tanh(x) if i < last else x
+    return x, weights["log_std"]
+
+
+def load(
+    path: str | pathlib.Path, seed: int | None = None
+) -> Callable[..., np.ndarray]:
+    """``act(observation, generator=None)``: (..., obs) -> (..., action), clipped.
+
+    With a `numpy.random.Generator` the action is drawn from the policy, without one it
+    is the policy's mean.
+
+    Raises:
+      ValueError: see `read`.
+    """
+    return make(read(path, seed))
+
+
+def make(weights: Mapping[str, np.ndarray]) -> Callable[..., np.ndarray]:
+    """As `load`, of arrays that are at hand."""
+
+    def act(
+        observation: np.ndarray, generator: np.random.Generator | None = None
+    ) -> np.ndarray:
+        action, log_std = mean_and_log_std(weights, observation)
+        if generator is not None:
+            action = action + np.exp(log_std) * generator.standard_normal(action.shape)
+        action = np.clip(action, weights["low"], weights["high"])
+        return np.asarray(action, np.float32)
+
+    return act

@@ -1,0 +1,84 @@
+"""Policies out of training states, and back into JAX."""
+
+import pathlib
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gasil_jax import normalization, numpy_policy
+
+
+def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
+    """The arrays of `numpy_policy` of a `TrainState`, or (seeds, ...) of a batch."""
+    params = jax.tree.map(np.asarray, state.params["policy"]["params"])
+    layers = params["MLP_0"]
+    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
+    mean, scale = normalization.moments(state.normalizer)
+    arrays = {
+        "mean": np.asarray(mean),
+        "scale": np.asarray(scale),
+        "log_std": params["log_std"],
+        "low": wide(low),
+        "high": wide(high),
+    }
+    for i in range(len(layers)):
+        arrays[f"kernel_{i}"] = layers[f"Dense_{i}"]["kernel"]
+        arrays[f"bias_{i}"] = layers[f"Dense_{i}"]["bias"]
+    return arrays
+
+
+def save(
+    path: pathlib.Path,
+    states: Any,
+    env: Any,
+    seeds: Sequence[int],
+    final_return: np.ndarray,
+) -> None:
+    """Write the policies of a batch of states as one ``.npz``, atomically.
+
+    Args:
+      path: where to.
+      states: (seeds, ...).
+      env: that they were trained in.
+      seeds: their numbers.
+      final_return: (seeds,), NaN where unknown.
+    """
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        np.savez(
+            file,
+            seeds=np.asarray(seeds, np.int64),
+            final_return=np.asarray(final_return, np.float64),
+            **weights(states, env),
+        )
+    partial.replace(path)
+
+
+def load_policy(
+    path: str | pathlib.Path, seed: int | None = None
+) -> Callable[..., jax.Array]:
+    """``policy(observation, key=None)``: (..., obs) -> (..., action), clipped.
+
+    A pure function for `jax.jit` and `jax.vmap`. Without a key the action is the
+    policy's mean, with one it is drawn; the key is consumed.
+
+    Args:
+      path: of the folder of a finished run, or of its ``policy.npz``.
+      seed: its number; default the one with the highest final return.
+
+    Raises:
+      ValueError: it is not a policy's file, or has no such seed.
+    """
+    arrays = jax.tree.map(jnp.asarray, numpy_policy.read(path, seed))
+
+    def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        action, log_std = numpy_policy.mean_and_log_std(arrays, observation, jnp)
+        if key is not None:
+            action += jnp.exp(log_std) * jax.random.normal(key, action.shape)
+        return jnp.clip(action, arrays["low"], arrays["high"])
+
+    return policy
