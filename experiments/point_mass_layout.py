@@ -3,8 +3,10 @@
 import pathlib
 
 import matplotlib
+import numpy as np
 
 from gasil_envs.point_mass import Layout
+from gasil_jax import plotting
 
 FIGURE = pathlib.Path(__file__).parent / "figures" / "point_mass_layout.png"
 
@@ -15,24 +17,11 @@ def draw(layout: Layout, path: pathlib.Path) -> None:
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(figsize=(4.0, 4.0), layout="constrained")
-    kinds = (
-        (layout.blue, "#0072B2", layout.blue_reward),
-        (layout.green, "#009E73", layout.green_reward),
-        (layout.orange, "#E69F00", layout.orange_reward),
-    )
-    for places, color, reward in kinds:
-        for x, y in places:
-            axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=0.6))
-            axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
-    (x, y), spread = layout.start, layout.start_spread
-    axes.add_patch(
-        plt.Rectangle((x - spread, y - spread), 2 * spread, 2 * spread, color="0.85")
-    )
+    count = len(layout.blue + layout.green + layout.orange)
+    plotting.point_mass_layout(axes, layout, np.zeros(count, bool))
+    (x, y) = layout.start
     axes.text(x, y, "start", ha="center", va="center", fontsize=9)
-    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")
-    path.parent.mkdir(exist_ok=True)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    plotting.save(figure, path, dpi=100)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from gasil_jax import checkpoint, logging
 from gasil_jax.batch import Batch
 from gasil_jax.interruption import Interrupted, Interruption
 from gasil_jax.progress import Progress
+from gasil_jax.trackers import Tracker, log
 
 # Time to a reaction to Ctrl-C, and between two updates of the display.
 _SECONDS_BETWEEN_LOOKS = 5.0
@@ -65,6 +66,7 @@ def drive(
     progress: Progress,
     interruption: Interruption,
     steps_before: int = 0,
+    trackers: Sequence[Tracker] = (),
 ) -> Outcome:
     """Train to the end, from the newest whole checkpoint in the folder if it has one.
 
@@ -76,6 +78,7 @@ def drive(
       progress: told what is going on.
       interruption: looked at after each chunk; a checkpoint is written then.
       steps_before: environment steps that `progress` has counted already.
+      trackers: given the metrics too, and closed.
 
     Raises:
       Interrupted: after the checkpoint that an interruption asks for.
@@ -125,6 +128,7 @@ def drive(
         pace = (time.monotonic() - looked) / count
         done += count
         writer.write(metrics)
+        log(trackers, labels, metrics)
         recent.append(metrics["episode_return"])
         progress.update(steps_before + steps_of(done), metrics["episode_return"])
         if schedule.every is None:
@@ -137,6 +141,8 @@ def drive(
     train_seconds = time.monotonic() - started
     save()
     writer.close()
+    for tracker in trackers:
+        tracker.close()
     if interruption.signal is not None and done < config.num_iterations:
         raise Interrupted(interruption.signal)
     return Outcome(

@@ -43,6 +43,28 @@ def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
     plt.close(figure)
 
 
+def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
+    """The point mass' box and objects; those that are `collected` (objects,) pale."""
+    import matplotlib.pyplot as plt
+
+    kinds = (
+        (layout.blue, "#0072B2", layout.blue_reward),
+        (layout.green, "#009E73", layout.green_reward),
+        (layout.orange, "#E69F00", layout.orange_reward),
+    )
+    objects = [(x, y, c, r) for places, c, r in kinds for x, y in places]
+    for (x, y, color, reward), taken in zip(objects, collected, strict=True):
+        alpha = 0.12 if taken else 0.6
+        axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=alpha))
+        axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
+    (x, y), spread = layout.start, layout.start_spread
+    corner = (x - spread, y - spread)
+    axes.add_patch(
+        plt.Rectangle(corner, 2 * spread, 2 * spread, color="0.85", zorder=0)
+    )
+    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")
+
+
 def learning_curve(
     path: pathlib.Path, env_steps: np.ndarray, episode_return: np.ndarray, title: str
 ) -> None:

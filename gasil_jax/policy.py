@@ -73,7 +73,16 @@ def load_policy(
     Raises:
       ValueError: it is not a policy's file, or has no such seed.
     """
-    arrays = jax.tree.map(jnp.asarray, numpy_policy.read(path, seed))
+    return _make(numpy_policy.read(path, seed))
+
+
+def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
+    """As `load_policy`, of one run's `TrainState`."""
+    return _make(weights(state, env))
+
+
+def _make(arrays: dict[str, np.ndarray]) -> Callable[..., jax.Array]:
+    arrays = jax.tree.map(jnp.asarray, arrays)
 
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         action, log_std = numpy_policy.mean_and_log_std(arrays, observation, jnp)

@@ -100,7 +100,7 @@ def check(
     while not folder.exists():
         folder = folder.parent
     wanted, free = num_checkpoints * num_members * one.state, _free_disk(folder)
-    if wanted > free:
+    if free is not None and wanted > free:
         raise ValueError(
             f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
             f"{num_checkpoints} checkpoints of {num_members} seeds need "
@@ -108,8 +108,10 @@ def check(
         )
 
 
-def _free_disk(folder: pathlib.Path) -> int:
-    return shutil.disk_usage(folder).free
+def _free_disk(folder: pathlib.Path) -> int | None:
+    usage = shutil.disk_usage(folder)
+    # A file system that is none, such as /proc, has no size.
+    return usage.free if usage.total else None
 
 
 def _in_words(number: int) -> str:

@@ -21,7 +21,7 @@ import jaxlib
 import numpy as np
 import tyro
 
-from gasil_jax import command_line, environments, presets, run_folder
+from gasil_jax import command_line, environments, presets, run_folder, trackers
 from gasil_jax import train as training
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, unknown, validate
@@ -35,8 +35,8 @@ class Options:
     """Train an agent on an environment, many seeds at once.
 
     Attributes:
-      env: environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
-        humanoid.
+      env: environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
+        humanoid, or brax: and the name of one of Brax's, brax:inverted_pendulum.
       seeds: how many seeds.
       first_seed: number of the first seed; a seed's result depends on its number
         alone.
@@ -47,6 +47,7 @@ class Options:
         ten minutes.
       keep_checkpoints: how many of the newest checkpoints are kept, besides the one
         with the best returns.
+      log: also to these, besides metrics.csv: tensorboard, wandb.
       preset: where the hyperparameters start from: tuned, by environment and agent,
         or paper; flags override it.
       devices: host devices that the seeds are sharded over; default the cores.
@@ -61,6 +62,7 @@ class Options:
     resume: bool = False
     checkpoint_every: int | None = None
     keep_checkpoints: int = 2
+    log: tuple[str, ...] = ()
     preset: str = "tuned"
     devices: int | None = None
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
@@ -127,6 +129,7 @@ def check(options: Options) -> None:
     try:
         environments.check(options.env, options.settings)
         validate(options.config, tuple(AGENTS))
+        trackers.check(options.log)
     except ValueError as error:
         raise InputError(str(error)) from None
     for name in ("seeds", "devices", "checkpoint_every", "keep_checkpoints"):
@@ -174,7 +177,7 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
       InputError: it is used, in use, or can't be written.
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{options.env}-{options.config.agent}-{stamp}"
+    name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
     folder = run_folder.create(options.out, name)
     with run_folder.lock(folder):
         if not (options.resume and run_folder.is_described(folder)):
@@ -206,7 +209,9 @@ def _keep_compiled_programs() -> None:
 
     By the version of jaxlib and the processor: a program for another one may crash.
     """
-    if jax.config.jax_compilation_cache_dir is not None:
+    # Before 0.12 XLA calls every program that it loads one for another processor.
+    quiet = jaxlib.version.__version_info__ >= (0, 12)
+    if jax.config.jax_compilation_cache_dir is not None or not quiet:
         return
     with contextlib.suppress(OSError):
         described = pathlib.Path("/proc/cpuinfo")
@@ -269,6 +274,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
             ),
             progress=progress,
             interruption=interruption,
+            trackers=trackers.make(options.log, folder, run_folder.flat(vars(options))),
         )
     metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), options.seeds)
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]

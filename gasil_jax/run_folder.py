@@ -125,6 +125,7 @@ def _as_tuples(value: Any) -> Any:
 
 #: What may differ between a run and its continuation.
 _FREE = ("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset")
+_FREE += ("log",)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -137,22 +138,22 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     Returns:
       "NAME was A, is B" for each.
     """
-    found = []
-    for name, old in _flat(before).items():
-        new = _flat(now).get(name)
+    found, asked = [], flat(now)
+    for name, old in flat(before).items():
+        new = asked.get(name)
         grown = name == "total_steps" and new is not None and new >= old
-        if old != new and not grown:
+        if old != new and not grown and name not in _FREE:
             found.append(f"{name} was {old}, is {new}")
     return found
 
 
-def _flat(described: Mapping[str, Any]) -> dict[str, Any]:
+def flat(described: Mapping[str, Any]) -> dict[str, Any]:
     """Every field by its own name, those in dataclasses too."""
-    flat = {}
+    fields = {}
     for name, value in described.items():
         if dataclasses.is_dataclass(value):
-            fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
-            flat |= _flat(fields)
-        elif name not in _FREE:
-            flat[name] = value
-    return flat
+            own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+            fields |= flat(own)
+        else:
+            fields[name] = value
+    return fields

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import run
+from gasil_jax import run, run_folder, trackers
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters, nearest
 
@@ -170,6 +170,9 @@ def sweep(
                 progress=progress,
                 interruption=interruption,
                 steps_before=steps_of(len(curves)),
+                trackers=trackers.make(
+                    options.log, place, run_folder.flat(vars(options))
+                ),
             )
             metrics = logging.read_metrics(
                 place / "metrics.csv", tuple(labels), runs.num_members

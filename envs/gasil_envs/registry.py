@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import brax.envs
 from brax.envs import Env
 
 from gasil_envs import locomotion, point_mass, wrappers
@@ -58,14 +59,26 @@ def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
     )
 
 
+#: Before the name of an environment of ``brax.envs``.
+BRAX = "brax:"
+_BRAX_EPISODE_LENGTH = 1000
+
+
 def names() -> tuple[str, ...]:
-    """The names that `make` takes."""
+    """The names of our own that `make` takes."""
     return tuple(_constructors())
 
 
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
-    _refuse_unknown("env", name, names())
+    if name.startswith(BRAX):
+        _refuse_unknown("env", name, [BRAX + known for known in brax.envs._envs])
+        for field in ("physics", "solver", "integrator"):
+            value = getattr(settings, field)
+            if value != getattr(Settings, field):
+                raise ValueError(f"{field} is {value!r}: {name} has its own")
+    else:
+        _refuse_unknown("env", name, names())
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
     _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
@@ -91,7 +104,7 @@ def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
-      name: one of `names()`.
+      name: one of `names()`, or "brax:" and a name of ``brax.envs``.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator.
 
@@ -100,8 +113,12 @@ def make(name: str, **settings: Any) -> Env:
     """
     chosen = Settings(**settings)
     check(name, chosen)
-    env = _constructors()[name](chosen)
-    env = wrappers.EpisodeLimit(env, env.episode_length)
+    if name.startswith(BRAX):
+        env = brax.envs.get_environment(name.removeprefix(BRAX))
+        env = wrappers.EpisodeLimit(env, _BRAX_EPISODE_LENGTH)
+    else:
+        env = _constructors()[name](chosen)
+        env = wrappers.EpisodeLimit(env, env.episode_length)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)
     if chosen.obs_noise > 0:

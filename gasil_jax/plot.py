@@ -1,0 +1,158 @@
+"""Figures of one or several runs: ``python -m gasil_jax.plot RUN [RUN ...]``."""
+
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import tyro
+
+from gasil_jax import command_line, logging, plotting, run_folder, statistics
+from gasil_jax.command_line import InputError
+
+#: Okabe and Ito's colours, which colour-blind readers tell apart.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+_STYLES = ("-", "--", "-.", ":")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Draw learning curves, final returns and performance profiles.
+
+    Attributes:
+      runs: folders; those of one environment and agent that differ in their seeds
+        alone are not joined.
+      out: the image, PNG, PDF or SVG.
+      labels: of the runs; default environment and agent.
+    """
+
+    runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    out: pathlib.Path = pathlib.Path("curves.png")
+    labels: tuple[str, ...] = ()
+
+
+class Curves(NamedTuple):
+    """One run.
+
+    Attributes:
+      label: in the legend.
+      env_steps: (points,).
+      returns: (seeds, points), each the mean of the episodes since the point before.
+      final: (seeds,), mean over the last tenth of training.
+    """
+
+    label: str
+    env_steps: np.ndarray
+    returns: np.ndarray
+    final: np.ndarray
+
+
+_POINTS = 50
+
+
+def read(folder: pathlib.Path, label: str | None = None) -> Curves:
+    """The returns of a run, finished or not.
+
+    Raises:
+      InputError: it is not a run's folder, or no episode has ended in it.
+    """
+    described = run_folder.read(folder)
+    path = folder / "metrics.csv"
+    try:
+        metrics = logging.read_metrics(path, ("seed",), described["seeds"])
+        steps, returns = metrics["env_steps"][0], metrics["episode_return"]
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise InputError(f"{path} has no curves to draw ({error})") from None
+    count = min(_POINTS, len(steps))
+    # The first of so many equal parts of training, and so on.
+    parts = np.array_split(np.arange(len(steps)), count)
+    mean = lambda x: np.array([row[np.isfinite(row)].mean() for row in x])
+    some = [p for p in parts if np.isfinite(returns[:, p]).any(axis=1).all()]
+    if not some:
+        raise InputError(f"{path}: not every seed has ended an episode")
+    last = returns[:, -max(1, len(steps) // 10) :]
+    if not np.isfinite(last).any(axis=1).all():
+        raise InputError(f"{path}: not every seed has ended an episode at the end")
+    default = f"{described['env']}, {described['config'].agent}"
+    return Curves(
+        label=label or default,
+        env_steps=np.array([steps[p[-1]] for p in some]),
+        returns=np.stack([mean(returns[:, p]) for p in some], axis=1),
+        final=mean(last),
+    )
+
+
+def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
+    """Write the figure: the interquartile mean over seeds, with 95% intervals.
+
+    Left, over environment steps; in the middle, of the final returns, with every seed;
+    right, the share of seeds above each final return.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, (curves, bars, profile) = plt.subplots(
+        1, 3, figsize=(13.0, 4.0), layout="constrained", width_ratios=(3, 2, 2)
+    )
+    every = np.concatenate([run.final for run in runs])
+    margin = 0.05 * (np.ptp(every) or 1.0)
+    levels = np.linspace(every.min() - margin, every.max() + margin, 200)
+    for number, run in enumerate(runs):
+        color = COLORS[number % len(COLORS)]
+        style = _STYLES[number // len(COLORS) % len(_STYLES)]
+        low, high = statistics.bootstrap_interval(run.returns)
+        middle = statistics.interquartile_mean(run.returns, axis=0)
+        curves.fill_between(run.env_steps, low, high, color=color, alpha=0.2, lw=0)
+        curves.plot(run.env_steps, middle, style, color=color, label=run.label)
+
+        low, high = statistics.bootstrap_interval(run.final)
+        middle = statistics.interquartile_mean(run.final)
+        bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
+        bars.plot([middle, middle], [number - 0.25, number + 0.25], color=color, lw=2)
+        bars.plot(run.final, [number] * len(run.final), "o", color="0.3", ms=3)
+
+        share = statistics.performance_profile(run.final, levels)
+        profile.plot(levels, share, style, color=color)
+    curves.set(xlabel="environment steps", ylabel="episode return")
+    curves.legend(frameon=False)
+    bars.set_yticks(range(len(runs)), [run.label for run in runs])
+    bars.invert_yaxis()
+    bars.set(xlabel="final return")
+    profile.set(xlabel="final return", ylabel="share of seeds above", ylim=(0, 1.03))
+    plotting.save(figure, path, dpi=150)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = command_line.parse(Options, arguments, "gasil_jax.plot")
+        labels = options.labels or (None,) * len(options.runs)
+        if not options.runs:
+            raise InputError("runs is empty: name one folder or more")
+        if len(labels) != len(options.runs):
+            raise InputError(f"labels are {len(labels)}: runs are {len(options.runs)}")
+        if options.out.suffix not in (".png", ".pdf", ".svg"):
+            raise InputError(f"out is {options.out}: it must end in .png, .pdf or .svg")
+        if options.out.exists():
+            raise InputError(f"out is {options.out}, which exists: name a new file")
+        runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    draw(runs, options.out)
+    print("run                             seeds  interquartile mean  95% interval")
+    for run in runs:
+        low, high = statistics.bootstrap_interval(run.final)
+        middle = statistics.interquartile_mean(run.final)
+        interval = f"{low:.1f} to {high:.1f}"
+        print(f"{run.label:30} {len(run.final):6} {middle:19.1f}  {interval}")
+    print(f"in {options.out}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,217 @@
+"""A film of a run's policy: ``python -m gasil_jax.render RUN --out walk.mp4``.
+
+Locomotion is drawn by MuJoCo off screen; the point mass as the path of some episodes.
+"""
+
+import dataclasses
+import os
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal
+
+# MuJoCo looks at it when it is imported; without a display EGL draws on a CPU too.
+if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+    os.environ.setdefault("MUJOCO_GL", "egl")
+
+import jax
+import numpy as np
+import tyro
+
+from gasil_jax import batch, command_line, evaluate, policy
+from gasil_jax.command_line import InputError
+
+_SUFFIXES = (".mp4", ".gif", ".png")
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Draw an episode of a run's policy.
+
+    Attributes:
+      run: the run's folder, of a finished run or not.
+      out: .mp4, which needs the package imageio-ffmpeg; .gif; or .png, a strip of
+        moments.
+      seed: whose policy; default the run's first.
+      checkpoint: which policies: last, or best by mean return in training.
+      steps: at most.
+      width: of a frame, pixels.
+      height: of a frame, pixels.
+      stochastic: draw actions from the policy instead of taking its mean.
+      key: of the episode's start and actions.
+    """
+
+    run: Annotated[pathlib.Path, tyro.conf.Positional]
+    out: pathlib.Path = pathlib.Path("episode.mp4")
+    seed: int | None = None
+    checkpoint: Literal["last", "best"] = "last"
+    steps: int = 1000
+    width: int = 480
+    height: int = 360
+    stochastic: bool = False
+    key: int = 0
+
+
+def episode(
+    env: Any, act: Any, key: jax.Array, num_steps: int
+) -> tuple[list[Any], float]:
+    """The physics states of an episode, from its start on, and its true return.
+
+    Args:
+      env: one environment.
+      act: (observation, key) -> action.
+      key: consumed.
+      num_steps: at most.
+    """
+    reset_key, key = jax.random.split(key)
+    state = jax.jit(env.reset)(reset_key)
+    step = jax.jit(lambda state, key: env.step(state, act(state.obs, key)))
+    states, total = [jax.device_get(state.pipeline_state)], 0.0
+    for step_key in jax.random.split(key, num_steps):
+        state = step(state, step_key)
+        states.append(jax.device_get(state.pipeline_state))
+        total += float(state.info.get("true_reward", state.reward))
+        if state.done > 0:
+            break
+    return states, total
+
+
+def locomotion_frames(
+    env: Any, states: Sequence[Any], size: tuple[int, int], fps: int = 25
+) -> tuple[list[np.ndarray], float]:
+    """Pictures (height, width, 3) uint8 of physics states, and frames a second.
+
+    Raises:
+      RuntimeError: no OpenGL can be had.
+    """
+    import mujoco
+
+    model = env.unwrapped.model
+    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
+    model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
+    every = max(1, round(1.0 / (fps * env.unwrapped.dt)))
+    data = mujoco.MjData(model)
+    camera = 0 if model.ncam else -1
+    try:
+        renderer = mujoco.Renderer(model, size[1], size[0])
+    # The GL library's own errors are of many types.
+    except Exception as error:
+        raise RuntimeError(
+            f"no OpenGL for MuJoCo to draw with ({error}): install libegl1 or "
+            "libosmesa6, and set MUJOCO_GL to egl or osmesa"
+        ) from None
+    frames = []
+    with renderer:
+        for state in states[::every]:
+            data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera)
+            frames.append(renderer.render().copy())
+    return frames, 1.0 / (every * env.unwrapped.dt)
+
+
+def point_mass_frames(
+    env: Any, states: Sequence[Any], size: tuple[int, int]
+) -> tuple[list[np.ndarray], float]:
+    """The path so far at each step, as pictures (height, width, 3) uint8."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from gasil_jax import plotting
+
+    places = np.stack([state.position for state in states])
+    figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    frames = []
+    for count in range(1, len(places) + 1):
+        axes.clear()
+        taken = states[count - 1].collected
+        plotting.point_mass_layout(axes, env.unwrapped.layout, taken)
+        axes.plot(*places[:count].T, color="0.3", linewidth=1)
+        axes.plot(*places[count - 1], "o", color="black", markersize=6)
+        axes.set(xticks=[], yticks=[])
+        figure.canvas.draw()
+        frames.append(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+    plt.close(figure)
+    return frames, 10.0
+
+
+def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
+    """Write frames as a film, or as a strip of eight of them.
+
+    Raises:
+      RuntimeError: a package is missing.
+    """
+    from PIL import Image
+
+    if path.suffix == ".mp4":
+        try:
+            import imageio_ffmpeg
+        except ImportError:
+            raise RuntimeError(
+                "an .mp4 needs the package imageio-ffmpeg (pip install "
+                '"gasil_jax[render]"); a .gif or .png needs nothing'
+            ) from None
+        height, width = frames[0].shape[:2]
+        writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps)
+        writer.send(None)
+        for frame in frames:
+            writer.send(np.ascontiguousarray(frame))
+        writer.close()
+    elif path.suffix == ".gif":
+        images = [Image.fromarray(frame) for frame in frames]
+        duration = 1000.0 / fps
+        images[0].save(
+            path, save_all=True, append_images=images[1:], duration=duration, loop=0
+        )
+    else:
+        chosen = np.linspace(0, len(frames) - 1, min(8, len(frames))).astype(int)
+        Image.fromarray(np.concatenate([frames[i] for i in chosen], axis=1)).save(path)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    try:
+        options = command_line.parse(Options, arguments, "gasil_jax.render")
+        if options.out.suffix not in _SUFFIXES:
+            raise InputError(
+                f"out is {options.out}: it must end in {', '.join(_SUFFIXES)}"
+            )
+        if options.out.exists():
+            raise InputError(f"out is {options.out}, which exists: name a new file")
+        for name in ("steps", "width", "height"):
+            if getattr(options, name) < 1:
+                value = getattr(options, name)
+                raise InputError(f"{name} is {value}: it must be 1 or more")
+        # A film's encoder takes no odd number of pixels.
+        size = (options.width + options.width % 2, options.height + options.height % 2)
+        env, _, seeds, states = evaluate.load(options.run, options.checkpoint)
+        seed = seeds[0] if options.seed is None else options.seed
+        if seed not in seeds:
+            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
+        if not hasattr(env.unwrapped, "model") and not hasattr(env.unwrapped, "layout"):
+            raise InputError("run is of an environment that can't be drawn")
+    except ValueError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    drawn = policy.from_state(batch.member(states, seeds.index(seed)), env)
+    act = drawn if options.stochastic else lambda observation, key: drawn(observation)
+    path, total = episode(env, act, jax.random.key(options.key), options.steps)
+    draw = locomotion_frames if hasattr(env.unwrapped, "model") else point_mass_frames
+    try:
+        frames, fps = draw(env, path, size)
+        write(frames, fps, options.out)
+    except (RuntimeError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print(
+        f"seed {seed}: return {total:.1f} in {len(path) - 1} steps, "
+        f"{len(frames)} frames in {options.out}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,119 @@
+"""Metrics for TensorBoard and Weights & Biases, beside metrics.csv.
+
+A tracker is given what metrics.csv is given: "mean/NAME" is a metric's mean over the
+members, "episode_return/LABEL" a member's own; steps are environment steps of a member.
+"""
+
+import importlib
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+
+class Tracker(Protocol):
+    """Where scalars go."""
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Take the scalars of one iteration."""
+
+    def close(self) -> None:
+        """Write what is left."""
+
+
+class _TensorBoard:
+    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+        import tensorboardX
+
+        self._writer = tensorboardX.SummaryWriter(str(folder / "tensorboard"))
+        self._writer.add_text("config", f"```\n{_as_text(config)}\n```")
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        for name, value in scalars.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _WeightsAndBiases:
+    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+        import wandb
+
+        # A run that goes on is the same run there; WANDB_MODE=offline needs no account.
+        self._run = wandb.init(
+            project="gasil_jax",
+            name=folder.name,
+            dir=str(folder),
+            id=f"{folder.name}-{config['first_seed']}",
+            resume="allow",
+            config=dict(config),
+        )
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        self._run.log(dict(scalars), step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _as_text(config: Mapping[str, Any]) -> str:
+    return "\n".join(f"{name}: {value}" for name, value in config.items())
+
+
+#: name -> (the package that it needs, what makes it).
+TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
+    "tensorboard": ("tensorboardX", _TensorBoard),
+    "wandb": ("wandb", _WeightsAndBiases),
+}
+
+
+def check(names: Sequence[str]) -> None:
+    """Raise `ValueError` for a tracker that is unknown or not installed."""
+    for name in names:
+        if name not in TRACKERS:
+            allowed = ", ".join(TRACKERS)
+            raise ValueError(f"log is {name!r}: it must be of {allowed}")
+        package = TRACKERS[name][0]
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            raise ValueError(
+                f"log is {name!r}: it needs the package {package} "
+                f'(pip install "gasil_jax[{name}]")'
+            ) from None
+
+
+def make(
+    names: Sequence[str], folder: pathlib.Path, config: Mapping[str, Any]
+) -> list[Tracker]:
+    """The trackers of a run.
+
+    Args:
+      names: of `TRACKERS`.
+      folder: of the run; its name is the run's.
+      config: what to show of the run, "first_seed" among it.
+    """
+    return [TRACKERS[name][1](folder, config) for name in names]
+
+
+def log(
+    trackers: Sequence[Tracker],
+    labels: Mapping[str, Sequence[Any]],
+    metrics: Mapping[str, np.ndarray],
+) -> None:
+    """Give a chunk of metrics, (members, iterations) each, to all trackers."""
+    members = list(zip(*labels.values(), strict=True))
+    for index, step in enumerate(metrics["env_steps"][0] if trackers else ()):
+        scalars = {}
+        for name, values in metrics.items():
+            column = values[:, index][np.isfinite(values[:, index])]
+            if column.size and name != "env_steps":
+                scalars[f"mean/{name}"] = float(column.mean())
+        for member, value in zip(members, metrics["episode_return"][:, index]):
+            if np.isfinite(value):
+                label = "-".join(map(str, member))
+                scalars[f"episode_return/{label}"] = float(value)
+        for tracker in trackers:
+            tracker.log(int(step), scalars)

@@ -1,0 +1,70 @@
+"""Metrics in TensorBoard and Weights & Biases."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from gasil_jax import run, trackers
+
+SMALL = (
+    *("--env", "point_mass", "--seeds", "2", "--first-seed", "3"),
+    *("--total-steps", "512", "--batch-steps", "128", "--num-envs", "4"),
+    *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
+    *("--discriminator-hidden-sizes", "8"),
+)
+
+
+def test_the_means_and_the_members_are_given():
+    taken = []
+
+    class Collector:
+        def log(self, step, scalars):
+            taken.append((step, dict(scalars)))
+
+    metrics = {
+        "env_steps": np.array([[10, 20], [10, 20]]),
+        "episode_return": np.array([[1.0, 2.0], [3.0, np.nan]]),
+        "entropy": np.array([[np.nan, 1.0], [np.nan, 2.0]]),
+    }
+    trackers.log([Collector()], {"point": [0, 1], "seed": [5, 5]}, metrics)
+    assert taken == [
+        (
+            10,
+            {"mean/episode_return": 2.0, "episode_return/0-5": 1.0}
+            | {"episode_return/1-5": 3.0},
+        ),
+        (
+            20,
+            {"mean/episode_return": 2.0, "mean/entropy": 1.5}
+            | {"episode_return/0-5": 2.0},
+        ),
+    ]
+
+
+def test_a_run_in_tensorboard(tmp_path):
+    pytest.importorskip("tensorboardX")
+    out = tmp_path / "out"
+    assert run.main([*SMALL, "--log", "tensorboard", "--out", str(out)]) == 0
+    (path,) = (out / "tensorboard").iterdir()
+    content = path.read_bytes()
+    assert content.count(b"mean/policy_loss") == 4
+    # Episodes of 50 steps end in every second iteration.
+    for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
+        assert content.count(name) == 2
+
+
+def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    out = tmp_path / "out"
+    assert run.main([*SMALL, "--log", "wandb", "--out", str(out)]) == 0
+    assert list(out.glob("wandb/offline-run-*/*.wandb"))
+
+
+def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
+    assert run.main([*SMALL, "--log", "tensorbord"]) == 2
+    assert "log is 'tensorbord': it must be of tensorboard" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert run.main([*SMALL, "--log", "wandb"]) == 2
+    assert 'pip install "gasil_jax[wandb]"' in capsys.readouterr().err
