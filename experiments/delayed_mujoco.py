@@ -21,12 +21,12 @@ STEPS = 1_000_000
 
 
 def train(env: str, folder: pathlib.Path) -> int:
-    """Run the sweep of one environment; returns the exit status."""
+    """Run the sweep of one environment, or go on with it; returns the exit status."""
     return sweep.main(
         [
             *("--env", env, "--agent", "ppo+gasil", "--reward-delay", "20"),
             *("--seeds", "10", "--total-steps", str(STEPS), "--out", str(folder)),
-            *("--grid", "alpha=" + ",".join(map(str, ALPHAS))),
+            *("--resume", "--grid", "alpha=" + ",".join(map(str, ALPHAS))),
         ]
     )
 

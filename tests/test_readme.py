@@ -1,0 +1,117 @@
+"""What the README tells people to type works."""
+
+import pathlib
+import re
+import shlex
+import sys
+
+import jax
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax import command_line, evaluate, plot, policy, render, run, sweep
+
+README = pathlib.Path(__file__).parent.parent / "README.md"
+TEXT = README.read_text()
+
+PROGRAMS = {
+    f"gasil_jax.{module.__name__.split('.')[-1]}": module
+    for module in (run, sweep, evaluate, plot, render)
+}
+
+
+def commands():
+    """Lines that start with $, those that end with a backslash joined."""
+    for block in re.findall(r"```console\n(.*?)```", TEXT, re.DOTALL):
+        for line in block.replace("\\\n", " ").splitlines():
+            if line.startswith("$ "):
+                yield line[2:]
+
+
+@pytest.mark.parametrize(
+    "line", [line for line in commands() if line.startswith("python -m gasil_jax")]
+)
+def test_a_command_is_understood(line):
+    _, _, program, *arguments = shlex.split(line, comments=True)
+    kind = PROGRAMS[program].Options
+    command_line.parse(kind, arguments, program)
+
+
+def test_options_in_the_table_exist():
+    fields = re.findall(r"^\| `(--[a-z-]+)", TEXT, re.MULTILINE)
+    assert len(fields) > 8
+    known = command_line.parse(run.Options, ["--env", "hopper"], "x")
+    names = {
+        name
+        for part in (known, known.settings, known.config, known.config.hyperparameters)
+        for name in vars(part)
+    }
+    for field in fields:
+        assert field[2:].replace("-", "_") in names, field
+
+
+def test_the_python_runs(tmp_path, monkeypatch):
+    """On the point mass, and for some thousand steps."""
+    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
+    assert len(blocks) >= 2
+    env = gasil_jax.make_env("point_mass")
+    config = gasil_jax.Config()
+    states = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))(
+        np.arange(4, dtype=np.uint32)
+    )
+    monkeypatch.chdir(tmp_path)
+    folder = pathlib.Path("runs", "hopper")
+    folder.mkdir(parents=True)
+    policy.save(folder / "policy.npz", states, env, range(4), np.zeros(4))
+    names = {"observation": np.zeros(env.observation_size, np.float32)}
+    for block in blocks:
+        small = block.replace('"walker2d"', '"point_mass"')
+        small = small.replace("1_000_000", "4096").replace("key(0), 10)", "key(0), 2)")
+        exec(compile(small, str(README), "exec"), names)
+    assert names["metrics"]["episode_return"].shape == (2, 2)
+    assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+
+
+def test_the_example_runs(tmp_path, monkeypatch, capsys):
+    import runpy
+
+    env = gasil_jax.make_env("hopper", physics="mujoco")
+    states = jax.vmap(
+        lambda seed: gasil_jax.init(env, gasil_jax.Config(), jax.random.key(seed))
+    )(np.arange(1, dtype=np.uint32))
+    policy.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
+    script = README.parent / "examples" / "gymnasium_rollout.py"
+    arguments = [str(script), str(tmp_path), "Hopper-v5", "--episodes", "2"]
+    monkeypatch.setattr(sys, "argv", arguments)
+    runpy.run_path(str(script), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
+
+
+def test_the_documented_agent_trains(monkeypatch):
+    from gasil_jax.imitation import AGENTS
+
+    text = (README.parent / "docs" / "extending.md").read_text()
+    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    names = {}
+    exec(block, names)
+    monkeypatch.setitem(AGENTS, "halved", names["HALVED"])
+    config = gasil_jax.Config(
+        agent="halved", total_steps=128, batch_steps=128, num_envs=4, num_epochs=1
+    )
+    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), config)
+    _, metrics = jax.jit(train)(jax.random.key(0))
+    assert np.isfinite(metrics["policy_loss"]).all()
+
+
+def test_the_documentation_builds(tmp_path):
+    pytest.importorskip("mkdocs")
+    import subprocess
+
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)]
+    result = subprocess.run(
+        command, cwd=README.parent, capture_output=True, text=True, timeout=200
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    assert "make_train" in (tmp_path / "api" / "index.html").read_text()
