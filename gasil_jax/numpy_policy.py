@@ -13,15 +13,18 @@ the last is followed by tanh; the output is the mean of a Gaussian.
 """
 
 import pathlib
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
+from gasil_jax import npz
+
 #: Normalized observations are clipped to plus and minus this.
 CLIP = 10.0
+
+_NEEDED = ("seeds", "final_return", "mean", "scale", "log_std", "low", "high")
+_NEEDED += ("kernel_0", "bias_0")
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
@@ -38,21 +41,14 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
     if path.is_dir():
         path = path / "policy.npz"
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-        seeds = arrays.pop("seeds").tolist()
-        returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
-        shared = {name: arrays.pop(name) for name in ("low", "high")}
-        needed = ("mean", "scale", "log_std", "kernel_0", "bias_0")
-        if missing := [name for name in needed if name not in arrays]:
-            raise KeyError(f"{missing[0]} is missing")
-    # A single array, a file cut off and one with wrong bits raise an error each.
-    except (
-        *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError),
-        *(zipfile.BadZipFile, zlib.error),
-    ) as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
-        raise ValueError(f"{path} is not a saved policy ({reason})") from None
+        arrays = npz.read(path)
+        if missing := [name for name in _NEEDED if name not in arrays]:
+            raise ValueError(f"{missing[0]} is missing")
+    except ValueError as error:
+        raise ValueError(f"{path} is not a saved policy ({error})") from None
+    seeds = arrays.pop("seeds").tolist()
+    returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
+    shared = {name: arrays.pop(name) for name in ("low", "high")}
     if seed is None:
         seed = seeds[int(np.argmax(returns))]
     if seed not in seeds:

@@ -109,10 +109,15 @@ def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
 
 def _begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
     """The folder of the run that is to go on, if there is one."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(
+        add_help=False, allow_abbrev=False, exit_on_error=False
+    )
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
-    given, _ = parser.parse_known_args(arguments)
+    try:
+        given, _ = parser.parse_known_args(arguments)
+    except argparse.ArgumentError:
+        return None  # refused where everything is parsed
     if not given.resume:
         return None
     if given.out is None:

@@ -27,10 +27,8 @@ def env_and_functions(name, physics="mjx"):
     return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
 
 
-@pytest.mark.parametrize("physics", locomotion.PHYSICS)
-@pytest.mark.parametrize("name", EACH_NAME)
-def test_reset_and_step_under_jit_and_vmap(name, physics):
-    env, reset, step = env_and_functions(name, physics)
+def check_reset_and_step(env, reset, step):
+    """Under jit and vmap: shapes, dtypes, starts that differ, finite numbers."""
     state = reset(jax.random.split(jax.random.key(0), BATCH))
     assert state.obs.shape == (BATCH, env.observation_size)
     assert len(np.unique(state.obs, axis=0)) == BATCH  # each start is its own
@@ -44,6 +42,10 @@ def test_reset_and_step_under_jit_and_vmap(name, physics):
     assert np.all(np.isfinite(following.obs)) and np.all(np.isfinite(following.reward))
     assert not np.any(following.done)
     assert not np.array_equal(state.obs, following.obs)
+
+
+def test_reset_and_step_of_the_point_mass():
+    check_reset_and_step(*env_and_functions("point_mass"))
 
 
 def gymnasium_transitions(name):
@@ -81,7 +83,9 @@ def gymnasium_transitions(name):
 @pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME[1:])
 def test_one_step_is_gymnasiums(name, physics):
-    env, _, step = env_and_functions(name, physics)
+    env, reset, step = env_and_functions(name, physics)
+    # Here, and not in a test of its own, so that a step is compiled once.
+    check_reset_and_step(env, reset, step)
     transitions = gymnasium_transitions(name)
     *before, action = (jnp.asarray(x, jnp.float32) for x in transitions[:5])
     observation, reward, terminated = transitions[5:]

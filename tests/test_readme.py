@@ -69,7 +69,8 @@ def test_the_python_runs(tmp_path, monkeypatch):
         small = block.replace('"walker2d"', '"point_mass"')
         small = small.replace("1_000_000", "4096").replace("key(0), 10)", "key(0), 2)")
         exec(compile(small, str(README), "exec"), names)
-    assert names["metrics"]["episode_return"].shape == (2, 2)
+    assert names["metrics"]["episode_return"].shape == (4, 2)  # alphas, iterations
+    assert names["state"].iteration.shape == (2,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
 
 

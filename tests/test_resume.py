@@ -302,3 +302,9 @@ def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
             ]
         )
     jax.tree.map(np.testing.assert_array_equal, *rest)
+    # It has trained all the while, with delay and noise and without a NaN.
+    metrics, _, leaves = rest[0]
+    assert metrics["skipped_updates"].sum() == 0
+    assert np.isfinite(metrics["policy_loss"]).all()
+    assert (metrics["good_steps"] == 100).all()
+    assert len(leaves) > 20

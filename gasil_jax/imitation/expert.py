@@ -2,10 +2,10 @@
 
 import functools
 import pathlib
-import zipfile
-import zlib
 
 import numpy as np
+
+from gasil_jax import npz
 
 _MINARI = "minari:"
 
@@ -44,17 +44,15 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
 
 def _load_file(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
     try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return arrays["observation"], arrays["action"]
-    # A single array, a file cut off and one with wrong bits raise an error each.
-    except (
-        *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError),
-        *(zipfile.BadZipFile, zlib.error),
-    ) as error:
+        arrays = npz.read(path)
+        if missing := [x for x in ("observation", "action") if x not in arrays]:
+            raise ValueError(f"{missing[0]} is missing")
+    except ValueError as error:
         raise ValueError(
             f"expert is {str(path)!r}: it must be an .npz file with arrays "
-            f"'observation' and 'action' ({_first_line(error)})"
+            f"'observation' and 'action' ({error})"
         ) from None
+    return arrays["observation"], arrays["action"]
 
 
 def _first_line(error: Exception) -> str:
