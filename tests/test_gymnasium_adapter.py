@@ -10,10 +10,6 @@ from gymnasium.vector import AutoresetMode
 import gasil_envs
 from gasil_envs import gymnasium_adapter
 
-# Installed, the names are there; from a bare checkout they are not.
-if "gasil_envs/point_mass" not in gymnasium.registry:
-    gymnasium_adapter.register()
-
 
 @pytest.mark.parametrize(
     ("name", "settings"),

@@ -1,10 +1,11 @@
 """Our environments under Gymnasium's interface, one alone or a batch of them.
 
+    import gasil_envs.gymnasium_adapter  # makes the names known
+
     gymnasium.make("gasil_envs/walker2d", reward_delay=20)
     gymnasium.make_vec("gasil_envs/walker2d", num_envs=64)
 
-Gymnasium finds the names where this package is installed. Physics runs under `jax.jit`;
-the batch is one `jax.vmap`.
+Physics runs under `jax.jit`; the batch is one `jax.vmap`.
 """
 
 from typing import Any
@@ -151,3 +152,8 @@ def register() -> None:
             vector_entry_point=f"{__name__}:GymnasiumVectorEnv",
             kwargs={"name": name},
         )
+
+
+# Not an entry point of the installed package: every program that imports Gymnasium
+# would load JAX.
+register()
