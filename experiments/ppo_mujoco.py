@@ -3,30 +3,17 @@
 Five seeds of 1M steps each; about 25 minutes on two CPU cores.
 """
 
-import csv
 import pathlib
 import sys
 
 import matplotlib
 import numpy as np
 
-from gasil_jax import plotting, run
+from gasil_jax import logging, plotting, run
 
 FIGURE = pathlib.Path(__file__).parent / "figures" / "ppo.png"
 ENVIRONMENTS = ("walker2d", "hopper", "halfcheetah")
-
-
-def read(folder: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    """Environment steps (iterations,) and returns (seeds, iterations) of a run."""
-    with (folder / "metrics.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    by_seed: dict[str, list[float]] = {}
-    for row in rows:
-        value = float(row["episode_return"] or "nan")
-        by_seed.setdefault(row["seed"], []).append(value)
-    first = rows[0]["seed"]
-    steps = [int(row["env_steps"]) for row in rows if row["seed"] == first]
-    return np.array(steps), np.array(list(by_seed.values()))
+SEEDS = 5
 
 
 def plot(folders: dict[str, pathlib.Path], path: pathlib.Path) -> None:
@@ -37,8 +24,9 @@ def plot(folders: dict[str, pathlib.Path], path: pathlib.Path) -> None:
     size = (10.0, 3.2)
     figure, panels = plt.subplots(1, len(folders), figsize=size, layout="constrained")
     for panel, (env, folder) in zip(panels, folders.items(), strict=True):
-        steps, returns = read(folder)
-        returns = plotting.smooth(returns, len(steps) // 50)
+        metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), SEEDS)
+        steps = metrics["env_steps"][0]
+        returns = plotting.smooth(metrics["episode_return"], len(steps) // 50)
         some = np.isfinite(returns).any(axis=0)
         steps, returns = steps[some] / 1e6, returns[:, some]
         for curve in returns:
@@ -54,7 +42,7 @@ def main() -> int:
     """Train what has not been trained yet, then plot."""
     folders = {env: pathlib.Path("runs", "ppo_mujoco", env) for env in ENVIRONMENTS}
     for env, folder in folders.items():
-        arguments = ["--env", env, "--agent", "ppo", "--seeds", "5"]
+        arguments = ["--env", env, "--agent", "ppo", "--seeds", str(SEEDS)]
         if not (folder / "summary.json").exists() and (
             status := run.main([*arguments, "--out", str(folder)])
         ):

@@ -200,25 +200,29 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 def best(root: pathlib.Path) -> Checkpoint | None:
     """The whole checkpoint with the highest "score" in its record, if one has any."""
-    scored = [folder for folder in _folders(root) if _score(folder) is not None]
-    for folder in sorted(scored, key=_score, reverse=True):
+    scores = _scores(_folders(root))
+    for folder in sorted(scores, key=scores.get, reverse=True):
         with contextlib.suppress(ValueError):
             return read(folder)
     return None
 
 
-def _score(folder: pathlib.Path) -> float | None:
-    try:
-        return json.loads((folder / _MANIFEST).read_text())["record"].get("score")
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
+    """The scores of those that have one."""
+    found = {}
+    for folder in folders:
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            score = json.loads((folder / _MANIFEST).read_text())["record"]["score"]
+            if score is not None:
+                found[folder] = score
+    return found
 
 
 def prune(root: pathlib.Path, keep: int) -> None:
     """Delete all but the newest `keep` and the best one."""
     folders = _folders(root)
-    scored = [folder for folder in folders if _score(folder) is not None]
-    kept = {*folders[-keep:], *([max(scored, key=_score)] if scored else [])}
+    scores = _scores(folders)
+    kept = {*folders[-keep:], *([max(scores, key=scores.get)] if scores else [])}
     for folder in folders:
         if folder not in kept:
             shutil.rmtree(folder)

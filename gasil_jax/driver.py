@@ -108,6 +108,7 @@ def drive(
     progress.phase("training", steps_before + steps_of(first))
     saved_at = started = time.monotonic()
     done, pace, recent = first, math.inf, []
+    every = schedule.every and math.ceil(schedule.every / config.batch_steps)
 
     def save() -> None:
         returns = np.concatenate(recent, axis=1) if recent else np.full((1, 1), np.nan)
@@ -119,8 +120,7 @@ def drive(
     while done < config.num_iterations and interruption.signal is None:
         counts = [runs.chunk, config.num_iterations - done]
         counts.append(max(1, int(_SECONDS_BETWEEN_LOOKS / pace)))
-        if schedule.every is not None:
-            every = math.ceil(schedule.every / config.batch_steps)
+        if every is not None:
             counts.append(every - done % every)
         count = min(counts)
         looked = time.monotonic()
@@ -131,7 +131,7 @@ def drive(
         log(trackers, labels, metrics)
         recent.append(metrics["episode_return"])
         progress.update(steps_before + steps_of(done), metrics["episode_return"])
-        if schedule.every is None:
+        if every is None:
             due = time.monotonic() - saved_at > _SECONDS_BETWEEN_CHECKPOINTS
         else:
             due = done % every == 0

@@ -84,7 +84,8 @@ def init(env: Any, key: jax.Array, num_envs: int) -> EnvironmentStates:
     )
 
 
-def _is_finite(tree: Any) -> jax.Array:
+def is_finite(tree: Any) -> jax.Array:
+    """Whether every number of every leaf is finite, bool ()."""
     leaves = jax.tree.leaves(tree)
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
@@ -129,7 +130,7 @@ def collect(
         reset_keys = jax.random.split(reset_key, num_envs)
         stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
 
-        finite = jax.vmap(_is_finite)((stepped.obs, stepped.reward))
+        finite = jax.vmap(is_finite)((stepped.obs, stepped.reward))
         length = carry.episode_length + 1
         reward = jnp.where(finite, stepped.reward, 0.0)
         true_reward = jnp.where(

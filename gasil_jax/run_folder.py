@@ -99,10 +99,10 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     path = folder / _CONFIG
     try:
         content = json.loads(path.read_text())
-        fields = dict(content["config"])
+        fields = _tuples_in(content["config"])
         fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
-        described = {name: _as_tuples(value) for name, value in content.items()}
-        described["config"] = Config(**_tuples_in(fields))
+        described = _tuples_in(content)
+        described["config"] = Config(**fields)
         described["settings"] = Settings(**content["settings"])
         for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
             if type(described[name]) is not kind:

@@ -103,11 +103,6 @@ def init(
     )
 
 
-def _is_finite(tree: Any) -> jax.Array:
-    floats = [x for x in jax.tree.leaves(tree) if jnp.issubdtype(x.dtype, jnp.floating)]
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in floats]))
-
-
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """One iteration of Algorithm 1: a batch of experience and the updates from it.
 
@@ -193,7 +188,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
 
     # An update that is not finite is as if it had not been.
     learned = (params, optimizer_state, imitation)
-    healthy = _is_finite(learned)
+    healthy = rollout.is_finite(learned)
     params, optimizer_state, imitation = jax.tree.map(
         lambda new, old: jnp.where(healthy, new, old),
         learned,

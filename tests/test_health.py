@@ -4,20 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import test_batch
 
 import gasil_jax
 from gasil_jax import batch, config, run
 
-SMALL = gasil_jax.Config(
-    total_steps=4 * 128,
-    num_envs=4,
-    batch_steps=128,
-    minibatch_size=32,
-    num_epochs=1,
-    hidden_sizes=(8,),
-    discriminator_hidden_sizes=(8,),
-    buffer_steps=300,
-)
+SMALL = test_batch.SMALL.replace(total_steps=4 * 128, buffer_steps=300)
 
 
 def as_arrays(tree):

@@ -14,6 +14,7 @@ import time
 import jax
 import numpy as np
 import pytest
+import test_batch
 
 import gasil_jax
 from gasil_jax import batch, checkpoint, run, run_folder
@@ -265,15 +266,9 @@ AGENTS = [name for name in gasil_jax.agents() if name != "gail"]
 def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
     """Three members on two devices: one is padding."""
     env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
-    config = gasil_jax.Config(
+    config = test_batch.SMALL.replace(
         agent=agent,
         total_steps=4 * 128,
-        num_envs=4,
-        batch_steps=128,
-        minibatch_size=32,
-        num_epochs=1,
-        hidden_sizes=(8,),
-        discriminator_hidden_sizes=(8,),
         buffer_steps=100,
         sil_buffer_steps=200,
         sil_minibatch_size=32,
