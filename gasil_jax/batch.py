@@ -42,6 +42,11 @@ class Batch:
     devices: Sequence[jax.Device]
     sharding: NamedSharding
 
+    @property
+    def device_kind(self) -> str:
+        """How many devices of which kind: "2 x cpu"."""
+        return f"{len(self.devices)} x {self.devices[0].device_kind}"
+
     def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
         """The states to start from, and `advance`, compiled.
 

@@ -76,21 +76,31 @@ class Options:
 T = TypeVar("T", bound=Options)
 
 
-def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
+def parse(
+    kind: type[T],
+    arguments: Sequence[str] | None,
+    program: str,
+    began: pathlib.Path | None = None,
+) -> T:
     """Options from the command line, on top of the preset that they name.
 
-    Where a run is to go on, on top of its own.
+    Args:
+      kind: what the options are.
+      arguments: default what the program was started with.
+      program: the module that was started.
+      began: folder of a run that is to go on; the options are on top of its own.
 
     Raises:
       InputError: a flag or value that is unknown, or that the run does not have.
     """
-    began = _begun_run(arguments)
     if began is not None:
         described = run_folder.read(began)
-        names = {field.name for field in dataclasses.fields(kind)}
-        if not names <= set(described):
+        fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
+        # One that is None by default may be newer than the run.
+        missing = {f.name for f in fields if f.default is not None} - set(described)
+        if missing:
             raise InputError(f"out is {began}, which another program has written")
-        before = kind(**{name: described[name] for name in names - {"out"}})
+        before = kind(**{f.name: described.get(f.name) for f in fields})
         options = command_line.parse(kind, arguments, program, before)
         changed = run_folder.differences(vars(before), vars(options))
         if changed:
@@ -107,8 +117,12 @@ def parse(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     return command_line.parse(kind, arguments, program, default)
 
 
-def _begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
-    """The folder of the run that is to go on, if there is one."""
+def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
+    """The folder of the run that --resume goes on with, if one has begun.
+
+    Raises:
+      InputError: --resume without --out.
+    """
     parser = argparse.ArgumentParser(
         add_help=False, allow_abbrev=False, exit_on_error=False
     )
@@ -311,7 +325,8 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
         "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
-        "device": f"{len(runs.devices)} x {runs.devices[0].device_kind}",
+        "device": runs.device_kind,
+        "device_count": len(runs.devices),
         "versions": logging.versions(),
     }
     logging.write_json(folder / "summary.json", summary)
@@ -353,7 +368,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = parse(Options, arguments, "gasil_jax.run")
+    options = parse(Options, arguments, "gasil_jax.run", begun_run(arguments))
     check(options)
     use_devices(options, options.seeds)
     env = make_env(options)
@@ -364,7 +379,8 @@ def _main(arguments: Sequence[str] | None) -> None:
     print(
         f"final return {'none ended' if mean is None else format(mean, '.1f')} "
         f"(mean over {options.seeds} seeds), "
-        f"{summary['env_steps_per_second']:,.0f} steps/s, in {folder}"
+        f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}, "
+        f"in {folder}"
     )
     if summary["unhealthy_seeds"]:
         print(

@@ -6,13 +6,14 @@ discriminator updates) are grouped, and each group compiles once.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
 curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png, and
-for each program a folder under programs/ with its metrics.csv and checkpoints.
+for each program a folder under programs/ with its metrics.csv and checkpoints. With
+--shard 3/8 an eighth of all points and seeds is trained in a folder of its own,
+shards/3-of-8, without the tables, which gasil_jax.merge makes of all shards.
 """
 
-import csv
+import argparse
 import dataclasses
 import itertools
-import math
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -20,12 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import run, run_folder, trackers
+from gasil_jax import launch, merge, run, run_folder, shards, sweep_tables, trackers
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters, nearest
+from gasil_jax.interruption import Interrupted, Interruption
+from gasil_jax.shards import Point, Program
 
-Point = Mapping[str, Any]
-
+_PROGRAM = "gasil_jax.sweep"
 _HYPERPARAMETERS = {f.name: float for f in dataclasses.fields(Hyperparameters)}
 _CONFIG = {
     f.name: int
@@ -51,10 +53,19 @@ class Options(run.Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
         ranges of the paper's appendix.
+      shard: train this part of all points and seeds alone, NUMBER/COUNT from 1/COUNT
+        on, in a folder below out; the same command again goes on with it. See
+        gasil_jax.merge.
+      launcher: train all shards and merge them: local, one process after another, or
+        ray, on its cluster.
+      shards: how many the launcher makes.
     """
 
     grid: tuple[str, ...] = ()
     random: int | None = None
+    shard: str | None = None
+    launcher: str | None = None
+    shards: int | None = None
 
 
 def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
@@ -108,145 +119,67 @@ def make_points(options: Options) -> list[dict[str, Any]]:
     return [dict(zip(values, every[i], strict=True)) for i in chosen]
 
 
-def group(config: Config, points: Sequence[Point]) -> dict[Config, list[int]]:
-    """Indices of points by the program that they share."""
-    groups: dict[Config, list[int]] = {}
-    for index, point in enumerate(points):
-        shared = config.updated(
-            {name: value for name, value in point.items() if name in _CONFIG}
-        )
-        groups.setdefault(shared, []).append(index)
-    return groups
-
-
-def sweep(
-    options: Options, env: Any, points: Sequence[Point], folder: pathlib.Path
-) -> Any:
-    """Train all points, log and save; returns the summary.
+def train(
+    options: Options,
+    env: Any,
+    points: Sequence[Point],
+    programs: Sequence[Program],
+    folder: pathlib.Path,
+) -> None:
+    """Train the programs one by one, log and save; those that are trained are left.
 
     Raises:
       Interrupted: by a signal.
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
-    from gasil_jax import batch, driver, logging
-    from gasil_jax.interruption import Interruption
+    from gasil_jax import batch, driver
     from gasil_jax.progress import Progress
 
     run.write_config(options, folder, points=points)
-    config, num_seeds = options.config, options.seeds
-    seeds = list(range(options.first_seed, options.first_seed + num_seeds))
-    steps_of = lambda points: (
-        config.num_iterations * config.batch_steps * num_seeds * points
+    steps_of = lambda program: (
+        program.config.num_iterations
+        * program.config.batch_steps
+        * len(program.members)
     )
     schedule = driver.Schedule(options.checkpoint_every, options.keep_checkpoints)
-    curves: dict[int, dict[str, np.ndarray]] = {}
-    title = f"{options.env} {config.agent} sweep"
+    steps_before = 0
+    title = f"{options.env} {options.config.agent} sweep"
     with (
         Interruption() as interruption,
-        Progress(title, steps_of(len(points))) as progress,
+        Progress(title, sum(map(steps_of, programs))) as progress,
     ):
-        for number, (shared, indices) in enumerate(group(config, points).items()):
-            hyperparameters = [
-                config.updated(points[i]).hyperparameters for i in indices
-            ]
-            runs = batch.make_batch(
-                env,
-                shared,
-                seeds * len(indices),
-                [floats for floats in hyperparameters for _ in seeds],
-            )
-            labels = {
-                "point": [index for index in indices for _ in seeds],
-                "seed": seeds * len(indices),
-            }
-            place = folder / "programs" / str(number)
-            place.mkdir(parents=True, exist_ok=True)
-            driver.drive(
-                runs,
-                place,
-                labels,
-                schedule=schedule,
-                progress=progress,
-                interruption=interruption,
-                steps_before=steps_of(len(curves)),
-                trackers=trackers.make(
-                    options.log, place, run_folder.flat(vars(options))
-                ),
-            )
-            metrics = logging.read_metrics(
-                place / "metrics.csv", tuple(labels), runs.num_members
-            )
-            for position, index in enumerate(indices):
-                mine = slice(position * num_seeds, (position + 1) * num_seeds)
-                curves[index] = {name: value[mine] for name, value in metrics.items()}
-
-    final = {i: run.final_returns(curves[i]["episode_return"]) for i in curves}
-    diverged = {i: (curves[i]["skipped_updates"] > 0).any(axis=1) for i in curves}
-    names = sorted({name for point in points for name in point})
-    with (folder / "results.csv").open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["point", "seed", *names, "final_return", "diverged"])
-        for index, point in enumerate(points):
-            for seed, value, bad in zip(seeds, final[index], diverged[index]):
-                cell = "" if math.isnan(value) else f"{value:.7g}"
-                row = [index, seed, *(point[name] for name in names), cell, int(bad)]
-                writer.writerow(row)
-    np.savez_compressed(
-        folder / "curves.npz",
-        **{
-            name: np.stack([curves[i][name] for i in range(len(points))])
-            for name in curves[0]
-        },
-    )
-    fine = [i for i in final if not diverged[i].any() and np.isfinite(final[i]).all()]
-    best = lambda score: max(fine, key=score) if fine else None
-    summary = {
-        "points": [
-            {
-                **point,
-                "mean": _finite(final[i].mean()),
-                "worst_seed": _finite(final[i].min()),
-                "diverged_seeds": int(diverged[i].sum()),
-            }
-            for i, point in enumerate(points)
-        ],
-        "best_by_mean": best(lambda i: final[i].mean()),
-        "best_by_worst_seed": best(lambda i: final[i].min()),
-        "versions": logging.versions(),
-    }
-    logging.write_json(folder / "summary.json", summary)
-    _plot(folder / "sweep.png", points, final)
-    return summary
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def _label(point: Point) -> str:
-    return ", ".join(f"{name}={value:g}" for name, value in point.items())
-
-
-def _plot(
-    path: pathlib.Path, points: Sequence[Point], final: Mapping[int, np.ndarray]
-) -> None:
-    """Every seed's final return and their mean, a row for each point."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    size = (8.0, 1.0 + 0.35 * len(points))
-    figure, axes = plt.subplots(figsize=size, layout="constrained")
-    for row in range(len(points)):
-        axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
-        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
-    axes.set_yticks(range(len(points)), [_label(point) for point in points])
-    axes.set(xlabel="final return (each seed; the bar is their mean)")
-    axes.invert_yaxis()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
+        for program in programs:
+            if sweep_tables.read_training(folder, program) is None:
+                indices, seeds = zip(*program.members)
+                floats = [
+                    options.config.updated(points[i]).hyperparameters for i in indices
+                ]
+                runs = batch.make_batch(env, program.config, seeds, floats)
+                place = program.folder(folder)
+                place.mkdir(parents=True, exist_ok=True)
+                outcome = driver.drive(
+                    runs,
+                    place,
+                    dict(zip(sweep_tables.LABELS, (indices, seeds))),
+                    schedule=schedule,
+                    progress=progress,
+                    interruption=interruption,
+                    steps_before=steps_before,
+                    trackers=trackers.make(
+                        options.log, place, run_folder.flat(vars(options))
+                    ),
+                )
+                sweep_tables.write_training(
+                    folder,
+                    program,
+                    env_steps=outcome.new_steps,
+                    compile_seconds=outcome.compile_seconds,
+                    train_seconds=outcome.train_seconds,
+                    device=runs.device_kind,
+                    device_count=len(runs.devices),
+                )
+            steps_before += steps_of(program)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -255,29 +188,130 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = run.parse(Options, arguments, "gasil_jax.sweep")
+    given, others = _placement(arguments)
+    if given.launcher is not None:
+        _launch(run.parse(Options, arguments, _PROGRAM), others)
+        return
+    if given.shard is None:
+        options = run.parse(Options, arguments, _PROGRAM, run.begun_run(arguments))
+    else:
+        options = _parse_shard(arguments, given)
+    points, programs = plan(options)
+    if options.shards is not None:
+        raise InputError(f"shards is {options.shards}: it is of --launcher")
+    if options.shard is None:
+        _train_whole(options, points, programs)
+    else:
+        _train_shard(options, points, programs)
+
+
+def _placement(
+    arguments: Sequence[str] | None,
+) -> tuple[argparse.Namespace, list[str]]:
+    """The options that say where training happens, and all other arguments."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    for name in ("--shard", "--launcher", "--shards", "--out"):
+        # Without its value it is refused where everything is parsed.
+        parser.add_argument(name, nargs="?")
+    return parser.parse_known_args(arguments)
+
+
+def _parse_shard(arguments: Sequence[str] | None, given: argparse.Namespace) -> Options:
+    """Options of a shard, on top of its own where it has begun."""
+    if given.out is None:
+        raise InputError("shard needs --out and the folder of the whole sweep")
+    whole = pathlib.Path(given.out)
+    shards.refuse_whole(whole)
+    folder = shards.parse(given.shard).folder(whole)
+    began = folder if run_folder.is_described(folder) else None
+    options = run.parse(Options, arguments, _PROGRAM, began)
+    return dataclasses.replace(options, out=folder, resume=True)
+
+
+def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
+    """All points and programs, checked.
+
+    Raises:
+      InputError: the value and what is allowed.
+    """
     run.check(options)
     points = make_points(options)
     for point in points:
         config = options.config.updated(point)
         run.check(dataclasses.replace(options, config=config))
-    run.use_devices(options, len(points) * options.seeds)
+    return points, shards.programs(options.config, points, _seeds(options))
+
+
+def _seeds(options: Options) -> range:
+    return range(options.first_seed, options.first_seed + options.seeds)
+
+
+def _prepare(options: Options, programs: Sequence[Program]) -> Any:
+    """What must be done before anything compiles; returns the environment."""
+    run.use_devices(options, sum(len(program.members) for program in programs))
     env = run.make_env(options)
-    for shared, indices in group(options.config, points).items():
-        run.check_resources(options, env, shared, len(indices) * options.seeds)
-    with run.open_folder(options, "gasil_jax.sweep") as folder:
-        summary = sweep(options, env, points, folder)
-    for title in ("best_by_mean", "best_by_worst_seed"):
-        best = summary[title]
-        if best is None:
-            print(f"{title}: none, every point has a seed that diverged or never ended")
-            continue
-        scores = summary["points"][best]
-        print(
-            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
-            f"worst seed {scores['worst_seed']:.1f})"
-        )
-    print(f"in {folder}")
+    for program in programs:
+        run.check_resources(options, env, program.config, len(program.members))
+    return env
+
+
+def _train_whole(
+    options: Options, points: Sequence[Point], programs: Sequence[Program]
+) -> None:
+    if options.out is not None and options.resume:
+        shards.refuse_sharded(options.out)
+    env = _prepare(options, programs)
+    with run.open_folder(options, _PROGRAM) as folder:
+        train(options, env, points, programs, folder)
+        trained = sweep_tables.Trained(folder, programs)
+        summary = sweep_tables.write(folder, points, _seeds(options), [trained])
+    print(*sweep_tables.report(points, summary), f"in {folder}", sep="\n")
+
+
+def _train_shard(
+    options: Options, points: Sequence[Point], programs: Sequence[Program]
+) -> None:
+    programs = shards.share(programs, shards.parse(options.shard))
+    trained = sweep_tables.Trained(options.out, programs)
+    if not trained.unfinished():
+        print(f"shard {options.shard} is done, in {options.out}")
+        return
+    env = _prepare(options, programs)
+    with run.open_folder(options, _PROGRAM) as folder:
+        train(options, env, points, programs, folder)
+    speed = sweep_tables.speed(trained.trainings())
+    print(
+        f"shard {options.shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
+        f"on {speed['device']}, in {folder}"
+    )
+
+
+def _launch(options: Options, others: Sequence[str]) -> None:
+    """Have the launcher run a command for each shard, and merge."""
+    launch.check(options.launcher)
+    if options.shard is not None:
+        raise InputError(f"shard is {options.shard}: --launcher trains all of them")
+    if options.shards is None or options.shards < 1:
+        raise InputError(f"shards is {options.shards}: --launcher needs 1 or more")
+    if options.out is None:
+        raise InputError("launcher needs --out and a folder that all hosts share")
+    points, programs = plan(options)
+    every = [
+        shards.Shard(number, options.shards) for number in range(1, options.shards + 1)
+    ]
+    shards.share(programs, every[-1])
+    shards.refuse_whole(options.out)
+    where = ["--out", str(options.out.absolute())]
+    jobs = {
+        f"shard {shard}": [*others, *where, "--shard", str(shard)] for shard in every
+    }
+    try:
+        launch.LAUNCHERS[options.launcher](_PROGRAM, jobs, options.devices)
+    except Interrupted as interrupted:
+        interrupted.add_note("go on with the same command")
+        raise
+    summary = merge.merge([options.out], options.out)
+    print(*sweep_tables.report(points, summary), f"in {options.out}", sep="\n")
 
 
 if __name__ == "__main__":

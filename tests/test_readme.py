@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import command_line, evaluate, plot, policy, render, run, sweep
+from gasil_jax import command_line, evaluate, merge, plot, policy, render, run, sweep
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
+SCALING = (README.parent / "docs" / "scaling.md").read_text()
 
 PROGRAMS = {
     f"gasil_jax.{module.__name__.split('.')[-1]}": module
-    for module in (run, sweep, evaluate, plot, render)
+    for module in (run, sweep, merge, evaluate, plot, render)
 }
 
 
 def commands():
     """Lines that start with $, those that end with a backslash joined."""
-    for block in re.findall(r"```console\n(.*?)```", TEXT, re.DOTALL):
+    for block in re.findall(r"```console\n(.*?)```", TEXT + SCALING, re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
                 yield line[2:]

@@ -6,11 +6,12 @@ import signal
 import subprocess
 import sys
 
+import jax
 import numpy as np
 import pytest
 from test_resume import finish, wait_for
 
-from gasil_jax import command_line, run, sweep
+from gasil_jax import command_line, merge, run, shards, sweep
 from gasil_jax.config import Config
 
 SMALL = (
@@ -34,8 +35,12 @@ def test_a_grid_is_every_combination():
         {"alpha": 1.0, "discriminator_updates": 1},
         {"alpha": 1.0, "discriminator_updates": 5},
     ]
-    groups = sweep.group(Config(), points)
-    assert sorted(groups.values()) == [[0, 2], [1, 3]]
+    programs = shards.programs(Config(), points, [7, 8])
+    assert [program.members for program in programs] == [
+        ((0, 7), (0, 8), (2, 7), (2, 8)),
+        ((1, 7), (1, 8), (3, 7), (3, 8)),
+    ]
+    assert [p.config.discriminator_updates for p in programs] == [1, 5]
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges():
@@ -56,6 +61,15 @@ def test_random_points_are_distinct_and_of_the_papers_ranges():
         ("--grid minibatch_size=64,60", "minibatch_size is 60"),
         ("--random 0", "random is 0"),
         ("", "grid is empty"),
+        ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
+        ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
+        ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
+        ("--grid alpha=1 --shard 1/1", "shard needs --out"),
+        ("--grid alpha=1 --shards 3", "shards is 3: it is of --launcher"),
+        ("--grid alpha=1 --launcher rya", "did you mean 'ray'"),
+        ("--grid alpha=1 --launcher local --out x", "shards is None"),
+        ("--grid alpha=1 --launcher local --shards 1", "launcher needs --out"),
+        ("--grid alpha=1 --launcher local --shards 2 --out x", "make 1 shards"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
@@ -93,6 +107,33 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
     assert all(curves[name].shape == (4, 2, 2) for name in curves)
+    assert summary["env_steps_per_second"] > 0
+    assert summary["device_count"] == jax.local_device_count()
+
+    # A half of the points has a program for itself, of the same shapes.
+    parts = tmp_path / "parts"
+    part = lambda number: sweep.main(
+        [*SMALL, "--seeds", "2", *grid, "--out", str(parts), "--shard", f"{number}/2"]
+    )
+    assert part(2) == 0
+    assert merge.main([str(parts)]) == 2
+    assert "missing: shards 1/2" in capsys.readouterr().err
+    assert part(1) == 0
+    before = {p: p.stat().st_mtime_ns for p in parts.rglob("*")}
+    assert part(1) == 0
+    assert "shard 1/2 is done" in capsys.readouterr().out
+    assert {p: p.stat().st_mtime_ns for p in parts.rglob("*")} == before
+    assert merge.main([str(parts)]) == 0
+    assert (parts / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
+    merged = np.load(parts / "curves.npz")
+    assert set(merged) == set(curves)
+    for name in curves:
+        np.testing.assert_array_equal(merged[name], curves[name])
+    merged = json.loads((parts / "summary.json").read_text())
+    assert set(merged) == set(summary)
+    for name in ("points", "best_by_mean", "best_by_worst_seed", "versions", "device"):
+        assert merged[name] == summary[name]
+    assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path):

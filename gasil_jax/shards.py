@@ -1,0 +1,143 @@
+"""How a sweep is cut: into programs that compile once, and into shards that run apart.
+
+A member is a point with a seed. The members of a program differ in `Hyperparameters`
+alone. A shard is one of n near-equal parts of all members, which are taken program by
+program, so that a shard compiles as few programs as may be.
+"""
+
+import dataclasses
+import pathlib
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from gasil_jax import run_folder
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters
+
+Point = Mapping[str, Any]
+
+_FLOATS = {field.name for field in dataclasses.fields(Hyperparameters)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What one compiled program trains.
+
+    Attributes:
+      number: among the programs of the whole sweep; names its folder.
+      config: that its members share.
+      members: (index of the point, absolute seed number) of each.
+    """
+
+    number: int
+    config: Config
+    members: tuple[tuple[int, int], ...]
+
+    def folder(self, sweep: pathlib.Path) -> pathlib.Path:
+        """Where it is in the folder of a sweep or shard."""
+        return sweep / "programs" / str(self.number)
+
+
+def programs(
+    config: Config, points: Sequence[Point], seeds: Sequence[int]
+) -> list[Program]:
+    """The programs of a sweep, all points with all seeds.
+
+    Args:
+      config: what the points are changes of.
+      points: hyperparameters and fields of `Config` by name.
+      seeds: absolute seed numbers.
+    """
+    groups: dict[Config, list[int]] = {}
+    for index, point in enumerate(points):
+        fields = {name: x for name, x in point.items() if name not in _FLOATS}
+        groups.setdefault(config.updated(fields), []).append(index)
+    return [
+        Program(number, shared, tuple((i, seed) for i in indices for seed in seeds))
+        for number, (shared, indices) in enumerate(groups.items())
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Shard:
+    """One of several parts of a sweep.
+
+    Attributes:
+      number: which, from 1 on.
+      count: how many there are.
+    """
+
+    number: int
+    count: int
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def folder(self, sweep: pathlib.Path) -> pathlib.Path:
+        """Where it is in the folder of its sweep: the same on every host."""
+        return root(sweep) / f"{self.number}-of-{self.count}"
+
+
+def root(sweep: pathlib.Path) -> pathlib.Path:
+    """The folder that holds the shards of a sweep."""
+    return sweep / "shards"
+
+
+def refuse_whole(out: pathlib.Path) -> None:
+    """Raise `InputError` if a run or sweep that is not in shards is in the folder."""
+    if run_folder.is_described(out) and not root(out).is_dir():
+        raise InputError(
+            f"out is {out}, which holds a run that is not in shards: name another "
+            "folder"
+        )
+
+
+def refuse_sharded(out: pathlib.Path) -> None:
+    """Raise `InputError` if a sweep in shards is in the folder."""
+    if root(out).is_dir():
+        raise InputError(
+            f"out is {out}, which holds shards: go on with each of them with --shard, "
+            "and then python -m gasil_jax.merge"
+        )
+
+
+def parse(text: str) -> Shard:
+    """From "3/8".
+
+    Raises:
+      InputError: it is no such thing.
+    """
+    found = re.fullmatch(r"([1-9][0-9]*)/([1-9][0-9]*)", text, re.ASCII)
+    shard = Shard(*map(int, found.groups())) if found else None
+    if shard is None or shard.number > shard.count:
+        raise InputError(
+            f"shard is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
+        )
+    return shard
+
+
+def share(whole: Sequence[Program], shard: Shard) -> list[Program]:
+    """The part of the programs that a shard trains, in order.
+
+    Shards differ by one member at most, and together hold each member once.
+
+    Raises:
+      InputError: there are more shards than members.
+    """
+    total = sum(len(program.members) for program in whole)
+    if shard.count > total:
+        raise InputError(
+            f"shard is {shard}: {total} members (points x seeds) make {total} shards "
+            "at most"
+        )
+    first = (shard.number - 1) * total // shard.count
+    last = shard.number * total // shard.count
+    mine, before = [], 0
+    for program in whole:
+        size = len(program.members)
+        members = program.members[max(0, first - before) : max(0, last - before)]
+        if members:
+            mine.append(dataclasses.replace(program, members=members))
+        before += size
+    return mine

@@ -1,0 +1,256 @@
+"""What a sweep comes to: from its programs' folders to results.csv and the others.
+
+A program's folder holds metrics.csv, a row for each member and iteration, and, once it
+is trained, training.json. Whether one process trained all programs or shards did on
+many hosts, the tables are made here, from those files alone.
+"""
+
+import csv
+import dataclasses
+import json
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax import logging
+from gasil_jax.command_line import InputError
+from gasil_jax.run import final_returns
+from gasil_jax.shards import Point, Program
+
+#: What metrics.csv calls the members.
+LABELS = ("point", "seed")
+_TRAINING = "training.json"
+
+Member = tuple[int, int]
+
+
+def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> None:
+    """Note that a program is trained to its end.
+
+    Args:
+      folder: of the sweep or shard.
+      program: which one.
+      **measured: "env_steps" (over all members), "compile_seconds" and "train_seconds",
+        all of the process that ended it; "device" and "device_count".
+    """
+    iterations = program.config.num_iterations
+    content = {"iterations": iterations, "members": len(program.members), **measured}
+    content["versions"] = logging.versions()
+    logging.write_json(program.folder(folder) / _TRAINING, content)
+
+
+def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
+    """What `write_training` wrote; None if the program is not trained to its end.
+
+    Args:
+      folder: of the sweep or shard.
+      program: which one; its config says where the end is.
+    """
+    try:
+        content = json.loads((program.folder(folder) / _TRAINING).read_text())
+        ended = content["iterations"] == program.config.num_iterations
+        same = content["members"] == len(program.members)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content if ended and same else None
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A folder and the programs that are trained in it: a whole sweep or a shard.
+
+    Attributes:
+      folder: of the sweep or shard.
+      programs: with the members that are trained there.
+    """
+
+    folder: pathlib.Path
+    programs: Sequence[Program]
+
+    def unfinished(self) -> list[int]:
+        """Numbers of the programs that are not trained to their end."""
+        return [
+            program.number
+            for program in self.programs
+            if read_training(self.folder, program) is None
+        ]
+
+    def trainings(self) -> list[dict[str, Any]]:
+        """What `read_training` reads, of each program; they must be finished."""
+        return [read_training(self.folder, program) for program in self.programs]
+
+    def members(self) -> dict[Member, dict[str, np.ndarray]]:
+        """Every metric of every member, (iterations,) each; NaN where there is none.
+
+        Raises:
+          InputError: metrics.csv is not what training has written.
+        """
+        found = {}
+        for program in self.programs:
+            path = program.folder(self.folder) / "metrics.csv"
+            try:
+                metrics = logging.read_metrics(path, LABELS, len(program.members))
+                whole = len(metrics["env_steps"][0]) == program.config.num_iterations
+            except (OSError, ValueError, KeyError, IndexError) as error:
+                raise InputError(f"{path} is damaged: {error}") from None
+            if not whole:
+                raise InputError(f"{path} is damaged: it lacks iterations")
+            for position, member in enumerate(program.members):
+                found[member] = {name: x[position] for name, x in metrics.items()}
+        return found
+
+
+def write(
+    folder: pathlib.Path,
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    parts: Sequence[Trained],
+) -> dict[str, Any]:
+    """Write results.csv, curves.npz, summary.json and sweep.png; returns the summary.
+
+    Args:
+      folder: where to.
+      points: all of them.
+      seeds: absolute seed numbers.
+      parts: finished, every point with every seed in one of them.
+    """
+    members: dict[Member, dict[str, np.ndarray]] = {}
+    for part in parts:
+        members |= part.members()
+    curves = _curves(points, seeds, members)
+    final = np.array(
+        [
+            final_returns(
+                np.stack([members[i, seed]["episode_return"] for seed in seeds])
+            )
+            for i in range(len(points))
+        ]
+    )
+    diverged = (curves["skipped_updates"] > 0).any(axis=2)
+    names = sorted({name for point in points for name in point})
+    with (folder / "results.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*LABELS, *names, "final_return", "diverged"])
+        for index, point in enumerate(points):
+            for seed, value, bad in zip(seeds, final[index], diverged[index]):
+                cell = "" if math.isnan(value) else f"{value:.7g}"
+                row = [index, seed, *(point[name] for name in names), cell, int(bad)]
+                writer.writerow(row)
+    np.savez_compressed(folder / "curves.npz", **curves)
+    trainings = [training for part in parts for training in part.trainings()]
+    fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
+    best = lambda scores: int(fine[scores[fine].argmax()]) if fine.size else None
+    summary = {
+        "points": [
+            {
+                **point,
+                "mean": _finite(final[i].mean()),
+                "worst_seed": _finite(final[i].min()),
+                "diverged_seeds": int(diverged[i].sum()),
+            }
+            for i, point in enumerate(points)
+        ],
+        "best_by_mean": best(final.mean(axis=1)),
+        "best_by_worst_seed": best(final.min(axis=1)),
+        **speed(trainings),
+        "versions": _joined([training["versions"] for training in trainings]),
+    }
+    logging.write_json(folder / "summary.json", summary)
+    _plot(folder / "sweep.png", points, final)
+    return summary
+
+
+def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Seconds, steps/s and devices of programs that were trained one by one.
+
+    Of shards, which run side by side, "env_steps_per_second" is one shard's on average.
+    """
+    total = lambda name: sum(training[name] for training in trainings)
+    devices = _joined([{"device": training["device"]} for training in trainings])
+    return {
+        "compile_seconds": total("compile_seconds"),
+        "train_seconds": total("train_seconds"),
+        "env_steps_per_second": total("env_steps") / max(total("train_seconds"), 1e-9),
+        **devices,
+        "device_count": max(training["device_count"] for training in trainings),
+    }
+
+
+def _joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The values of all records; where they differ, all of them in one string."""
+    every = {name: {record.get(name) for record in records} for name in records[0]}
+    return {
+        name: values.pop() if len(values) == 1 else ", ".join(sorted(map(str, values)))
+        for name, values in every.items()
+    }
+
+
+def _curves(
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    members: Mapping[Member, Mapping[str, np.ndarray]],
+) -> dict[str, np.ndarray]:
+    """Every metric, (points, seeds, iterations)."""
+    # Points may differ in batch_steps, and so in iterations.
+    length = max(len(metrics["env_steps"]) for metrics in members.values())
+    pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
+    return {
+        name: np.array(
+            [
+                [pad(members[i, seed][name]) for seed in seeds]
+                for i in range(len(points))
+            ]
+        )
+        for name in members[0, seeds[0]]
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
+    """Lines that say how fast it was and which points are best."""
+    lines = [
+        f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}"
+        f" ({summary['train_seconds']:,.0f} s of training)"
+    ]
+    for title in ("best_by_mean", "best_by_worst_seed"):
+        best = summary[title]
+        if best is None:
+            lines.append(
+                f"{title}: none, every point has a seed that diverged or never ended"
+            )
+            continue
+        scores = summary["points"][best]
+        lines.append(
+            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
+            f"worst seed {scores['worst_seed']:.1f})"
+        )
+    return lines
+
+
+def _label(point: Point) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+
+
+def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> None:
+    """Every seed's final return and their mean, a row for each point."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    size = (8.0, 1.0 + 0.35 * len(points))
+    figure, axes = plt.subplots(figsize=size, layout="constrained")
+    for row in range(len(points)):
+        axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
+        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
+    axes.set_yticks(range(len(points)), [_label(point) for point in points])
+    axes.set(xlabel="final return (each seed; the bar is their mean)")
+    axes.invert_yaxis()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

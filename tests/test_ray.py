@@ -1,0 +1,90 @@
+"""A sweep on a Ray cluster: a worker is killed in the middle, and nothing is lost.
+
+Half a minute, and Ray, which is no part of the tests' own extra:
+pip install "gasil_jax[ray]".
+"""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+from test_resume import finish
+from test_sweep import SMALL
+
+from gasil_jax import sweep
+
+ray = pytest.importorskip("ray")
+
+LONG = (*SMALL, "--total-steps", str(300 * 256), "--seeds", "2", "--devices", "1")
+LONG += ("--checkpoint-every", str(20 * 256))
+# Two programs: a shard has one of them, as the whole sweep has.
+GRID = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
+
+
+@pytest.fixture
+def cluster():
+    ray.init(num_cpus=2, num_gpus=0, include_dashboard=False)
+    yield
+    ray.shutdown()
+
+
+def process_of(folder):
+    """Of the shard that is trained in a folder."""
+    return int(re.match(r"process (\d+)", (folder / ".lock").read_text()).group(1))
+
+
+def test_a_killed_workers_shard_goes_on_from_its_checkpoint(cluster, tmp_path):
+    out = tmp_path / "out"
+    shard = out / "shards" / "2-of-2"
+    killed = []
+
+    def kill():
+        root = shard / "programs" / "1" / "checkpoints"
+        while not any(path.name.isdecimal() for path in root.glob("*")):
+            time.sleep(0.01)
+        killed.append(process_of(shard))
+        os.kill(killed[0], signal.SIGKILL)
+
+    thread = threading.Thread(target=kill, daemon=True)
+    thread.start()
+    arguments = [*LONG, *GRID, "--launcher", "ray", "--shards", "2"]
+    assert sweep.main([*arguments, "--out", str(out)]) == 0
+    assert len(killed) == 1 and process_of(shard) != killed[0]
+    first = process_of(out / "shards" / "1-of-2")
+    assert first not in (os.getpid(), killed[0], process_of(shard))
+
+    whole = tmp_path / "whole"
+    command = [sys.executable, "-m", "gasil_jax.sweep", *LONG, *GRID]
+    child = subprocess.Popen(
+        [*command, "--out", str(whole)], stderr=subprocess.PIPE, text=True
+    )
+    status, _, err = finish(child)
+    assert status == 0, err
+    assert (out / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+    curves = [np.load(folder / "curves.npz") for folder in (out, whole)]
+    assert set(curves[0]) == set(curves[1])
+    for name in curves[0]:
+        np.testing.assert_array_equal(curves[0][name], curves[1][name])
+    # What it had done before it was killed was not done again.
+    beside = list((shard / "programs" / "1").glob("metrics-cut-*.csv"))
+    assert len(beside) <= 1
+    arguments[arguments.index("ray")] = "local"
+    before = {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")}
+    assert sweep.main([*arguments, "--out", str(out)]) == 0
+    assert {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")} == before
+
+
+def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
+    """The disk is full: its folder can't be made."""
+    out = tmp_path / "out"
+    (out / "shards").mkdir(parents=True)
+    (out / "shards" / "1-of-1").touch()
+    arguments = [*SMALL, "--grid", "alpha=1", "--launcher", "ray", "--shards", "1"]
+    assert sweep.main([*arguments, "--out", str(out)]) == 1
+    assert "shard 1/1 (status 2) failed" in capsys.readouterr().err
