@@ -155,9 +155,9 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
             )
         # JAX takes its devices once in a process, so each job has a process; and it
         # dies with the job's, so that nothing holds the folder when it runs again.
-        task = ray.remote(_run_module).options(
+        task = ray.remote(
             max_calls=1, max_retries=RETRIES, retry_exceptions=[_Unfinished], **needs
-        )
+        )(_run_module)
         names = {
             task.options(name=name).remote(program, list(arguments)): name
             for name, arguments in jobs.items()
