@@ -30,6 +30,8 @@ class Batch:
       init: () -> states, (padded, ...) each leaf.
       advance: (states, num_iterations) -> states, metrics (padded, chunk), of which
         the first `num_iterations` are written. Takes the states' memory.
+      init_members: what `init` does, for other members of the same number.
+      compiled: `advance`, compiled for such states; compiles once.
       devices: what the members are sharded over.
       sharding: of the states.
     """
@@ -39,6 +41,8 @@ class Batch:
     chunk: int
     init: Callable[[], Any]
     advance: Callable[[Any, Any], Any]
+    init_members: Callable[[Sequence[int], Sequence[Hyperparameters]], Any]
+    compiled: Callable[[Any], Callable[[Any, Any], Any]]
     devices: Sequence[jax.Device]
     sharding: NamedSharding
 
@@ -55,7 +59,14 @@ class Batch:
         """
         states = self.init() if states is None else self.place(states)
         states = jax.block_until_ready(states)
-        return states, self.advance.lower(states, np.int32(0)).compile()
+        return states, self.compiled(states)
+
+    def of(
+        self, seeds: Sequence[int], hyperparameters: Sequence[Hyperparameters]
+    ) -> "Batch":
+        """Other members, as many, for the same compiled program."""
+        init = lambda: self.init_members(seeds, hyperparameters)
+        return dataclasses.replace(self, init=init)
 
     def train(
         self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
@@ -127,7 +138,7 @@ def make_batch(
     devices = list(devices or jax.devices())[: len(seeds)]
     padding = -len(seeds) % len(devices)
     pad = lambda values: [*values, *([values[-1]] * padding)]
-    members = (
+    arrays = lambda seeds, hyperparameters: (
         np.array(pad(seeds), np.uint32),
         jax.tree.map(lambda *x: np.array(x, np.float32), *pad(hyperparameters)),
     )
@@ -164,12 +175,23 @@ def make_batch(
     init = jax.jit(
         shard(jax.vmap(init_one), (spec,)), in_shardings=NamedSharding(mesh, spec)
     )
+    init_members = lambda seeds, hyperparameters: init(arrays(seeds, hyperparameters))
+    jitted = jax.jit(shard(advance, (spec, P())), donate_argnums=0)
+    programs: list[Callable[[Any, Any], Any]] = []
+
+    def compiled(states: Any) -> Callable[[Any, Any], Any]:
+        if not programs:
+            programs.append(jitted.lower(states, np.int32(0)).compile())
+        return programs[0]
+
     return Batch(
         num_members=len(seeds),
         config=config,
         chunk=chunk,
-        init=lambda: init(members),
-        advance=jax.jit(shard(advance, (spec, P())), donate_argnums=0),
+        init=lambda: init_members(seeds, hyperparameters),
+        advance=jitted,
+        init_members=init_members,
+        compiled=compiled,
         devices=devices,
         sharding=NamedSharding(mesh, spec),
     )

@@ -67,6 +67,7 @@ def drive(
     interruption: Interruption,
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
+    until: int | None = None,
 ) -> Outcome:
     """Train to the end, from the newest whole checkpoint in the folder if it has one.
 
@@ -79,6 +80,7 @@ def drive(
       interruption: looked at after each chunk; a checkpoint is written then.
       steps_before: environment steps that `progress` has counted already.
       trackers: given the metrics too, and closed.
+      until: pause after so many iterations; a checkpoint is written then.
 
     Raises:
       Interrupted: after the checkpoint that an interruption asks for.
@@ -86,6 +88,7 @@ def drive(
       OSError: the folder can't be written, or the disk is full.
     """
     config, root = runs.config, folder / "checkpoints"
+    last = config.num_iterations if until is None else until
     steps_of = lambda done: done * config.batch_steps * runs.num_members
     found, damages = checkpoint.latest(root)
     for damage in damages:
@@ -117,8 +120,8 @@ def drive(
         checkpoint.write(root, done, runs.trim(states), record)
         checkpoint.prune(root, schedule.keep)
 
-    while done < config.num_iterations and interruption.signal is None:
-        counts = [runs.chunk, config.num_iterations - done]
+    while done < last and interruption.signal is None:
+        counts = [runs.chunk, last - done]
         counts.append(max(1, int(_SECONDS_BETWEEN_LOOKS / pace)))
         if every is not None:
             counts.append(every - done % every)
@@ -143,7 +146,7 @@ def drive(
     writer.close()
     for tracker in trackers:
         tracker.close()
-    if interruption.signal is not None and done < config.num_iterations:
+    if interruption.signal is not None and done < last:
         raise Interrupted(interruption.signal)
     return Outcome(
         states=runs.trim(states),

@@ -123,20 +123,31 @@ def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
     Raises:
       InputError: --resume without --out.
     """
+    given = _folder_arguments(arguments)
+    if given is None or not given.resume:
+        return None
+    if given.out is None:
+        raise InputError("resume needs --out and the folder of the run to go on with")
+    return given.out if run_folder.is_described(given.out) else None
+
+
+def out_of(arguments: Sequence[str] | None) -> pathlib.Path | None:
+    """The folder that --out names, if it is given."""
+    given = _folder_arguments(arguments)
+    return None if given is None else given.out
+
+
+def _folder_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
+    """--resume and --out; None if they are refused where everything is parsed."""
     parser = argparse.ArgumentParser(
         add_help=False, allow_abbrev=False, exit_on_error=False
     )
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
     try:
-        given, _ = parser.parse_known_args(arguments)
+        return parser.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
-        return None  # refused where everything is parsed
-    if not given.resume:
         return None
-    if given.out is None:
-        raise InputError("resume needs --out and the folder of the run to go on with")
-    return given.out if run_folder.is_described(given.out) else None
 
 
 def check(options: Options) -> None:

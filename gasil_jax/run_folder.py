@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import socket
+import time
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -66,6 +67,26 @@ def lock(folder: pathlib.Path) -> Iterator[None]:
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}")
         file.flush()
+        yield
+
+
+@contextlib.contextmanager
+def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]:
+    """`lock`, after whoever has it for a moment.
+
+    Raises:
+      InputError: another process had it all the time.
+    """
+    deadline = time.monotonic() + seconds
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(lock(folder))
+                break
+            except InputError:
+                if time.monotonic() > deadline:
+                    raise
+                time.sleep(0.1)
         yield
 
 

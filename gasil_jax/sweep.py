@@ -46,13 +46,24 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 
 
 @dataclasses.dataclass(frozen=True)
-class Options(run.Options):
-    """Train every point of a grid, or random points, with many seeds each.
+class PointOptions(run.Options):
+    """What is trained at every point.
 
     Attributes:
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
         ranges of the paper's appendix.
+    """
+
+    grid: tuple[str, ...] = ()
+    random: int | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Options(PointOptions):
+    """Train every point of a grid, or random points, with many seeds each.
+
+    Attributes:
       shard: train this part of all points and seeds alone, NUMBER/COUNT from 1/COUNT
         on, in a folder below out; the same command again goes on with it. See
         gasil_jax.merge.
@@ -61,8 +72,6 @@ class Options(run.Options):
       shards: how many the launcher makes.
     """
 
-    grid: tuple[str, ...] = ()
-    random: int | None = None
     shard: str | None = None
     launcher: str | None = None
     shards: int | None = None
@@ -94,7 +103,7 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     return values
 
 
-def make_points(options: Options) -> list[dict[str, Any]]:
+def make_points(options: PointOptions) -> list[dict[str, Any]]:
     """The points of a sweep, without repetitions.
 
     Raises:
@@ -228,7 +237,7 @@ def _parse_shard(arguments: Sequence[str] | None, given: argparse.Namespace) -> 
     return dataclasses.replace(options, out=folder, resume=True)
 
 
-def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
+def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
     """All points and programs, checked.
 
     Raises:
@@ -239,14 +248,15 @@ def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
     for point in points:
         config = options.config.updated(point)
         run.check(dataclasses.replace(options, config=config))
-    return points, shards.programs(options.config, points, _seeds(options))
+    return points, shards.programs(options.config, points, seeds_of(options))
 
 
-def _seeds(options: Options) -> range:
+def seeds_of(options: PointOptions) -> range:
+    """Absolute numbers of the seeds of each point."""
     return range(options.first_seed, options.first_seed + options.seeds)
 
 
-def _prepare(options: Options, programs: Sequence[Program]) -> Any:
+def prepare(options: PointOptions, programs: Sequence[Program]) -> Any:
     """What must be done before anything compiles; returns the environment."""
     run.use_devices(options, sum(len(program.members) for program in programs))
     env = run.make_env(options)
@@ -260,11 +270,11 @@ def _train_whole(
 ) -> None:
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
-    env = _prepare(options, programs)
+    env = prepare(options, programs)
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
         trained = sweep_tables.Trained(folder, programs)
-        summary = sweep_tables.write(folder, points, _seeds(options), [trained])
+        summary = sweep_tables.write(folder, points, seeds_of(options), [trained])
     print(*sweep_tables.report(points, summary), f"in {folder}", sep="\n")
 
 
@@ -276,7 +286,7 @@ def _train_shard(
     if not trained.unfinished():
         print(f"shard {options.shard} is done, in {options.out}")
         return
-    env = _prepare(options, programs)
+    env = prepare(options, programs)
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
     speed = sweep_tables.speed(trained.trainings())
