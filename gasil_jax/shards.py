@@ -93,6 +93,17 @@ def refuse_whole(out: pathlib.Path) -> None:
         )
 
 
+def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
+    """Raise `InputError` if the folder holds shards of another number."""
+    inside = root(out)
+    cuts = {path.name.split("-of-")[-1] for path in inside.glob("*-of-*")}
+    others = cuts - {str(shard.count)}
+    if others:
+        raise InputError(
+            f"shard is {shard}: {out} holds a sweep that is cut into {min(others)}"
+        )
+
+
 def refuse_sharded(out: pathlib.Path) -> None:
     """Raise `InputError` if a sweep in shards is in the folder."""
     if root(out).is_dir():

@@ -230,8 +230,10 @@ def _parse_shard(arguments: Sequence[str] | None, given: argparse.Namespace) -> 
     if given.out is None:
         raise InputError("shard needs --out and the folder of the whole sweep")
     whole = pathlib.Path(given.out)
+    shard = shards.parse(given.shard)
     shards.refuse_whole(whole)
-    folder = shards.parse(given.shard).folder(whole)
+    shards.refuse_recut(whole, shard)
+    folder = shard.folder(whole)
     began = folder if run_folder.is_described(folder) else None
     options = run.parse(Options, arguments, _PROGRAM, began)
     return dataclasses.replace(options, out=folder, resume=True)
@@ -311,6 +313,7 @@ def _launch(options: Options, others: Sequence[str]) -> None:
     ]
     shards.share(programs, every[-1])
     shards.refuse_whole(options.out)
+    shards.refuse_recut(options.out, every[-1])
     where = ["--out", str(options.out.absolute())]
     jobs = {
         f"shard {shard}": [*others, *where, "--shard", str(shard)] for shard in every

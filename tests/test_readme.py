@@ -10,7 +10,17 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import command_line, evaluate, merge, plot, policy, render, run, sweep
+from gasil_jax import (
+    command_line,
+    evaluate,
+    halving,
+    merge,
+    plot,
+    policy,
+    render,
+    run,
+    sweep,
+)
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
@@ -18,7 +28,7 @@ SCALING = (README.parent / "docs" / "scaling.md").read_text()
 
 PROGRAMS = {
     f"gasil_jax.{module.__name__.split('.')[-1]}": module
-    for module in (run, sweep, merge, evaluate, plot, render)
+    for module in (run, sweep, halving, merge, evaluate, plot, render)
 }
 
 
@@ -27,7 +37,7 @@ def commands():
     for block in re.findall(r"```console\n(.*?)```", TEXT + SCALING, re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
-                yield line[2:]
+                yield re.sub(r"^[A-Z_]+=\S+ ", "", line[2:])  # without variables
 
 
 @pytest.mark.parametrize(

@@ -191,6 +191,9 @@ def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, caps
     assert "not in shards" in capsys.readouterr().err
     assert sweep.main(["--resume", "--out", str(tmp_path / "parts")]) == 2
     assert "go on with each of them" in capsys.readouterr().err
+    for again in (["--shard", "1/3"], ["--launcher", "local", "--shards", "3"]):
+        assert sweep.main([*more, str(tmp_path / "parts"), *again]) == 2
+        assert "is cut into 2" in capsys.readouterr().err
     # With its own settings: where it is trained, nothing is left to do.
     same = [*more, str(tmp_path / "parts"), "--shard", "1/2"]
     assert sweep.main(same) == 0
