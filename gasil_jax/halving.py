@@ -1,13 +1,15 @@
 """Successive halving: ``python -m gasil_jax.halving --env hopper --random 16 ...``.
 
 A point, with all its seeds, trains to a rung of environment steps (first_rung, then
-reduction times as many, and so on), reports its mean return, and either stops there or
-goes on: Optuna's SuccessiveHalvingPruner decides by the points that have reached that
-rung so far, so nobody waits for anybody. Schedules are those of the whole training.
+reduction times as many, and so on), reports its mean return there, and pauses. It goes
+on from its checkpoint once it is among the best at that rung, by the rule of Optuna's
+SuccessiveHalvingPruner; new points are begun where none is (Li et al. 2020, "A system
+for massively parallel hyperparameter tuning"). Schedules are those of the whole
+training.
 
 Any number of processes with the same command share OUT and take points that nobody
-has. A point whose process died goes on from its checkpoint in the next process that
-comes by. The folder holds config.json, optuna.journal, for each point a folder under
+has; nobody waits for anybody. A point whose process died goes on from its checkpoint
+in another. The folder holds config.json, optuna.journal, for each point a folder under
 points/ with its metrics.csv and checkpoints, and in the end results.csv and
 summary.json.
 """
@@ -19,7 +21,7 @@ import importlib.metadata
 import math
 import pathlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -32,6 +34,9 @@ from gasil_jax.shards import Point, Program
 
 _PROGRAM = "gasil_jax.halving"
 _STUDY = "halving"
+
+#: Of each point that has begun, its mean return by environment steps of a seed.
+Scores = Mapping[int, Mapping[int, float]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,17 +97,9 @@ class Study:
     Args:
       folder: of the file.
       points: all of them.
-      first_rung: environment steps.
-      reduction: one in so many goes on.
     """
 
-    def __init__(
-        self,
-        folder: pathlib.Path,
-        points: Sequence[Point],
-        first_rung: int,
-        reduction: int,
-    ):
+    def __init__(self, folder: pathlib.Path, points: Sequence[Point]):
         self._optuna = _optuna()
         from optuna.storages import JournalStorage
         from optuna.storages.journal import JournalFileBackend
@@ -113,31 +110,24 @@ class Study:
             storage=JournalStorage(JournalFileBackend(str(folder / "optuna.journal"))),
             direction="maximize",
             sampler=self._optuna.samplers.RandomSampler(),
-            pruner=self._optuna.pruners.SuccessiveHalvingPruner(
-                min_resource=first_rung, reduction_factor=reduction
-            ),
             load_if_exists=True,
         )
 
-    def trial(self, index: int) -> Any | None:
-        """The trial of a point, as it is now; None if nobody has begun it."""
-        for trial in self._study.get_trials(deepcopy=False):
-            if trial.user_attrs["point"] == index:
-                return trial
-        return None
+    def _trials(self) -> dict[int, Any]:
+        trials = self._study.get_trials(deepcopy=False)
+        return {trial.user_attrs["point"]: trial for trial in trials}
 
-    def is_done(self, index: int) -> bool:
-        """Whether a point is stopped or trained to its end."""
-        trial = self.trial(index)
-        return trial is not None and trial.state.is_finished()
+    def scores(self) -> Scores:
+        """What has been reported so far."""
+        return {i: dict(x.intermediate_values) for i, x in self._trials().items()}
 
     def begin(self, index: int) -> None:
         """Have a trial for a point, if there is none."""
-        if self.trial(index) is not None:
+        if index in self._trials():
             return
         point = self._points[index]
         choices = {
-            name: tuple({point[name]: None for point in self._points}) for name in point
+            name: tuple({other[name]: None for other in self._points}) for name in point
         }
         categorical = self._optuna.distributions.CategoricalDistribution
         self._study.add_trial(
@@ -149,24 +139,70 @@ class Study:
             )
         )
 
-    def goes_on(self, index: int, steps: int, score: float) -> bool:
-        """Report the score of a point at a rung; returns whether it goes on."""
-        trial = self._optuna.trial.Trial(self._study, self.trial(index)._trial_id)
-        trial.report(score, steps)
-        if not trial.should_prune():
-            return True
-        state = self._optuna.trial.TrialState.PRUNED
-        self._study.tell(trial, state=state)
-        return False
+    def report(self, index: int, steps: int, score: float) -> None:
+        """Note the score of a point at a rung."""
+        trial_id = self._trials()[index]._trial_id
+        self._optuna.trial.Trial(self._study, trial_id).report(score, steps)
 
-    def end(self, index: int, steps: int, score: float) -> None:
-        """Report the score of a point that is trained to its end."""
-        trial = self._optuna.trial.Trial(self._study, self.trial(index)._trial_id)
-        trial.report(score, steps)
-        if math.isfinite(score):
-            self._study.tell(trial, score)
-        else:
-            self._study.tell(trial, state=self._optuna.trial.TrialState.FAIL)
+    def close(self, last: int) -> None:
+        """Tell Optuna which points have come to the last rung, and which have not."""
+        states = self._optuna.trial.TrialState
+        for trial in self._trials().values():
+            score = trial.intermediate_values[trial.last_step]
+            if not math.isfinite(score):
+                told = {"state": states.FAIL}
+            elif trial.last_step == last:
+                told = {"values": score}
+            else:
+                told = {"state": states.PRUNED}
+            self._study.tell(trial.number, skip_if_finished=True, **told)
+
+
+def _goes_on(others: Sequence[float], score: float, reduction: int, least: int) -> bool:
+    """What Optuna's pruner says to a point that is seen last of those at its rung."""
+    optuna = _optuna()
+    study = optuna.create_study(
+        direction="maximize",
+        pruner=optuna.pruners.SuccessiveHalvingPruner(
+            min_resource=1, reduction_factor=reduction, bootstrap_count=least - 1
+        ),
+    )
+    for value in (*others, score):
+        trial = study.ask()
+        trial.report(value if math.isfinite(value) else -math.inf, 1)
+        stops = trial.should_prune()
+    return not stops
+
+
+def candidates(
+    scores: Scores, steps: Sequence[int], num_points: int, reduction: int, least: int
+) -> Iterator[int]:
+    """Points that may train to their next rung, the most worthy one first.
+
+    Args:
+      scores: of `Study.scores`.
+      steps: of `rungs`.
+      num_points: how many there are.
+      reduction: one in so many goes on.
+      least: from a rung that fewer have reached none goes on.
+
+    Yields:
+      those that are among the best at the highest rung, and so on down; then those that
+      have no score yet.
+    """
+    for rung in reversed(steps[:-1]):
+        there = {
+            i: by_steps[rung] for i, by_steps in scores.items() if rung in by_steps
+        }
+        paused = [
+            i for i in there if max(scores[i]) == rung and math.isfinite(there[i])
+        ]
+        for index in sorted(paused, key=there.get, reverse=True):
+            others = [score for i, score in there.items() if i != index]
+            if not _goes_on(others, there[index], reduction, least):
+                break
+            yield index
+    yield from (i for i in range(num_points) if not scores.get(i))
 
 
 @contextlib.contextmanager
@@ -191,81 +227,114 @@ def _score(metrics: dict[str, np.ndarray]) -> float:
 
 def climb(
     options: Options, env: Any, points: Sequence[Point], folder: pathlib.Path
-) -> Study:
-    """Train every point that nobody else has, from rung to rung.
+) -> Study | None:
+    """Train points from rung to rung as long as there is one for this process.
+
+    Returns:
+      the study; None while another process trains a point, which goes on then.
 
     Raises:
       Interrupted: by a signal.
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
+    steps, study = _rungs(options), Study(folder, points)
+    places = [folder / "points" / str(index) for index in range(len(points))]
+    batch_of = _batches(options, env, points)
+
+    def advance(least: int) -> bool:
+        """Train one point to its next rung, if there is one."""
+        now = study.scores()
+        for index in candidates(now, steps, len(points), options.reduction, least):
+            with _claimed(places[index]) as mine:
+                reached = study.scores().get(index, {})
+                # Another process may have been there just now.
+                if mine and reached == now.get(index, {}):
+                    study.begin(index)
+                    rung = steps[len(reached)]
+                    score = _train(options, index, batch_of(index), places[index], rung)
+                    study.report(index, rung, score)
+                    return True
+        return False
+
+    while True:
+        if advance(options.reduction):
+            continue
+        if not all(map(_is_free, places)):
+            return None
+        # Nobody is left to compare with: the best of few go on, one at least.
+        if not advance(1):
+            study.close(steps[-1])
+            return study
+
+
+def _is_free(place: pathlib.Path) -> bool:
+    with _claimed(place) as mine:
+        return mine
+
+
+def _batches(
+    options: Options, env: Any, points: Sequence[Point]
+) -> Callable[[int], Any]:
+    """A function from a point to its seeds' batch; programs compile once."""
     from gasil_jax import batch
 
-    steps = _rungs(options)
-    study = Study(folder, points, steps[0], options.reduction)
-    seeds = sweep.seeds_of(options)
-    batches: dict[Config, batch.Batch] = {}
-    for program in shards.programs(options.config, points, [0]):
-        for index, _ in program.members:
-            place = folder / "points" / str(index)
-            with _claimed(place) as mine:
-                if not mine or study.is_done(index):
-                    continue
-                study.begin(index)
-                floats = options.config.updated(points[index]).hyperparameters
-                members = (list(seeds), [floats] * len(seeds))
-                if program.config not in batches:
-                    batches[program.config] = batch.make_batch(
-                        env, program.config, *members
-                    )
-                runs = batches[program.config].of(*members)
-                _climb_point(options, study, index, runs, place, steps)
-    return study
+    seeds = list(sweep.seeds_of(options))
+    programs: dict[Config, batch.Batch] = {}
+    every = shards.programs(options.config, points, [0])
+    configs = {index: x.config for x in every for index, _ in x.members}
+
+    def batch_of(index: int) -> batch.Batch:
+        config = configs[index]
+        floats = options.config.updated(points[index]).hyperparameters
+        members = (seeds, [floats] * len(seeds))
+        if config not in programs:
+            programs[config] = batch.make_batch(env, config, *members)
+        return programs[config].of(*members)
+
+    return batch_of
 
 
-def _climb_point(
-    options: Options,
-    study: Study,
-    index: int,
-    runs: Any,
-    place: pathlib.Path,
-    steps: Sequence[int],
-) -> None:
+def _train(
+    options: Options, index: int, runs: Any, place: pathlib.Path, rung: int
+) -> float:
+    """Train a point to a rung; returns its score there."""
     from gasil_jax import driver, logging
     from gasil_jax.interruption import Interruption
     from gasil_jax.progress import Progress
 
     config, seeds = runs.config, sweep.seeds_of(options)
     title = f"{options.env} {config.agent} point {index}"
-    total = config.num_iterations * config.batch_steps * len(seeds)
-    for number, rung in enumerate(steps):
-        with Interruption() as interruption, Progress(title, total) as progress:
-            driver.drive(
-                runs,
-                place,
-                {"seed": seeds},
-                schedule=driver.Schedule(
-                    options.checkpoint_every, options.keep_checkpoints
-                ),
-                progress=progress,
-                interruption=interruption,
-                trackers=trackers.make(
-                    options.log, place, run_folder.flat(vars(options))
-                ),
-                until=math.ceil(rung / config.batch_steps),
-            )
-        metrics = logging.read_metrics(place / "metrics.csv", ("seed",), len(seeds))
-        score = _score(metrics)
-        if number == len(steps) - 1:
-            study.end(index, rung, score)
-        elif not study.goes_on(index, rung, score):
-            return
+    until = math.ceil(rung / config.batch_steps)
+    total = until * config.batch_steps * len(seeds)
+    with Interruption() as interruption, Progress(title, total) as progress:
+        driver.drive(
+            runs,
+            place,
+            {"seed": seeds},
+            schedule=driver.Schedule(
+                options.checkpoint_every, options.keep_checkpoints
+            ),
+            progress=progress,
+            interruption=interruption,
+            trackers=trackers.make(options.log, place, run_folder.flat(vars(options))),
+            until=until,
+        )
+    metrics = logging.read_metrics(place / "metrics.csv", ("seed",), len(seeds))
+    return _score(metrics)
 
 
 def write(
-    folder: pathlib.Path, points: Sequence[Point], study: Study, seeds: int
+    folder: pathlib.Path, points: Sequence[Point], study: Study, last: int, seeds: int
 ) -> dict[str, Any]:
     """Write results.csv and summary.json of a study that is done.
+
+    Args:
+      folder: where to.
+      points: all of them.
+      study: with a score of each.
+      last: environment steps of the whole training.
+      seeds: how many a point has.
 
     Returns:
       the summary: "best" is the index of the point that ended with the highest mean
@@ -275,17 +344,22 @@ def write(
 
     names = sorted({name for point in points for name in point})
     results = []
-    for index, point in enumerate(points):
-        trial = study.trial(index)
-        score = trial.intermediate_values[trial.last_step]
-        state = {"COMPLETE": "finished", "PRUNED": "stopped", "FAIL": "diverged"}
+    for index, (point, by_steps) in enumerate(
+        zip(points, (study.scores()[i] for i in range(len(points))))
+    ):
+        reached = max(by_steps)
+        score = by_steps[reached]
+        if not math.isfinite(score):
+            state = "diverged"
+        else:
+            state = "finished" if reached == last else "paused"
         results.append(
             {
                 "point": index,
                 **{name: point[name] for name in names},
-                "env_steps": trial.last_step,
+                "env_steps": reached,
                 "mean_return": score if math.isfinite(score) else None,
-                "state": state[trial.state.name],
+                "state": state,
             }
         )
     with (folder / "results.csv").open("w", newline="") as file:
@@ -339,12 +413,11 @@ def _main(arguments: Sequence[str] | None) -> None:
     except Interrupted as interrupted:
         interrupted.add_note("go on with the same command")
         raise
-    others = [str(i) for i in range(len(points)) if not study.is_done(i)]
-    if others:
-        print(f"points {', '.join(others)} are other processes': the last one reports")
+    if study is None:
+        print("the points that are left are other processes': the last one reports")
         return
     with run_folder.wait_for_lock(folder):
-        summary = write(folder, points, study, len(seeds))
+        summary = write(folder, points, study, options.config.total_steps, len(seeds))
     for row in summary["points"]:
         score = row["mean_return"]
         told = "none" if score is None else f"{score:.1f}"
