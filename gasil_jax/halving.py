@@ -344,11 +344,10 @@ def write(
 
     names = sorted({name for point in points for name in point})
     results = []
-    for index, (point, by_steps) in enumerate(
-        zip(points, (study.scores()[i] for i in range(len(points))))
-    ):
-        reached = max(by_steps)
-        score = by_steps[reached]
+    scores = study.scores()
+    for index, point in enumerate(points):
+        reached = max(scores[index])
+        score = scores[index][reached]
         if not math.isfinite(score):
             state = "diverged"
         else:
@@ -400,14 +399,13 @@ def _main(arguments: Sequence[str] | None) -> None:
         if not run_folder.is_described(folder):
             run_folder.refuse_used(folder)
             run.write_config(options, folder, points=points)
-    # Another process may have been first.
-    before = run.parse(Options, arguments, _PROGRAM, folder)
-    described = run_folder.read(folder)["config"].total_steps
-    if before.config.total_steps != described:
-        raise InputError(
-            f"total_steps was {described}, is {before.config.total_steps}: rungs can't "
-            "move"
-        )
+    # Another process may have been first, with other settings.
+    options = run.parse(Options, arguments, _PROGRAM, folder)
+    total, before = (
+        x.total_steps for x in (options.config, run_folder.read(folder)["config"])
+    )
+    if total != before:
+        raise InputError(f"total_steps was {before}, is {total}: rungs can't move")
     try:
         study = climb(options, env, points, folder)
     except Interrupted as interrupted:
