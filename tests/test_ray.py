@@ -1,6 +1,6 @@
 """A sweep on a Ray cluster: a worker is killed in the middle, and nothing is lost.
 
-Half a minute, and Ray, which is no part of the tests' own extra:
+A minute, and Ray (260 MB), which is no part of the tests' own extra:
 pip install "gasil_jax[ray]".
 """
 
