@@ -18,8 +18,7 @@ from flax import struct
 Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
-@struct.dataclass
-class Hyperparameters:
+class Hyperparameters(struct.PyTreeNode):
     """Every float of the algorithms: a pytree, so a sweep is a `vmap` over leaves.
 
     Attributes:
@@ -130,7 +129,7 @@ class Config:
         """Iterations of Algorithm 1 in a run."""
         return math.ceil(self.total_steps / self.batch_steps)
 
-    def replace(self, **changes: object) -> "Config":
+    def replace(self, **changes: Any) -> "Config":
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 

@@ -124,8 +124,10 @@ def _as_tuples(value: Any) -> Any:
 
 
 #: What may differ between a run and its continuation.
-_FREE = ("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset")
-_FREE += ("log",)
+_FREE = (
+    *("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset"),
+    "log",
+)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -149,7 +151,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 def flat(described: Mapping[str, Any]) -> dict[str, Any]:
     """Every field by its own name, those in dataclasses too."""
-    fields = {}
+    fields: dict[str, Any] = {}
     for name, value in described.items():
         if dataclasses.is_dataclass(value):
             own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}

@@ -20,8 +20,7 @@ from gasil_jax.networks import Policy, Value
 Metrics = dict[str, jax.Array]
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """All that a run needs to go on, and nothing that it can do without.
 
     Attributes:
@@ -51,10 +50,11 @@ class TrainState:
 
 def max_episode_steps(env: Any, config: Config) -> int:
     """Steps after which an episode is truncated, at the latest."""
-    return config.max_episode_steps or getattr(env, "episode_length", 1000)
+    return config.max_episode_steps or int(getattr(env, "episode_length", 1000))
 
 
-def _networks(env: Any, config: Config) -> tuple[Policy, Value]:
+def _networks(env: Any, config: Config) -> tuple[Any, Any]:
+    # Flax says of `apply` that it may give changed variables too: Any is narrower.
     return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
 
 

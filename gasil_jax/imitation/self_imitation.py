@@ -33,8 +33,7 @@ _HIGHEST_NEGATIVE_LOG_PROB = 5.0
 _LEAST_SAMPLES = 64
 
 
-@struct.dataclass
-class Replay:
+class Replay(struct.PyTreeNode):
     """The last `capacity` steps of ended episodes, a ring.
 
     Attributes:
@@ -64,7 +63,7 @@ def init_replay(capacity: int, observation_size: int, action_size: int) -> Repla
 
 
 def returns_to_go(
-    history: History, num_steps: int, gamma: jax.Array
+    history: History, num_steps: int, gamma: jax.Array | float
 ) -> tuple[jax.Array, jax.Array]:
     """Discounted returns of the steps whose episode ended in the last batch.
 
@@ -149,7 +148,7 @@ def loss(
     value: jax.Array,
     return_: jax.Array,
     weight: jax.Array,
-    value_coefficient: jax.Array,
+    value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
     """The loss of a minibatch, (), and the fraction of positive advantages, ()."""
     chex.assert_equal_shape([log_prob, value, return_, weight])
@@ -183,7 +182,7 @@ def _update_policy(
     replay: Replay,
     params: Any,
     optimizer_state: Any,
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     context: Context,
     key: jax.Array,
 ) -> tuple[Replay, Any, Any, Metrics]:
