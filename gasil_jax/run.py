@@ -14,7 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import jax
 import jaxlib
@@ -28,6 +28,10 @@ from gasil_jax.config import Config, unknown, validate
 from gasil_jax.environments import Settings
 from gasil_jax.imitation import AGENTS
 from gasil_jax.interruption import Interrupted, Interruption
+from gasil_jax.progress import Progress, announced
+
+if TYPE_CHECKING:
+    from gasil_jax import driver
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,6 +150,8 @@ def check(options: Options) -> None:
         raise InputError(
             f"first_seed is {options.first_seed}: it must be from 0 to {last}"
         )
+    if options.out is not None:
+        run_folder.check(options.out, options.resume)
 
 
 def check_resources(
@@ -158,12 +164,14 @@ def check_resources(
     """
     from gasil_jax import resources
 
+    with announced(options.env, "starting the devices"):
+        devices = jax.devices()
     try:
         resources.check(
             env,
             config,
             num_members,
-            jax.devices(),
+            devices,
             options.out or pathlib.Path("runs"),
             # The best one, and one that is being written.
             options.keep_checkpoints + 2,
@@ -216,7 +224,8 @@ def _keep_compiled_programs() -> None:
     """
     # Before 0.12 XLA calls every program that it loads one for another processor.
     quiet = jaxlib.version.__version_info__ >= (0, 12)
-    if jax.config.jax_compilation_cache_dir is not None or not quiet:
+    config: Any = jax.config  # Its options are attributes that its type does not have.
+    if config.jax_compilation_cache_dir is not None or not quiet:
         return
     with contextlib.suppress(OSError):
         described = pathlib.Path("/proc/cpuinfo")
@@ -244,7 +253,8 @@ def make_env(options: Options) -> Any:
     Raises:
       InputError: the agent can't run in it.
     """
-    env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
+    with announced(options.env, "building the environment"):
+        env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
     try:
         training.check(env, options.config)
     except ValueError as error:
@@ -260,8 +270,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
-    from gasil_jax import batch, driver, logging, plotting, policy
-    from gasil_jax.progress import Progress
+    from gasil_jax import batch, driver
 
     config = options.config
     seeds = range(options.first_seed, options.first_seed + options.seeds)
@@ -269,6 +278,9 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
     total_steps = config.num_iterations * config.batch_steps * options.seeds
     title = f"{options.env} {config.agent}"
     with Interruption() as interruption, Progress(title, total_steps) as progress:
+        with progress.aside("starting the trackers"):
+            described = run_folder.flat(vars(options))
+            following = trackers.make(options.log, folder, described)
         runs = batch.make_batch(env, config, seeds)
         outcome = driver.drive(
             runs,
@@ -279,8 +291,24 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
             ),
             progress=progress,
             interruption=interruption,
-            trackers=trackers.make(options.log, folder, run_folder.flat(vars(options))),
+            trackers=following,
         )
+    with announced(title, "writing the curve, the policies and the summary"):
+        return _write_results(options, env, folder, runs.devices, outcome)
+
+
+def _write_results(
+    options: Options,
+    env: Any,
+    folder: pathlib.Path,
+    devices: Sequence[jax.Device],
+    outcome: "driver.Outcome",
+) -> dict[str, Any]:
+    """What a run leaves beside metrics and checkpoints; returns the summary."""
+    from gasil_jax import logging, plotting, policy
+
+    config = options.config
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), options.seeds)
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     plotting.learning_curve(
@@ -311,7 +339,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
         "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
-        "device": f"{len(runs.devices)} x {runs.devices[0].device_kind}",
+        "device": f"{len(devices)} x {devices[0].device_kind}",
         "versions": logging.versions(),
     }
     logging.write_json(folder / "summary.json", summary)

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import socket
+import tempfile
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -16,6 +17,31 @@ from gasil_jax.environments import Settings
 
 _LOCK = ".lock"
 _CONFIG = "config.json"
+
+
+def check(out: pathlib.Path, resume: bool) -> None:
+    """Refuse a folder before a run is built for it; nothing new is left but a lock.
+
+    Raises:
+      InputError: it can't be written, is in use, or, unless `resume`, is used.
+    """
+    if out.is_dir():
+        with lock(create(out, "")):
+            if not (resume and is_described(out)):
+                refuse_used(out)
+        return
+    place = out
+    while not place.exists():
+        place = place.parent
+    try:
+        with tempfile.TemporaryDirectory(prefix=".writable-", dir=place):
+            pass
+    except OSError as error:
+        raise InputError(_unwritable(out, error)) from None
+
+
+def _unwritable(folder: pathlib.Path, error: OSError) -> str:
+    return f"out is {folder}, which can't be written: {error.strerror}"
 
 
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
@@ -40,9 +66,7 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
             number += 1
     except OSError as error:
         where = folder if out is None else out
-        raise InputError(
-            f"out is {where}, which can't be written: {error.strerror}"
-        ) from None
+        raise InputError(_unwritable(where, error)) from None
 
 
 @contextlib.contextmanager

@@ -1,11 +1,12 @@
 """Metrics in TensorBoard and Weights & Biases."""
 
+import contextlib
 import sys
 
 import numpy as np
 import pytest
 
-from gasil_jax import run, trackers
+from gasil_jax import progress, run, trackers
 
 SMALL = (
     *("--env", "point_mass", "--seeds", "2", "--first-seed", "3"),
@@ -42,9 +43,16 @@ def test_the_means_and_the_members_are_given():
     ]
 
 
-def test_a_run_in_tensorboard(tmp_path):
+def test_a_run_in_tensorboard(tmp_path, monkeypatch):
     pytest.importorskip("tensorboardX")
-    out = tmp_path / "out"
+    out, said = tmp_path / "out", []
+
+    def announced(title, name):
+        said.append(name)
+        return contextlib.nullcontext()
+
+    for module in (run, progress):
+        monkeypatch.setattr(module, "announced", announced)
     assert run.main([*SMALL, "--log", "tensorboard", "--out", str(out)]) == 0
     (path,) = (out / "tensorboard").iterdir()
     content = path.read_bytes()
@@ -52,6 +60,15 @@ def test_a_run_in_tensorboard(tmp_path):
     # Episodes of 50 steps end in every second iteration.
     for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
         assert content.count(name) == 2
+    # What a run does before, beside and after training is said.
+    assert said == [
+        "building the environment",
+        "starting the trackers",
+        "reading the checkpoints",
+        "saving a checkpoint",
+        "closing the trackers",
+        "writing the curve, the policies and the summary",
+    ]
 
 
 def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
