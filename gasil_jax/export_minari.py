@@ -12,6 +12,7 @@ environment's limit. All this stands in the data set's description too.
 """
 
 import dataclasses
+import itertools
 import pathlib
 import shutil
 import sys
@@ -76,12 +77,11 @@ def episodes(buffer: GoodTrajectories, max_episode_steps: int) -> list[Episode]:
       max_episode_steps: one of so many steps is whole, wherever it is.
     """
     size = int(buffer.size)
-    starts = np.flatnonzero(np.asarray(buffer.time[:size]) == 0)
-    ends = [*starts[1:], size]
+    bounds = [*np.flatnonzero(np.asarray(buffer.time[:size]) == 0), size]
     observation, action = np.asarray(buffer.observation), np.asarray(buffer.action)
     found = [
         Episode(observation[start:end], action[start:end], float(buffer.return_[start]))
-        for start, end in zip(starts, ends, strict=True)
+        for start, end in itertools.pairwise(bounds)
     ]
     if size == buffer.capacity and len(found[-1].action) < max_episode_steps:
         found.pop()

@@ -39,6 +39,6 @@ def untrained_hopper(tmp_path_factory):
     run.write_config(options, out)
     env = run.make_env(options)
     init = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))
-    states = init(np.arange(1, dtype=np.uint32))
+    states = jax.jit(init)(np.arange(1, dtype=np.uint32))
     checkpoint.write(out / "checkpoints", 0, states, {"score": None})
     return out

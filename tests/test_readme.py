@@ -144,13 +144,10 @@ def test_the_python_runs(tmp_path, monkeypatch):
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
 
 
-def test_the_example_runs(tmp_path, monkeypatch, capsys):
+def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     import runpy
 
-    env = gasil_jax.make_env("hopper", physics="mujoco")
-    states = jax.vmap(
-        lambda seed: gasil_jax.init(env, gasil_jax.Config(), jax.random.key(seed))
-    )(np.arange(1, dtype=np.uint32))
+    env, _, _, states = evaluate.load(untrained_hopper)
     policy.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
     script = README.parent / "examples" / "gymnasium_rollout.py"
     arguments = [str(script), str(tmp_path), "Hopper-v5", "--episodes", "2"]
