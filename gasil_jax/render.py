@@ -155,8 +155,10 @@ def locomotion_page(env: Any, states: Sequence[Any]) -> str:
     from brax.base import Transform
     from brax.io import html, mjcf
 
-    # Brax writes into the model that it is given.
+    # Brax writes into the model that it is given, and loads it with MJX, which lacks
+    # humanoid's solver; none is needed to place bodies.
     model = copy.copy(env.unwrapped.model)
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     with warnings.catch_warnings():
         # That Brax's physics is not maintained: it is not used here.
         warnings.simplefilter("ignore", UserWarning)

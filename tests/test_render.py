@@ -2,19 +2,21 @@
 
 import base64
 import json
+import pathlib
 import re
 import subprocess
 import sys
 import types
 import zlib
 
+import gymnasium
 import jax
 import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-import gasil_jax
+from gasil_envs import locomotion
 from gasil_jax import batch, evaluate, policy, render, run
 
 SMALL = (
@@ -95,12 +97,16 @@ def test_a_page_has_the_simulations_bodies(untrained_hopper, tmp_path, capsys):
     assert np.isfinite(model.jnt_range).all()
 
 
-@pytest.mark.parametrize("name", ["walker2d", "halfcheetah", "swimmer", "ant"])
+@pytest.mark.parametrize("name", locomotion.TASKS)
 def test_every_model_makes_a_page(name):
-    env = gasil_jax.make_env(name, physics="mujoco").unwrapped
-    physics = env.physics.init(np.float32(env.model.qpos0), np.zeros(env.model.nv))
-    page = render.locomotion_page(env, [types.SimpleNamespace(physics=physics)])
-    assert len(system_in(page)["states"]["x"][0]["pos"]) == env.model.nbody - 1
+    assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+    path = assets / locomotion.TASKS[name].xml
+    model = mujoco.MjModel.from_xml_path(str(path))
+    env = types.SimpleNamespace(model=model, dt=0.02)
+    env.unwrapped = env
+    start = types.SimpleNamespace(qpos=model.qpos0)
+    page = render.locomotion_page(env, [types.SimpleNamespace(physics=start)])
+    assert len(system_in(page)["states"]["x"][0]["pos"]) == model.nbody - 1
 
 
 def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
