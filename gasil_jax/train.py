@@ -4,8 +4,7 @@ Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or
 any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -235,9 +234,16 @@ def check(env: Any, config: Config) -> None:
     AGENTS[config.agent].check(config, env.observation_size, env.action_size)
 
 
-def make_train(
-    env: Any, config: Config
-) -> Callable[[jax.Array, Hyperparameters | None], tuple[TrainState, Metrics]]:
+class Train(Protocol):
+    """A whole run: a key, consumed, to the last state and metrics (iterations,)."""
+
+    def __call__(
+        self, key: jax.Array, hyperparameters: Hyperparameters | None = None
+    ) -> tuple[TrainState, Metrics]:
+        """Train; default hyperparameters are the configuration's."""
+
+
+def make_train(env: Any, config: Config) -> Train:
     """A pure function that trains from nothing to `config.total_steps`.
 
     Args:
