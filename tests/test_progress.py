@@ -1,5 +1,6 @@
 """What a run says that it is doing, where there is no terminal."""
 
+import threading
 import time
 
 import numpy as np
@@ -26,10 +27,15 @@ def test_what_takes_long_is_said_in_one_line(monkeypatch, capsys):
 
 
 def test_what_is_quick_is_not_said(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 0.2)
+    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 600.0)
+    before = threading.active_count()
     with progress.announced("hopper", "building"):
-        pass
-    time.sleep(0.4)
+        assert threading.active_count() == before + 1
+    # What would have said it has ended, long before its time.
+    deadline = time.monotonic() + 20.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert threading.active_count() == before
     assert capsys.readouterr().err == ""
 
 
