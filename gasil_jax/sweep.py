@@ -12,6 +12,7 @@ for each program a folder under programs/ with its metrics.csv and checkpoints.
 import csv
 import dataclasses
 import itertools
+import json
 import math
 import pathlib
 import sys
@@ -51,10 +52,13 @@ class Options(run.Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
         ranges of the paper's appendix.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in place of
+        grid and random.
     """
 
     grid: tuple[str, ...] = ()
     random: int | None = None
+    points_file: str | None = None
 
 
 def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
@@ -69,10 +73,7 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name not in kinds:
-            raise InputError(
-                f"grid has {name!r}, which can't vary: did you mean "
-                f"{nearest(name, tuple(kinds))!r}? (one of {', '.join(kinds)})"
-            )
+            raise InputError(f"grid: {_unknown_name(name)}")
         try:
             values[name] = tuple(kinds[name](value) for value in listed.split(","))
         except ValueError:
@@ -83,16 +84,58 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     return values
 
 
+def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The points that a file lists.
+
+    Raises:
+      InputError: it can't be read, or has something else in it.
+    """
+    try:
+        points = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(f"points_file is {path}, which can't be read: {error}") from None
+    if not isinstance(points, list) or not points:
+        raise InputError(f"points_file is {path}: it must hold a list of points, one or more")
+    kinds = {**_HYPERPARAMETERS, **_CONFIG}
+    for point in points:
+        if not isinstance(point, dict):
+            raise InputError(f"points_file is {path}: {point!r} is not a point")
+        for name, value in point.items():
+            if name not in kinds:
+                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
+            whole = kinds[name] is int
+            if isinstance(value, bool) or not isinstance(
+                value, int if whole else int | float
+            ):
+                kind = "a whole number" if whole else "a number"
+                raise InputError(f"points_file is {path}: {name} is {value!r}, not {kind}")
+    return [
+        {name: kinds[name](value) for name, value in point.items()} for point in points
+    ]
+
+
+def _unknown_name(name: str) -> str:
+    kinds = (*_HYPERPARAMETERS, *_CONFIG)
+    return (
+        f"{name!r} can't vary: did you mean {nearest(name, kinds)!r}? "
+        f"(one of {', '.join(kinds)})"
+    )
+
+
 def make_points(options: Options) -> list[dict[str, Any]]:
     """The points of a sweep, without repetitions.
 
     Raises:
       InputError: there is nothing to vary.
     """
+    if options.points_file is not None:
+        if options.grid or options.random is not None:
+            raise InputError("points_file stands in place of grid and random")
+        return read_points(pathlib.Path(options.points_file))
     values = parse_grid(options.grid)
     if options.random is None:
         if not values:
-            raise InputError("grid is empty: it must be NAME=VALUE,... or use --random")
+            raise InputError("grid is empty: it must be NAME=VALUE,... or use --random or --points")
         return [
             dict(zip(values, point, strict=True))
             for point in itertools.product(*values.values())

@@ -46,6 +46,23 @@ def test_random_points_are_distinct_and_of_the_papers_ranges():
         assert all(value in sweep.PAPER_RANGES[name] for name, value in point.items())
 
 
+def test_points_from_a_file(tmp_path):
+    path = tmp_path / "points.json"
+    path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
+    points = sweep.make_points(options("--points-file", str(path)))
+    assert points == [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    for text, message in (
+        ("[", "can't be read"),
+        ("{}", "a list of points"),
+        ("[3]", "3 is not a point"),
+        ('[{"alhpa": 1}]', "did you mean 'alpha'"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5, not a whole number"),
+    ):
+        path.write_text(text)
+        with pytest.raises(command_line.InputError, match=message):
+            sweep.make_points(options("--points-file", str(path)))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
