@@ -52,8 +52,8 @@ class Options(run.Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
         ranges of the paper's appendix.
-      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in place of
-        grid and random.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in
+        place of grid and random.
     """
 
     grid: tuple[str, ...] = ()
@@ -93,9 +93,13 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
     try:
         points = json.loads(path.read_text())
     except (OSError, ValueError) as error:
-        raise InputError(f"points_file is {path}, which can't be read: {error}") from None
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
     if not isinstance(points, list) or not points:
-        raise InputError(f"points_file is {path}: it must hold a list of points, one or more")
+        raise InputError(
+            f"points_file is {path}: it must hold a list of points, one or more"
+        )
     kinds = {**_HYPERPARAMETERS, **_CONFIG}
     for point in points:
         if not isinstance(point, dict):
@@ -108,7 +112,9 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
                 value, int if whole else int | float
             ):
                 kind = "a whole number" if whole else "a number"
-                raise InputError(f"points_file is {path}: {name} is {value!r}, not {kind}")
+                raise InputError(
+                    f"points_file is {path}: {name} is {value!r}, not {kind}"
+                )
     return [
         {name: kinds[name](value) for name, value in point.items()} for point in points
     ]
@@ -135,7 +141,9 @@ def make_points(options: Options) -> list[dict[str, Any]]:
     values = parse_grid(options.grid)
     if options.random is None:
         if not values:
-            raise InputError("grid is empty: it must be NAME=VALUE,... or use --random or --points")
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,... or use --random or --points"
+            )
         return [
             dict(zip(values, point, strict=True))
             for point in itertools.product(*values.values())
