@@ -1,0 +1,119 @@
+"""A search for the point mass' layout: ``python -m experiments.point_mass_layouts``.
+
+The paper prints no coordinates. Layouts are drawn from a family: a blue object or two
+below the start, greens above, and between them a row of orange distractors with gaps.
+In each, PPO and PPO+GASIL are trained at the same learning rates with the same seeds,
+other than those of the figures, and each layout's returns go into a CSV file.
+"""
+
+import argparse
+import csv
+import pathlib
+import sys
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from gasil_envs import wrappers
+from gasil_envs.point_mass import Layout, PointMass
+from gasil_jax import batch, presets
+from gasil_jax.environments import available_cores
+
+AGENTS = ("ppo", "ppo+gasil")
+LEARNING_RATES = (1e-3, 3e-4, 1e-4)
+_FIRST_SEED = 1000
+
+
+def draw(number: int) -> Layout:
+    """Layout `number` of the family."""
+    rng = np.random.default_rng(number)
+    row = lambda count, spacing, y: tuple(
+        (round(float((i - (count - 1) / 2) * spacing), 3), round(float(y), 3))
+        for i in range(count)
+    )
+    barrier = rng.choice((0.3, 0.35, 0.4, 0.45))
+    return Layout(
+        blue=row(rng.choice((1, 1, 2)), 0.6, -rng.choice((0.3, 0.4, 0.5))),
+        green=row(
+            rng.choice((2, 3, 4)),
+            rng.choice((0.3, 0.4)),
+            barrier + rng.choice((0.25, 0.35, 0.45)),
+        ),
+        orange=row(rng.choice((3, 5, 7)), rng.choice((0.2, 0.25, 0.3)), barrier),
+        start_spread=float(rng.choice((0.1, 0.2))),
+        radius=float(rng.choice((0.1, 0.12, 0.15))),
+        max_speed=float(rng.choice((0.05, 0.07, 0.1))),
+        actuation_cost=float(rng.choice((0.02, 0.05, 0.1))),
+    )
+
+
+def evaluate(layout: Layout, seeds: int, total_steps: int) -> list[dict[str, object]]:
+    """Train both agents; a row for each agent, learning rate and seed.
+
+    "early" is the mean return over the second tenth of training, "final" over the last.
+    """
+    env = wrappers.EpisodeLimit(PointMass(layout), layout.episode_length)
+    rows = []
+    for agent in AGENTS:
+        config = presets.preset("point_mass", agent, "tuned").replace(
+            total_steps=total_steps
+        )
+        numbers = list(range(_FIRST_SEED, _FIRST_SEED + seeds))
+        hyperparameters = [
+            config.hyperparameters.replace(learning_rate=rate)
+            for rate in LEARNING_RATES
+            for _ in numbers
+        ]
+        runs = batch.make_batch(
+            env, config, numbers * len(LEARNING_RATES), hyperparameters
+        )
+        states, advance = runs.compile()
+        returns = []
+        for done in range(0, config.num_iterations, runs.chunk):
+            count = min(runs.chunk, config.num_iterations - done)
+            states, metrics = runs.train(advance, states, done, count)
+            returns.append(metrics["episode_return"])
+        tenths = np.array_split(np.concatenate(returns, axis=1), 10, axis=1)
+        for member, (early, final) in enumerate(zip(tenths[1], tenths[-1])):
+            rows.append(
+                {
+                    "agent": agent,
+                    "learning_rate": LEARNING_RATES[member // seeds],
+                    "seed": numbers[member % seeds],
+                    "early": round(float(np.nanmean(early)), 3),
+                    "final": round(float(np.nanmean(final)), 3),
+                }
+            )
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Evaluate layouts that have not been; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--total-steps", type=int, default=250_000)
+    parser.add_argument(
+        "--runs", type=pathlib.Path, default=pathlib.Path("runs", "layouts")
+    )
+    options = parser.parse_args(arguments)
+    jax.config.update("jax_num_cpu_devices", available_cores())
+    jax.config.update("jax_default_matmul_precision", "highest")
+    options.runs.mkdir(parents=True, exist_ok=True)
+    for number in range(options.first, options.first + options.count):
+        path = options.runs / f"{number}.csv"
+        if path.exists():
+            continue
+        rows = evaluate(draw(number), options.seeds, options.total_steps)
+        with path.open("x", newline="") as file:
+            writer = csv.DictWriter(file, ["layout", *rows[0]], lineterminator="\n")
+            writer.writeheader()
+            writer.writerows({"layout": number, **row} for row in rows)
+        print(path, flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
