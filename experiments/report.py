@@ -3,7 +3,7 @@
 import dataclasses
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -22,14 +22,23 @@ class Figure:
       claim: what the paper says.
       favourite: the curve that the claim is about; compared with each other curve of
         its panel. None where the claim is about the order of all.
-      more: what else the page says, after the tables.
+      conclude: from panel -> curve -> results to what they say of the claim; default
+        `tally` of the favourite.
+      more: what else the page says: what was tried where the claim does not hold.
     """
 
     name: str
     title: str
     claim: str
     favourite: str | None = "ppo+gasil"
+    conclude: Callable[[Mapping[str, Mapping[str, Results]]], str] | None = None
     more: str = ""
+
+    def conclusions(self, shown: Mapping[str, Mapping[str, Results]]) -> str:
+        """What the results say of the claim, Markdown."""
+        if self.conclude is not None:
+            return self.conclude(shown)
+        return tally(shown, self.favourite) if self.favourite else ""
 
 
 def difference(ours: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
@@ -123,6 +132,26 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
     return "\n".join(lines)
 
 
+def optimum(shown: Mapping[str, Mapping[str, Results]]) -> str:
+    """Of panels whose curves are values in order: the best, against both ends."""
+    lines = []
+    for panel, curves in shown.items():
+        names = list(curves)
+        score = lambda name: float(
+            statistics.interquartile_mean(curves[name].final[0])  # noqa: B023
+        )
+        best = max(names, key=score)
+        against = [
+            f"better than {end}: "
+            + verdict(*difference(curves[best].final[0], curves[end].final[0])[1:])
+            for end in (names[0], names[-1])
+            if end != best
+        ]
+        place = "at an end" if best in (names[0], names[-1]) else "in the middle"
+        lines.append(f"- {panel}: {best} is best, {place}; {', '.join(against)}.")
+    return "\n".join(lines)
+
+
 def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """What each curve was trained with, beyond the appendix's defaults."""
     lines = ["| task | agent | hyperparameters | trained with |", "|---|---|---|---|"]
@@ -187,9 +216,8 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
         'seeds; "better?" says "yes" where the 95% interval of the difference of '
         "interquartile means is above 0.",
         table(shown, figure.favourite),
+        "**Measured here.**\n\n" + figure.conclusions(shown),
     ]
-    if figure.favourite:
-        parts.append(tally(shown, figure.favourite))
     if figure.more:
         parts.append(figure.more)
     parts += [

@@ -18,6 +18,7 @@ from experiments import (
     random_search,
     report,
     stochastic_walker2d,
+    summary,
     trials,
 )
 
@@ -182,6 +183,24 @@ def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypa
         if described.exists():
             settings = json.loads(described.read_text())["settings"]
             assert settings == json.loads(json.dumps(trial.settings()))
+
+
+def test_the_summary_is_that_of_the_csv_files():
+    path = trials.RESULTS / "README.md"
+    assert path.read_text() == summary.page()
+
+
+def test_an_optimum_is_named_by_where_it_is(tmp_path):
+    def results(mean):
+        returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
+        trial = trials.Trial("x/y", "hopper", "ppo")
+        return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
+
+    shown = {"a": {"1": results(1.0), "2": results(9.0), "3": results(8.0)}}
+    said = report.optimum(shown)
+    assert "2 is best, in the middle; better than 1: yes, better than 3: yes" in said
+    shown = {"a": {"1": results(1.0), "2": results(0.9)}}
+    assert "1 is best, at an end; better than 2: yes" in report.optimum(shown)
 
 
 def test_the_point_mass_is_trained_and_drawn(tmp_path, capsys):
