@@ -8,6 +8,7 @@ from experiments import (
     delayed_mujoco,
     hyperparameters,
     mujoco,
+    point_mass,
     random_search,
     report,
     stochastic_walker2d,
@@ -16,6 +17,7 @@ from experiments import (
 
 #: Each figure with the function that makes its trials.
 FIGURES = (
+    (point_mass.FIGURE, point_mass.make),
     (mujoco.FIGURE, lambda: comparison.make(1)),
     (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
     (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),

@@ -231,9 +231,14 @@ class Results:
     @property
     def final(self) -> np.ndarray:
         """Mean return over the last tenth of training, (points, seeds)."""
-        last = self.returns[..., self.env_steps > 0.9 * self.env_steps[-1]]
-        count = np.isfinite(last).sum(axis=-1)
-        return np.where(count > 0, np.nansum(last, -1) / np.maximum(count, 1), np.nan)
+        return self.part(0.9, 1.0)
+
+    def part(self, begin: float, end: float) -> np.ndarray:
+        """Mean return over a part of training, from share to share, (points, seeds)."""
+        share = self.env_steps / self.env_steps[-1]
+        rows = self.returns[..., (share > begin) & (share <= end)]
+        count = np.isfinite(rows).sum(axis=-1)
+        return np.where(count > 0, np.nansum(rows, -1) / np.maximum(count, 1), np.nan)
 
 
 def read(trial: Trial, results: pathlib.Path) -> Results | None:

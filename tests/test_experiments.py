@@ -15,6 +15,7 @@ from experiments import (
     hyperparameters,
     mujoco,
     point_mass,
+    point_mass_moments,
     random_search,
     report,
     stochastic_walker2d,
@@ -154,7 +155,13 @@ def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
     assert message in error and len(error.splitlines()) == 1
 
 
-PUBLISHED = (mujoco, delayed_mujoco, stochastic_walker2d, hyperparameters)
+PUBLISHED = (
+    point_mass,
+    mujoco,
+    delayed_mujoco,
+    stochastic_walker2d,
+    hyperparameters,
+)
 
 
 @pytest.mark.parametrize("module", [*PUBLISHED, random_search])
@@ -203,10 +210,11 @@ def test_an_optimum_is_named_by_where_it_is(tmp_path):
     assert "1 is best, at an end; better than 2: yes" in report.optimum(shown)
 
 
-def test_the_point_mass_is_trained_and_drawn(tmp_path, capsys):
-    size = ("--seeds", "2", "--total-steps", "10240", "--moments", "5")
-    assert point_mass.main([*size, "--out", str(tmp_path)]) == 0
-    assert "ppo+gasil  final return" in capsys.readouterr().out
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {*("point_mass_curves.png", "point_mass_moments.png")}
-    assert point_mass.main(["--moments", "2"]) == 2
+def test_moments_of_the_point_mass_are_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(point_mass_moments, "SHARES", (0.0, 1.0))
+    monkeypatch.setattr(point_mass, "AGENTS", ("ppo+gasil",))
+    arguments = ["--total-steps", "6144", "--out", str(tmp_path)]
+    assert point_mass_moments.main(arguments) == 0
+    picture = (tmp_path / "point_mass_moments.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert point_mass_moments.main(["--total-steps", "0"]) == 2
