@@ -3,6 +3,8 @@
 from experiments import random_search
 from experiments.trials import AGENTS, TASKS, Trial
 
+Schedule = tuple[tuple[float, float], ...]
+
 #: Humanoid's length; the other tasks' is the trial's default.
 _STEPS = {"humanoid": 3_000_000}
 
@@ -20,10 +22,18 @@ def make(reward_delay: int) -> list[Trial]:
             points=(random_search.best(env, agent, reward_delay) or {},),
             reward_delay=reward_delay,
             total_steps=_STEPS.get(env, 1_000_000),
+            alpha_schedule=_schedule(env, agent, reward_delay),
         )
         for env in TASKS
         for agent in AGENTS
     ]
+
+
+def _schedule(env: str, agent: str, reward_delay: int) -> Schedule:
+    """The paper's rule for Humanoid; alpha is fixed in all else."""
+    if (env, agent, reward_delay) == ("humanoid", "ppo+gasil", 1):
+        return ((2e6, 0.0), (3e6, 1.0))
+    return ()
 
 
 def quick(wanted: list[Trial]) -> list[Trial]:

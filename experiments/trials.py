@@ -43,6 +43,7 @@ class Trial:
       first_seed: the number of the first.
       total_steps: of a seed.
       rows: of a seed in the results: so many equal parts of training.
+      alpha_schedule: (steps, factor) points.
     """
 
     name: str
@@ -55,12 +56,15 @@ class Trial:
     first_seed: int = 0
     total_steps: int = 1_000_000
     rows: int = 50
+    alpha_schedule: tuple[tuple[float, float], ...] = ()
 
     def settings(self) -> dict[str, Any]:
         """What decides the results, but for the seeds."""
         fields = dataclasses.asdict(self)
         for name in ("name", "seeds", "first_seed"):
             del fields[name]
+        if not self.alpha_schedule:
+            del fields["alpha_schedule"]
         return fields | {"points": [dict(point) for point in self.points]}
 
 
@@ -108,6 +112,7 @@ def train(
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
         return 0
+    schedule = [str(number) for pair in share.alpha_schedule for number in pair]
     return sweep.main(
         [
             *("--env", share.env, "--agent", share.agent, *_FLAGS),
@@ -115,7 +120,8 @@ def train(
             *("--obs-noise", str(share.obs_noise)),
             *("--seeds", str(share.seeds), "--first-seed", str(share.first_seed)),
             *("--total-steps", str(share.total_steps), "--out", str(place)),
-            *("--resume", "--points-file", str(listed), *flags),
+            *("--resume", "--points-file", str(listed)),
+            *("--alpha-schedule", *schedule, *flags),
         ]
     )
 
