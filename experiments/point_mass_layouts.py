@@ -25,26 +25,59 @@ LEARNING_RATES = (1e-3, 3e-4, 1e-4)
 _FIRST_SEED = 1000
 
 
-def draw(number: int) -> Layout:
-    """Layout `number` of the family."""
-    rng = np.random.default_rng(number)
-    row = lambda count, spacing, y: tuple(
-        (round(float((i - (count - 1) / 2) * spacing), 3), round(float(y), 3))
-        for i in range(count)
+Places = tuple[tuple[float, float], ...]
+
+
+def _row(count: int, spacing: float, x: float, y: float) -> Places:
+    """Places in a row, centred at x."""
+    first = x - spacing * (count - 1) / 2
+    return tuple(
+        (round(float(first + i * spacing), 3), round(float(y), 3)) for i in range(count)
     )
+
+
+def draw(number: int) -> Layout:
+    """Layout `number`: below 1000 with a closed row of distractors, then with a gap."""
+    rng = np.random.default_rng(number)
+    return _closed(rng) if number < 1000 else _with_gap(rng)
+
+
+def _closed(rng: np.random.Generator) -> Layout:
     barrier = rng.choice((0.3, 0.35, 0.4, 0.45))
     return Layout(
-        blue=row(rng.choice((1, 1, 2)), 0.6, -rng.choice((0.3, 0.4, 0.5))),
-        green=row(
+        blue=_row(rng.choice((1, 1, 2)), 0.6, 0.0, -rng.choice((0.3, 0.4, 0.5))),
+        green=_row(
             rng.choice((2, 3, 4)),
             rng.choice((0.3, 0.4)),
+            0.0,
             barrier + rng.choice((0.25, 0.35, 0.45)),
         ),
-        orange=row(rng.choice((3, 5, 7)), rng.choice((0.2, 0.25, 0.3)), barrier),
+        orange=_row(rng.choice((3, 5, 7)), rng.choice((0.2, 0.25, 0.3)), 0.0, barrier),
         start_spread=float(rng.choice((0.1, 0.2))),
         radius=float(rng.choice((0.1, 0.12, 0.15))),
         max_speed=float(rng.choice((0.05, 0.07, 0.1))),
         actuation_cost=float(rng.choice((0.02, 0.05, 0.1))),
+    )
+
+
+def _with_gap(rng: np.random.Generator) -> Layout:
+    radius, gap = 0.12, rng.choice((0.08, 0.16, 0.24))
+    middle, barrier = rng.choice((0.0, 0.2)), rng.choice((0.15, 0.25))
+    wing = radius + gap / 2 + 0.2
+    count = int(rng.choice((2, 3)))
+    left = _row(count, 0.2, middle - wing - 0.1 * (count - 1) + 0.2, barrier)
+    right = _row(count, 0.2, middle + wing + 0.1 * (count - 1) - 0.2, barrier)
+    return Layout(
+        blue=_row(rng.choice((1, 2)), 0.5, 0.0, -rng.choice((0.45, 0.55))),
+        green=_row(
+            rng.choice((2, 3, 4)), 0.3, middle, barrier + rng.choice((0.3, 0.4, 0.5))
+        ),
+        orange=left + right,
+        start=(0.0, -0.2),
+        start_spread=float(rng.choice((0.1, 0.2))),
+        radius=radius,
+        max_speed=float(rng.choice((0.05, 0.1))),
+        actuation_cost=float(rng.choice((0.02, 0.05))),
     )
 
 
