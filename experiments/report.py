@@ -128,7 +128,8 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
             for word in ("yes", "not clear", "no, it is lower", "unknown")
             if word in said
         )
-        lines.append(f"- {favourite} better than {other}: {counts} of {len(said)}.")
+        if said:
+            lines.append(f"- {favourite} better than {other}: {counts} of {len(said)}.")
     return "\n".join(lines)
 
 
@@ -216,18 +217,15 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
         'seeds; "better?" says "yes" where the 95% interval of the difference of '
         "interquartile means is above 0.",
         table(shown, figure.favourite),
-        "**Measured here.**\n\n" + figure.conclusions(shown),
-    ]
-    if figure.more:
-        parts.append(figure.more)
-    parts += [
+        figure.conclusions(shown),
+        figure.more,
         "## Settings",
         "What differs from the appendix's defaults; the raw numbers are in the "
         f"CSV files under `{figure.name}/`, and `python -m experiments.{figure.name} "
         "--report` makes this page from them.",
         settings_table(shown),
     ]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:

@@ -47,12 +47,11 @@ def page() -> str:
             parts += [
                 figure.conclusions(shown),
                 f"[Tables, curves and settings]({figure.name}.md).",
+                figure.more,
             ]
-        if figure.more:
-            parts.append(figure.more)
         if missing:
             parts.append(f"Not run yet: {', '.join(missing)}.")
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
