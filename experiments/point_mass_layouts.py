@@ -37,12 +37,12 @@ def _row(count: int, spacing: float, x: float, y: float) -> Places:
 
 
 def draw(number: int) -> Layout:
-    """Layout `number`: below 1000 with a closed row of distractors, then with a gap."""
+    """Layout `number`: below 1000 greens behind distractors, then on two sides."""
     rng = np.random.default_rng(number)
-    return _closed(rng) if number < 1000 else _with_gap(rng)
+    return _behind(rng) if number < 1000 else _two_sides(rng)
 
 
-def _closed(rng: np.random.Generator) -> Layout:
+def _behind(rng: np.random.Generator) -> Layout:
     barrier = rng.choice((0.3, 0.35, 0.4, 0.45))
     return Layout(
         blue=_row(rng.choice((1, 1, 2)), 0.6, 0.0, -rng.choice((0.3, 0.4, 0.5))),
@@ -60,28 +60,30 @@ def _closed(rng: np.random.Generator) -> Layout:
     )
 
 
-def _with_gap(rng: np.random.Generator) -> Layout:
-    radius, gap = 0.12, rng.choice((0.08, 0.16, 0.24))
-    middle, barrier = rng.choice((0.0, 0.2)), rng.choice((0.15, 0.25))
-    wing = radius + gap / 2 + 0.2
-    count = int(rng.choice((2, 3)))
-    left = _row(count, 0.2, middle - wing - 0.1 * (count - 1) + 0.2, barrier)
-    right = _row(count, 0.2, middle + wing + 0.1 * (count - 1) - 0.2, barrier)
+def _two_sides(rng: np.random.Generator) -> Layout:
+    x, y = rng.choice((0.3, 0.4, 0.5)), rng.choice((0.1, 0.3, 0.5))
+    wall = int(rng.choice((1, 3)))
+    low = rng.choice((-0.6, -0.7))
+    blue = ((-0.5, low), (0.5, low), (0.0, low), (0.0, 0.85))
+    green = ((-x, y), (x, y), *(((0.0, y + 0.4),) if rng.random() < 0.5 else ()))
     return Layout(
-        blue=_row(rng.choice((1, 2)), 0.5, 0.0, -rng.choice((0.45, 0.55))),
-        green=_row(
-            rng.choice((2, 3, 4)), 0.3, middle, barrier + rng.choice((0.3, 0.4, 0.5))
+        blue=blue[: int(rng.choice((0, 1, 2)))],
+        green=tuple((round(float(a), 3), round(float(b), 3)) for a, b in green),
+        orange=(
+            *((0.0, round(float(y + 0.2 * (i - wall // 2)), 3)) for i in range(wall)),
+            *((side, float(y)) for side in (-0.75, 0.75)),
         ),
-        orange=left + right,
-        start=(0.0, -0.2),
-        start_spread=float(rng.choice((0.1, 0.2))),
-        radius=radius,
+        start=(0.0, -0.3),
+        start_spread=float(rng.choice((0.2, 0.3, 0.4))),
+        radius=float(rng.choice((0.1, 0.12, 0.15))),
         max_speed=float(rng.choice((0.05, 0.1))),
-        actuation_cost=float(rng.choice((0.02, 0.05))),
+        actuation_cost=float(rng.choice((0.02, 0.05, 0.1, 0.2))),
     )
 
 
-def evaluate(layout: Layout, seeds: int, total_steps: int) -> list[dict[str, object]]:
+def evaluate(
+    layout: Layout, seeds: int, total_steps: int, alpha: float
+) -> list[dict[str, object]]:
     """Train both agents; a row for each agent, learning rate and seed.
 
     "early" is the mean return over the second tenth of training, "final" over the last.
@@ -92,6 +94,7 @@ def evaluate(layout: Layout, seeds: int, total_steps: int) -> list[dict[str, obj
         config = presets.preset("point_mass", agent, "tuned").replace(
             total_steps=total_steps
         )
+        config = config.updated({"alpha": alpha})
         numbers = list(range(_FIRST_SEED, _FIRST_SEED + seeds))
         hyperparameters = [
             config.hyperparameters.replace(learning_rate=rate)
@@ -128,6 +131,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--total-steps", type=int, default=250_000)
+    parser.add_argument("--alpha", type=float, default=1.0, help="of PPO+GASIL")
     parser.add_argument(
         "--runs", type=pathlib.Path, default=pathlib.Path("runs", "layouts")
     )
@@ -139,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         path = options.runs / f"{number}.csv"
         if path.exists():
             continue
-        rows = evaluate(draw(number), options.seeds, options.total_steps)
+        rows = evaluate(draw(number), options.seeds, options.total_steps, options.alpha)
         with path.open("x", newline="") as file:
             writer = csv.DictWriter(file, ["layout", *rows[0]], lineterminator="\n")
             writer.writeheader()
