@@ -189,7 +189,7 @@ def read(folder: pathlib.Path) -> Checkpoint:
 
 def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
     """The newest checkpoint that is whole, and what is wrong with newer ones."""
-    damages = []
+    damages: list[str] = []
     for folder in reversed(_folders(root)):
         try:
             return read(folder), damages
@@ -201,7 +201,7 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 def best(root: pathlib.Path) -> Checkpoint | None:
     """The whole checkpoint with the highest "score" in its record, if one has any."""
     scores = _scores(_folders(root))
-    for folder in sorted(scores, key=scores.get, reverse=True):
+    for folder in sorted(scores, key=scores.__getitem__, reverse=True):
         with contextlib.suppress(ValueError):
             return read(folder)
     return None
@@ -222,7 +222,10 @@ def prune(root: pathlib.Path, keep: int) -> None:
     """Delete all but the newest `keep` and the best one."""
     folders = _folders(root)
     scores = _scores(folders)
-    kept = {*folders[-keep:], *([max(scores, key=scores.get)] if scores else [])}
+    kept = {
+        *folders[-keep:],
+        *([max(scores, key=scores.__getitem__)] if scores else []),
+    }
     for folder in folders:
         if folder not in kept:
             shutil.rmtree(folder)

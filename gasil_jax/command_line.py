@@ -66,10 +66,11 @@ def parse(
     try:
         with contextlib.redirect_stderr(printed), _REGISTRY:
             return tyro.cli(
-                tyro.conf.OmitArgPrefixes[options],
+                options,
                 args=arguments,
                 prog=f"python -m {program}",
-                **({} if default is None else {"default": default}),
+                config=(tyro.conf.OmitArgPrefixes,),
+                default=tyro.MISSING_NONPROP if default is None else default,
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):

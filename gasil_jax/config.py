@@ -18,8 +18,7 @@ from flax import struct
 Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
-@struct.dataclass
-class Hyperparameters:
+class Hyperparameters(struct.PyTreeNode):
     """Every float of the algorithms: a pytree, so a sweep is a `vmap` over leaves.
 
     Attributes:
@@ -37,7 +36,8 @@ class Hyperparameters:
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_entropy_coefficient: weight of the entropy of D's output.
       behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
-      sil_value_coefficient: weight of the value's part of the loss of PPO+SIL.
+      sil_coefficient: weight of the loss of PPO+SIL.
+      sil_value_coefficient: weight of the value's part in it.
     """
 
     learning_rate: float = 3e-4
@@ -52,6 +52,7 @@ class Hyperparameters:
     discriminator_learning_rate: float = 1e-4
     discriminator_entropy_coefficient: float = 1e-3
     behavior_cloning_coefficient: float = 0.1
+    sil_coefficient: float = 0.1
     sil_value_coefficient: float = 0.01
 
 
@@ -105,7 +106,7 @@ class Config:
     behavior_cloning_minibatch_size: int = 64
     sil_updates: int = 10
     sil_minibatch_size: int = 512
-    sil_buffer_steps: int = 100_000
+    sil_buffer_steps: int = 50_000
     learning_rate_schedule: Schedule = ()
     clip_epsilon_schedule: Schedule = ()
     alpha_schedule: Schedule = ()
@@ -130,7 +131,7 @@ class Config:
         """Iterations of Algorithm 1 in a run."""
         return math.ceil(self.total_steps / self.batch_steps)
 
-    def replace(self, **changes: object) -> "Config":
+    def replace(self, **changes: Any) -> "Config":
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
@@ -170,6 +171,7 @@ _HYPERPARAMETER_RANGES = {
     "discriminator_learning_rate": (0.0, math.inf, False),
     "discriminator_entropy_coefficient": (0.0, math.inf, True),
     "behavior_cloning_coefficient": (0.0, math.inf, True),
+    "sil_coefficient": (0.0, math.inf, True),
     "sil_value_coefficient": (0.0, math.inf, True),
 }
 

@@ -90,14 +90,16 @@ def drive(
     config, root = runs.config, folder / "checkpoints"
     last = config.num_iterations if until is None else until
     steps_of = lambda done: done * config.batch_steps * runs.num_members
-    found, damages = checkpoint.latest(root)
+    with progress.aside("reading the checkpoints"):
+        found, damages = checkpoint.latest(root)
     for damage in damages:
         instead = "starting anew" if found is None else f"using {found.folder.name}"
         print(f"warning: {damage}; {instead}", file=sys.stderr)
     first, states, size = 0, None, None
     if found is not None:
-        like = jax.eval_shape(lambda: runs.trim(runs.init()))
-        first, states = found.iteration, found.restore(like)
+        with progress.aside(f"restoring {found.folder.name}"):
+            like = jax.eval_shape(lambda: runs.trim(runs.init()))
+            first, states = found.iteration, found.restore(like)
         size = found.record["metrics_size"]
     elif (folder / "metrics.csv").exists():
         size = 0
@@ -110,15 +112,17 @@ def drive(
 
     progress.phase("training", steps_before + steps_of(first))
     saved_at = started = time.monotonic()
-    done, pace, recent = first, math.inf, []
+    done, pace = first, math.inf
+    recent: list[np.ndarray] = []
     every = schedule.every and math.ceil(schedule.every / config.batch_steps)
 
     def save() -> None:
         returns = np.concatenate(recent, axis=1) if recent else np.full((1, 1), np.nan)
         score = float(np.nanmean(returns)) if np.isfinite(returns).any() else None
         record = {"metrics_size": writer.size(), "score": score}
-        checkpoint.write(root, done, runs.trim(states), record)
-        checkpoint.prune(root, schedule.keep)
+        with progress.aside("saving a checkpoint"):
+            checkpoint.write(root, done, runs.trim(states), record)
+            checkpoint.prune(root, schedule.keep)
 
     while done < last and interruption.signal is None:
         counts = [runs.chunk, last - done]
@@ -144,8 +148,9 @@ def drive(
     train_seconds = time.monotonic() - started
     save()
     writer.close()
-    for tracker in trackers:
-        tracker.close()
+    with progress.aside("closing the trackers"):
+        for tracker in trackers:
+            tracker.close()
     if interruption.signal is not None and done < last:
         raise Interrupted(interruption.signal)
     return Outcome(

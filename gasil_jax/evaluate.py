@@ -23,6 +23,7 @@ from gasil_jax import (
 )
 from gasil_jax.config import Config
 from gasil_jax.networks import Policy
+from gasil_jax.progress import announced
 
 
 def evaluate(
@@ -50,7 +51,7 @@ def evaluate(
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
     """
-    network = Policy(config.hidden_sizes, env.action_size)
+    network: Any = Policy(config.hidden_sizes, env.action_size)
     low, high = getattr(env, "action_range", (-1.0, 1.0))
     reset_key, act_key = jax.random.split(key)
 
@@ -217,8 +218,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.episodes < 1:
             raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
         env, config, seeds, states = load(options.run, options.checkpoint)
-        task = getattr(env.unwrapped, "task", None)
-        if options.gymnasium and (task is None or options.stochastic):
+        locomotion = hasattr(env.unwrapped, "task")
+        if options.gymnasium and not (locomotion and not options.stochastic):
             raise ValueError(
                 "gymnasium is on: the run must be of a locomotion task, and "
                 "stochastic must be off"
@@ -227,10 +228,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     jax.config.update("jax_default_matmul_precision", "highest")
-    if options.gymnasium:
-        scores = _score_in_gymnasium(options, env, task.gymnasium_id, states, seeds)
-    else:
-        scores = _score(options, env, config, states, seeds)
+    with announced("evaluate", f"scoring {len(seeds)} policies"):
+        if options.gymnasium:
+            name = env.unwrapped.task.gymnasium_id
+            scores = _score_in_gymnasium(options, env, name, states, seeds)
+        else:
+            scores = _score(options, env, config, states, seeds)
     print("seed  episodes      return     spread  length")
     for i, seed in enumerate(seeds):
         returns, length = scores["episode_return"][i], scores["episode_length"][i]

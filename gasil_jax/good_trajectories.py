@@ -17,8 +17,7 @@ from flax import struct
 # environment, N environments.
 
 
-@struct.dataclass
-class GoodTrajectories:
+class GoodTrajectories(struct.PyTreeNode):
     """The best steps so far, best episode first, each in the order of time.
 
     Attributes:
@@ -41,8 +40,7 @@ class GoodTrajectories:
         return self.return_.shape[-1]
 
 
-@struct.dataclass
-class History:
+class History(struct.PyTreeNode):
     """The last H steps of each environment, a ring over time.
 
     Attributes:
@@ -60,8 +58,7 @@ class History:
     cursor: jax.Array
 
 
-@struct.dataclass
-class Episodes:
+class Episodes(struct.PyTreeNode):
     """Ended episodes on offer; entries with ``length == 0`` are none.
 
     Attributes:

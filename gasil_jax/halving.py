@@ -197,7 +197,7 @@ def candidates(
         paused = [
             i for i in there if max(scores[i]) == rung and math.isfinite(there[i])
         ]
-        for index in sorted(paused, key=there.get, reverse=True):
+        for index in sorted(paused, key=lambda i: there[i], reverse=True):
             others = [score for i, score in there.items() if i != index]
             if not _goes_on(others, there[index], reduction, least):
                 break

@@ -30,8 +30,10 @@ COLUMNS = (
 
 def versions() -> dict[str, str | None]:
     """Versions of what a result depends on; None for what isn't installed."""
-    packages = ("gasil_jax", "jax", "jaxlib", "flax", "optax", "brax")
-    packages += ("mujoco", "mujoco-mjx", "gymnasium", "numpy")
+    packages = (
+        *("gasil_jax", "jax", "jaxlib", "flax", "optax", "brax"),
+        *("mujoco", "mujoco-mjx", "gymnasium", "numpy"),
+    )
     return {"python": platform.python_version()} | {
         name: _version(name) for name in packages
     }
@@ -53,7 +55,7 @@ def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
 
 
 def _to_json(value: Any) -> Any:
-    if dataclasses.is_dataclass(value):
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return dataclasses.asdict(value)
     if isinstance(value, np.ndarray | np.generic | jax.Array):
         return np.asarray(value).tolist()

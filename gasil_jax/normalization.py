@@ -6,8 +6,7 @@ import jax.numpy as jnp
 from flax import struct
 
 
-@struct.dataclass
-class Normalizer:
+class Normalizer(struct.PyTreeNode):
     """Mean and variance of all observations so far.
 
     Attributes:

@@ -23,8 +23,10 @@ from gasil_jax import npz
 #: Normalized observations are clipped to plus and minus this.
 CLIP = 10.0
 
-_NEEDED = ("seeds", "final_return", "mean", "scale", "log_std", "low", "high")
-_NEEDED += ("kernel_0", "bias_0")
+_NEEDED = (
+    *("seeds", "final_return", "mean", "scale", "log_std", "low", "high"),
+    *("kernel_0", "bias_0"),
+)
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:

@@ -49,12 +49,12 @@ def save(
     """
     partial = path.with_name(path.name + ".partial")
     with partial.open("wb") as file:
-        np.savez(
-            file,
-            seeds=np.asarray(seeds, np.int64),
-            final_return=np.asarray(final_return, np.float64),
+        arrays: dict[str, Any] = {
+            "seeds": np.asarray(seeds, np.int64),
+            "final_return": np.asarray(final_return, np.float64),
             **weights(states, env),
-        )
+        }
+        np.savez(file, **arrays)
     partial.replace(path)
 
 

@@ -13,8 +13,7 @@ from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
 
 
-@struct.dataclass
-class Batch:
+class Batch(struct.PyTreeNode):
     """What PPO learns from; the leading axis is (steps,) or (minibatch,).
 
     Attributes:
@@ -39,8 +38,8 @@ def generalized_advantage_estimation(
     terminated: jax.Array,
     ended: jax.Array,
     *,
-    gamma: jax.Array,
-    gae_lambda: jax.Array,
+    gamma: jax.Array | float,
+    gae_lambda: jax.Array | float,
 ) -> jax.Array:
     """GAE(lambda), Schulman et al. 2016, equation 16: (time, env) -> (time, env).
 
@@ -128,7 +127,7 @@ def descend(
     params: Any,
     optimizer_state: Any,
     gradient: Any,
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     hyperparameters: Hyperparameters,
 ) -> tuple[Any, Any]:
     """One step of `optimizer` for one network: its new params and state."""
@@ -143,7 +142,7 @@ def descend_each(
     params: dict[str, Any],
     optimizer_state: dict[str, Any],
     gradient: dict[str, Any],
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     hyperparameters: Hyperparameters,
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     """`descend` for every network by name, each clipped and stepped for itself."""
@@ -171,7 +170,7 @@ def update(
     *,
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     value: Callable[[Any, jax.Array], jax.Array],
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     config: Config,
     hyperparameters: Hyperparameters,
 ) -> tuple[Any, Any, dict[str, jax.Array]]:

@@ -1,6 +1,10 @@
 """A live display of a run: a bar on a terminal, plain lines elsewhere."""
 
+import contextlib
+import sys
+import threading
 import time
+from collections.abc import Iterator
 from types import TracebackType
 
 import numpy as np
@@ -17,6 +21,30 @@ from rich.progress import (
 )
 
 _SECONDS_BETWEEN_LINES = 10.0
+_SECONDS_OF_SILENCE = 1.0
+
+
+@contextlib.contextmanager
+def announced(title: str, name: str) -> Iterator[None]:
+    """Say what is being done while this is entered, if it takes more than a second.
+
+    Args:
+      title: of the program or run, before the colon of the line on stderr.
+      name: of what is being done.
+    """
+    timer = threading.Timer(_SECONDS_OF_SILENCE, _line, (title, name))
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _line(title: str, text: str) -> None:
+    # In one write: a line of another thread's does not come between.
+    sys.stderr.write(f"{title}: {text}\n")
+    sys.stderr.flush()
 
 
 class Progress:
@@ -61,7 +89,23 @@ class Progress:
         self._steps_before = steps
         self._bar.update(self._task, status=name)
         if not self._live:
-            self._line(name)
+            _line(self._title, name)
+
+    @contextlib.contextmanager
+    def aside(self, name: str) -> Iterator[None]:
+        """Say what is done between two pieces of training, if it takes long.
+
+        Its time does not count in the speed.
+        """
+        started = time.monotonic()
+        status = self._bar.tasks[0].fields["status"]
+        self._bar.update(self._task, status=name)
+        with contextlib.ExitStack() as stack:
+            if not self._live:
+                stack.enter_context(announced(self._title, name))
+            yield
+        self._bar.update(self._task, status=status)
+        self._training_since += time.monotonic() - started
 
     def update(self, steps: int, returns: np.ndarray) -> None:
         """Show progress.
@@ -85,7 +129,4 @@ class Progress:
         if not self._live and due:
             self._last_line = now
             left = (self._total - steps) / speed
-            self._line(f"{status}, {left:,.0f} s left")
-
-    def _line(self, text: str) -> None:
-        print(f"{self._title}: {text}", file=self._console.file, flush=True)
+            _line(self._title, f"{status}, {left:,.0f} s left")

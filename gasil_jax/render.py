@@ -1,12 +1,16 @@
 """A film of a run's policy: ``python -m gasil_jax.render RUN --out walk.mp4``.
 
-Locomotion is drawn by MuJoCo off screen; the point mass as the path of some episodes.
+Locomotion is drawn by MuJoCo off screen, or played in a web page by Brax's viewer; the
+point mass is drawn as the path of an episode.
 """
 
+import copy
 import dataclasses
 import os
 import pathlib
 import sys
+import types
+import warnings
 from collections.abc import Sequence
 from typing import Annotated, Any, Literal
 
@@ -20,8 +24,10 @@ import tyro
 
 from gasil_jax import batch, command_line, evaluate, policy
 from gasil_jax.command_line import InputError
+from gasil_jax.progress import announced
 
-_SUFFIXES = (".mp4", ".gif", ".png")
+_PICTURES = (".mp4", ".gif", ".png")
+_PAGE = ".html"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,12 +36,12 @@ class Options:
 
     Attributes:
       run: the run's folder, of a finished run or not.
-      out: .mp4, which needs the package imageio-ffmpeg; .gif; or .png, a strip of
-        moments.
+      out: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a strip of
+        moments; or, of locomotion, .html, to turn and zoom in a browser.
       seed: whose policy; default the run's first.
       checkpoint: which policies: last, or best by mean return in training.
       steps: at most.
-      width: of a frame, pixels.
+      width: of a frame, pixels; a page fills its window.
       height: of a frame, pixels.
       stochastic: draw actions from the policy instead of taking its mean.
       key: of the episode's start and actions.
@@ -118,11 +124,13 @@ def point_mass_frames(
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     from gasil_jax import plotting
 
     places = np.stack([state.position for state in states])
     figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+    canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     frames = []
     for count in range(1, len(places) + 1):
@@ -132,10 +140,57 @@ def point_mass_frames(
         axes.plot(*places[:count].T, color="0.3", linewidth=1)
         axes.plot(*places[count - 1], "o", color="black", markersize=6)
         axes.set(xticks=[], yticks=[])
-        figure.canvas.draw()
-        frames.append(np.asarray(figure.canvas.buffer_rgba())[..., :3].copy())
+        canvas.draw()
+        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
     plt.close(figure)
     return frames, 10.0
+
+
+def locomotion_page(env: Any, states: Sequence[Any]) -> str:
+    """HTML that plays physics states in Brax's viewer, every one of them a frame.
+
+    The page holds model and states; the viewer's scripts come from the net.
+    """
+    import mujoco
+    from brax.base import Transform
+    from brax.io import html, mjcf
+
+    # Brax writes into the model that it is given, and loads it with MJX, which lacks
+    # humanoid's solver; none is needed to place bodies.
+    model = copy.copy(env.unwrapped.model)
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    with warnings.catch_warnings():
+        # That Brax's physics is not maintained: it is not used here.
+        warnings.simplefilter("ignore", UserWarning)
+        system = mjcf.load_model(model)
+    data = mujoco.MjData(env.unwrapped.model)
+    frames = []
+    for state in states:
+        data.qpos[:] = state.physics.qpos
+        mujoco.mj_kinematics(env.unwrapped.model, data)
+        # Brax numbers the bodies without the world.
+        placed = Transform(pos=data.xpos[1:].copy(), rot=data.xquat[1:].copy())
+        frames.append(types.SimpleNamespace(x=placed))
+    # Of a frame, where the model has that of a physics step.
+    system = system.tree_replace({"opt.timestep": env.unwrapped.dt})
+    return html.render(system, frames, height="100vh", colab=False)
+
+
+def save(
+    env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
+) -> int:
+    """Write physics states as what the suffix of `path` says; returns the frames.
+
+    Raises:
+      RuntimeError: a package or library is missing.
+    """
+    if path.suffix == _PAGE:
+        path.write_text(locomotion_page(env, states))
+        return len(states)
+    draw = locomotion_frames if hasattr(env.unwrapped, "model") else point_mass_frames
+    frames, fps = draw(env, states, size)
+    write(frames, fps, path)
+    return len(frames)
 
 
 def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
@@ -175,10 +230,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
     try:
         options = command_line.parse(Options, arguments, "gasil_jax.render")
-        if options.out.suffix not in _SUFFIXES:
-            raise InputError(
-                f"out is {options.out}: it must end in {', '.join(_SUFFIXES)}"
-            )
+        if options.out.suffix not in (*_PICTURES, _PAGE):
+            allowed = ", ".join((*_PICTURES, _PAGE))
+            raise InputError(f"out is {options.out}: it must end in {allowed}")
         if options.out.exists():
             raise InputError(f"out is {options.out}, which exists: name a new file")
         for name in ("steps", "width", "height"):
@@ -193,22 +247,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
             raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
         if not hasattr(env.unwrapped, "model") and not hasattr(env.unwrapped, "layout"):
             raise InputError("run is of an environment that can't be drawn")
+        if options.out.suffix == _PAGE and not hasattr(env.unwrapped, "model"):
+            raise InputError(
+                f"out is {options.out}, which is for locomotion: of the point mass it "
+                f"must end in {', '.join(_PICTURES)}"
+            )
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     drawn = policy.from_state(batch.member(states, seeds.index(seed)), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
-    path, total = episode(env, act, jax.random.key(options.key), options.steps)
-    draw = locomotion_frames if hasattr(env.unwrapped, "model") else point_mass_frames
+    with announced("render", "compiling and running the episode"):
+        path, total = episode(env, act, jax.random.key(options.key), options.steps)
     try:
-        frames, fps = draw(env, path, size)
-        write(frames, fps, options.out)
+        with announced("render", f"drawing {options.out}"):
+            num_frames = save(env, path, size, options.out)
     except (RuntimeError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     print(
         f"seed {seed}: return {total:.1f} in {len(path) - 1} steps, "
-        f"{len(frames)} frames in {options.out}"
+        f"{num_frames} frames in {options.out}"
     )
     return 0
 

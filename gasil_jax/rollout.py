@@ -9,8 +9,7 @@ from flax import struct
 from gasil_jax.networks import gaussian_log_prob
 
 
-@struct.dataclass
-class Rollout:
+class Rollout(struct.PyTreeNode):
     """One batch of experience; every field is (time, env, ...).
 
     Attributes:
@@ -47,8 +46,7 @@ class Rollout:
         return self.terminated | self.truncated
 
 
-@struct.dataclass
-class EnvironmentStates:
+class EnvironmentStates(struct.PyTreeNode):
     """Running episodes; every field is (env, ...).
 
     Attributes:
@@ -98,7 +96,7 @@ def collect(
     *,
     num_steps: int,
     max_episode_steps: int,
-    gamma: jax.Array,
+    gamma: jax.Array | float,
 ) -> tuple[EnvironmentStates, Rollout]:
     """Take `num_steps` in each environment; a fresh episode follows an ended one.
 

@@ -14,7 +14,7 @@ import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Annotated, Any, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import jax
 import jaxlib
@@ -28,6 +28,10 @@ from gasil_jax.config import Config, unknown, validate
 from gasil_jax.environments import Settings
 from gasil_jax.imitation import AGENTS
 from gasil_jax.interruption import Interrupted, Interruption
+from gasil_jax.progress import Progress, announced
+
+if TYPE_CHECKING:
+    from gasil_jax import batch, driver
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,7 +104,8 @@ def parse(
         missing = {f.name for f in fields if f.default is not None} - set(described)
         if missing:
             raise InputError(f"out is {began}, which another program has written")
-        before = kind(**{f.name: described.get(f.name) for f in fields})
+        values: dict[str, Any] = {f.name: described.get(f.name) for f in fields}
+        before = kind(**values)
         options = command_line.parse(kind, arguments, program, before)
         changed = run_folder.differences(vars(before), vars(options))
         if changed:
@@ -173,6 +178,16 @@ def check(options: Options) -> None:
         )
 
 
+def check_out(options: Options) -> None:
+    """Refuse a folder that can't be used before anything is built for it.
+
+    Raises:
+      InputError: why.
+    """
+    if options.out is not None:
+        run_folder.check(options.out, options.resume)
+
+
 def check_resources(
     options: Options, env: Any, config: Config, num_members: int
 ) -> None:
@@ -183,12 +198,14 @@ def check_resources(
     """
     from gasil_jax import resources
 
+    with announced(options.env, "starting the devices"):
+        devices = jax.devices()
     try:
         resources.check(
             env,
             config,
             num_members,
-            jax.devices(),
+            devices,
             options.out or pathlib.Path("runs"),
             # The best one, and one that is being written.
             options.keep_checkpoints + 2,
@@ -241,7 +258,8 @@ def _keep_compiled_programs() -> None:
     """
     # Before 0.12 XLA calls every program that it loads one for another processor.
     quiet = jaxlib.version.__version_info__ >= (0, 12)
-    if jax.config.jax_compilation_cache_dir is not None or not quiet:
+    config: Any = jax.config  # Its options are attributes that its type does not have.
+    if config.jax_compilation_cache_dir is not None or not quiet:
         return
     with contextlib.suppress(OSError):
         described = pathlib.Path("/proc/cpuinfo")
@@ -269,7 +287,8 @@ def make_env(options: Options) -> Any:
     Raises:
       InputError: the agent can't run in it.
     """
-    env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
+    with announced(options.env, "building the environment"):
+        env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
     try:
         training.check(env, options.config)
     except ValueError as error:
@@ -285,8 +304,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
-    from gasil_jax import batch, driver, logging, plotting, policy
-    from gasil_jax.progress import Progress
+    from gasil_jax import batch, driver
 
     config = options.config
     seeds = range(options.first_seed, options.first_seed + options.seeds)
@@ -294,6 +312,9 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
     total_steps = config.num_iterations * config.batch_steps * options.seeds
     title = f"{options.env} {config.agent}"
     with Interruption() as interruption, Progress(title, total_steps) as progress:
+        with progress.aside("starting the trackers"):
+            described = run_folder.flat(vars(options))
+            following = trackers.make(options.log, folder, described)
         runs = batch.make_batch(env, config, seeds)
         outcome = driver.drive(
             runs,
@@ -304,8 +325,24 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
             ),
             progress=progress,
             interruption=interruption,
-            trackers=trackers.make(options.log, folder, run_folder.flat(vars(options))),
+            trackers=following,
         )
+    with announced(title, "writing the curve, the policies and the summary"):
+        return _write_results(options, env, folder, runs, outcome)
+
+
+def _write_results(
+    options: Options,
+    env: Any,
+    folder: pathlib.Path,
+    runs: "batch.Batch",
+    outcome: "driver.Outcome",
+) -> dict[str, Any]:
+    """What a run leaves beside metrics and checkpoints; returns the summary."""
+    from gasil_jax import logging, plotting, policy
+
+    config = options.config
+    seeds = range(options.first_seed, options.first_seed + options.seeds)
     metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), options.seeds)
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     plotting.learning_curve(
@@ -381,6 +418,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     options = parse(Options, arguments, "gasil_jax.run", begun_run(arguments))
     check(options)
+    check_out(options)
     use_devices(options, options.seeds)
     env = make_env(options)
     check_resources(options, env, options.config, options.seeds)

@@ -7,6 +7,7 @@ import json
 import os
 import pathlib
 import socket
+import tempfile
 import time
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -17,6 +18,31 @@ from gasil_jax.environments import Settings
 
 _LOCK = ".lock"
 _CONFIG = "config.json"
+
+
+def check(out: pathlib.Path, resume: bool) -> None:
+    """Refuse a folder before a run is built for it; nothing new is left but a lock.
+
+    Raises:
+      InputError: it can't be written, is in use, or, unless `resume`, is used.
+    """
+    if out.is_dir():
+        with lock(create(out, "")):
+            if not (resume and is_described(out)):
+                refuse_used(out)
+        return
+    place = out
+    while not place.exists():
+        place = place.parent
+    try:
+        with tempfile.TemporaryDirectory(prefix=".writable-", dir=place):
+            pass
+    except OSError as error:
+        raise InputError(_unwritable(out, error)) from None
+
+
+def _unwritable(folder: pathlib.Path, error: OSError) -> str:
+    return f"out is {folder}, which can't be written: {error.strerror}"
 
 
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
@@ -41,9 +67,7 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
             number += 1
     except OSError as error:
         where = folder if out is None else out
-        raise InputError(
-            f"out is {where}, which can't be written: {error.strerror}"
-        ) from None
+        raise InputError(_unwritable(where, error)) from None
 
 
 @contextlib.contextmanager
@@ -145,8 +169,10 @@ def _as_tuples(value: Any) -> Any:
 
 
 #: What may differ between a run and its continuation.
-_FREE = ("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset")
-_FREE += ("log",)
+_FREE = (
+    *("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset"),
+    "log",
+)
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
@@ -170,7 +196,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
 
 def flat(described: Mapping[str, Any]) -> dict[str, Any]:
     """Every field by its own name, those in dataclasses too."""
-    fields = {}
+    fields: dict[str, Any] = {}
     for name, value in described.items():
         if dataclasses.is_dataclass(value):
             own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}

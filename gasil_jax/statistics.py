@@ -8,6 +8,7 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
 
     Half a quarter of fewer than four scores is a fraction of a score: the outermost
     ones that are left count in part, so that the result is continuous in the scores.
+    The package rliable drops whole scores: the same where four divides their number.
     """
     ordered = np.moveaxis(np.sort(scores, axis=axis), axis, -1)
     count = ordered.shape[-1]

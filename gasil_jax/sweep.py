@@ -14,6 +14,7 @@ shards/3-of-8, without the tables, which gasil_jax.merge makes of all shards.
 import argparse
 import dataclasses
 import itertools
+import json
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -53,10 +54,13 @@ class PointOptions(run.Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
         ranges of the paper's appendix.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in
+        place of grid and random.
     """
 
     grid: tuple[str, ...] = ()
     random: int | None = None
+    points_file: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,10 +93,7 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name not in kinds:
-            raise InputError(
-                f"grid has {name!r}, which can't vary: did you mean "
-                f"{nearest(name, tuple(kinds))!r}? (one of {', '.join(kinds)})"
-            )
+            raise InputError(f"grid: {_unknown_name(name)}")
         try:
             values[name] = tuple(kinds[name](value) for value in listed.split(","))
         except ValueError:
@@ -103,16 +104,67 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     return values
 
 
+def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The points that a file lists.
+
+    Raises:
+      InputError: it can't be read, or has something else in it.
+    """
+    try:
+        points = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
+    if not isinstance(points, list) or not points:
+        raise InputError(
+            f"points_file is {path}: it must hold a list of points, one or more"
+        )
+    kinds = {**_HYPERPARAMETERS, **_CONFIG}
+    for point in points:
+        if not isinstance(point, dict):
+            raise InputError(f"points_file is {path}: {point!r} is not a point")
+        for name, value in point.items():
+            if name not in kinds:
+                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
+            whole = kinds[name] is int
+            if isinstance(value, bool) or not isinstance(
+                value, int if whole else int | float
+            ):
+                kind = "a whole number" if whole else "a number"
+                raise InputError(
+                    f"points_file is {path}: {name} is {value!r}, not {kind}"
+                )
+    return [
+        {name: kinds[name](value) for name, value in point.items()} for point in points
+    ]
+
+
+def _unknown_name(name: str) -> str:
+    kinds = (*_HYPERPARAMETERS, *_CONFIG)
+    return (
+        f"{name!r} can't vary: did you mean {nearest(name, kinds)!r}? "
+        f"(one of {', '.join(kinds)})"
+    )
+
+
 def make_points(options: PointOptions) -> list[dict[str, Any]]:
     """The points of a sweep, without repetitions.
 
     Raises:
       InputError: there is nothing to vary.
     """
-    values = parse_grid(options.grid)
+    if options.points_file is not None:
+        if options.grid or options.random is not None:
+            raise InputError("points_file stands in place of grid and random")
+        return read_points(pathlib.Path(options.points_file))
+    values: Mapping[str, tuple[Any, ...]] = parse_grid(options.grid)
     if options.random is None:
         if not values:
-            raise InputError("grid is empty: it must be NAME=VALUE,... or use --random")
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random or "
+                "--points-file"
+            )
         return [
             dict(zip(values, point, strict=True))
             for point in itertools.product(*values.values())
@@ -199,19 +251,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     given, others = _placement(arguments)
     if given.launcher is not None:
-        _launch(run.parse(Options, arguments, _PROGRAM), others)
-        return
-    if given.shard is None:
+        options = run.parse(Options, arguments, _PROGRAM)
+        _launch(options, given.launcher, others)
+    elif given.shard is not None:
+        _train_shard(arguments, shards.parse(given.shard), given.out)
+    else:
         options = run.parse(Options, arguments, _PROGRAM, run.begun_run(arguments))
-    else:
-        options = _parse_shard(arguments, given)
-    points, programs = plan(options)
-    if options.shards is not None:
-        raise InputError(f"shards is {options.shards}: it is of --launcher")
-    if options.shard is None:
-        _train_whole(options, points, programs)
-    else:
-        _train_shard(options, points, programs)
+        _train_whole(options)
 
 
 def _placement(
@@ -223,20 +269,6 @@ def _placement(
         # Without its value it is refused where everything is parsed.
         parser.add_argument(name, nargs="?")
     return parser.parse_known_args(arguments)
-
-
-def _parse_shard(arguments: Sequence[str] | None, given: argparse.Namespace) -> Options:
-    """Options of a shard, on top of its own where it has begun."""
-    if given.out is None:
-        raise InputError("shard needs --out and the folder of the whole sweep")
-    whole = pathlib.Path(given.out)
-    shard = shards.parse(given.shard)
-    shards.refuse_whole(whole)
-    shards.refuse_recut(whole, shard)
-    folder = shard.folder(whole)
-    began = folder if run_folder.is_described(folder) else None
-    options = run.parse(Options, arguments, _PROGRAM, began)
-    return dataclasses.replace(options, out=folder, resume=True)
 
 
 def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
@@ -267,11 +299,18 @@ def prepare(options: PointOptions, programs: Sequence[Program]) -> Any:
     return env
 
 
-def _train_whole(
-    options: Options, points: Sequence[Point], programs: Sequence[Program]
-) -> None:
+def _plan_here(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
+    points, programs = plan(options)
+    if options.shards is not None:
+        raise InputError(f"shards is {options.shards}: it is of --launcher")
+    return points, programs
+
+
+def _train_whole(options: Options) -> None:
+    points, programs = _plan_here(options)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
+    run.check_out(options)
     env = prepare(options, programs)
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
@@ -281,26 +320,38 @@ def _train_whole(
 
 
 def _train_shard(
-    options: Options, points: Sequence[Point], programs: Sequence[Program]
+    arguments: Sequence[str] | None, shard: shards.Shard, out: str | None
 ) -> None:
-    programs = shards.share(programs, shards.parse(options.shard))
-    trained = sweep_tables.Trained(options.out, programs)
+    """Train a shard of the sweep in `out`, or go on with it."""
+    if out is None:
+        raise InputError("shard needs --out and the folder of the whole sweep")
+    whole = pathlib.Path(out)
+    shards.refuse_whole(whole)
+    shards.refuse_recut(whole, shard)
+    place = shard.folder(whole)
+    began = place if run_folder.is_described(place) else None
+    options = run.parse(Options, arguments, _PROGRAM, began)
+    options = dataclasses.replace(options, out=place, resume=True)
+    points, programs = _plan_here(options)
+    programs = shards.share(programs, shard)
+    trained = sweep_tables.Trained(place, programs)
     if not trained.unfinished():
-        print(f"shard {options.shard} is done, in {options.out}")
+        print(f"shard {shard} is done, in {place}")
         return
+    run.check_out(options)
     env = prepare(options, programs)
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
     speed = sweep_tables.speed(trained.trainings())
     print(
-        f"shard {options.shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
+        f"shard {shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
         f"on {speed['device']}, in {folder}"
     )
 
 
-def _launch(options: Options, others: Sequence[str]) -> None:
+def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     """Have the launcher run a command for each shard, and merge."""
-    launch.check(options.launcher)
+    launch.check(launcher)
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")
     if options.shards is None or options.shards < 1:
@@ -319,7 +370,7 @@ def _launch(options: Options, others: Sequence[str]) -> None:
         f"shard {shard}": [*others, *where, "--shard", str(shard)] for shard in every
     }
     try:
-        launch.LAUNCHERS[options.launcher](_PROGRAM, jobs, options.devices)
+        launch.LAUNCHERS[launcher](_PROGRAM, jobs, options.devices)
     except Interrupted as interrupted:
         interrupted.add_note("go on with the same command")
         raise

@@ -79,8 +79,9 @@ class Trained:
         ]
 
     def trainings(self) -> list[dict[str, Any]]:
-        """What `read_training` reads, of each program; they must be finished."""
-        return [read_training(self.folder, program) for program in self.programs]
+        """What `read_training` reads, of each program that is finished."""
+        read = [read_training(self.folder, program) for program in self.programs]
+        return [training for training in read if training is not None]
 
     def members(self) -> dict[Member, dict[str, np.ndarray]]:
         """Every metric of every member, (iterations,) each; NaN where there is none.
@@ -129,7 +130,7 @@ def write(
             for i in range(len(points))
         ]
     )
-    diverged = (curves["skipped_updates"] > 0).any(axis=2)
+    diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     names = sorted({name for point in points for name in point})
     with (folder / "results.csv").open("w", newline="") as file:
         writer = csv.writer(file)
@@ -192,7 +193,7 @@ def _curves(
     points: Sequence[Point],
     seeds: Sequence[int],
     members: Mapping[Member, Mapping[str, np.ndarray]],
-) -> dict[str, np.ndarray]:
+) -> dict[str, Any]:
     """Every metric, (points, seeds, iterations)."""
     # Points may differ in batch_steps, and so in iterations.
     length = max(len(metrics["env_steps"]) for metrics in members.values())

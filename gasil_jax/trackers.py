@@ -4,8 +4,11 @@ A tracker is given what metrics.csv is given: "mean/NAME" is a metric's mean ove
 members, "episode_return/LABEL" a member's own; steps are environment steps of a member.
 """
 
+import contextlib
 import importlib
+import os
 import pathlib
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
 
@@ -41,14 +44,16 @@ class _WeightsAndBiases:
     def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
         import wandb
 
-        # A run that goes on is the same run there; WANDB_MODE=offline needs no account.
+        # A run that goes on is the same run there, though it may get more steps;
+        # WANDB_MODE=offline needs no account.
         self._run = wandb.init(
-            project="gasil_jax",
+            project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
             name=folder.name,
             dir=str(folder),
-            id=f"{folder.name}-{config['first_seed']}",
+            id=_identifier(folder / "wandb-id"),
             resume="allow",
             config=dict(config),
+            allow_val_change=True,
         )
 
     def log(self, step: int, scalars: Mapping[str, float]) -> None:
@@ -56,6 +61,13 @@ class _WeightsAndBiases:
 
     def close(self) -> None:
         self._run.finish()
+
+
+def _identifier(path: pathlib.Path) -> str:
+    """What a file holds that is written once: folders of one name are told apart."""
+    with contextlib.suppress(FileExistsError), path.open("x") as file:
+        file.write(uuid.uuid4().hex)
+    return path.read_text()
 
 
 def _as_text(config: Mapping[str, Any]) -> str:
@@ -93,7 +105,7 @@ def make(
     Args:
       names: of `TRACKERS`.
       folder: of the run; its name is the run's.
-      config: what to show of the run, "first_seed" among it.
+      config: what to show of the run.
     """
     return [TRACKERS[name][1](folder, config) for name in names]
 

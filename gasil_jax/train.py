@@ -4,8 +4,7 @@ Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or
 any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +19,7 @@ from gasil_jax.networks import Policy, Value
 Metrics = dict[str, jax.Array]
 
 
-@struct.dataclass
-class TrainState:
+class TrainState(struct.PyTreeNode):
     """All that a run needs to go on, and nothing that it can do without.
 
     Attributes:
@@ -51,10 +49,11 @@ class TrainState:
 
 def max_episode_steps(env: Any, config: Config) -> int:
     """Steps after which an episode is truncated, at the latest."""
-    return config.max_episode_steps or getattr(env, "episode_length", 1000)
+    return config.max_episode_steps or int(getattr(env, "episode_length", 1000))
 
 
-def _networks(env: Any, config: Config) -> tuple[Policy, Value]:
+def _networks(env: Any, config: Config) -> tuple[Any, Any]:
+    # Flax says of `apply` that it may give changed variables too: Any is narrower.
     return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
 
 
@@ -235,9 +234,16 @@ def check(env: Any, config: Config) -> None:
     AGENTS[config.agent].check(config, env.observation_size, env.action_size)
 
 
-def make_train(
-    env: Any, config: Config
-) -> Callable[[jax.Array, Hyperparameters | None], tuple[TrainState, Metrics]]:
+class Train(Protocol):
+    """A whole run: a key, consumed, to the last state and metrics (iterations,)."""
+
+    def __call__(
+        self, key: jax.Array, hyperparameters: Hyperparameters | None = None
+    ) -> tuple[TrainState, Metrics]:
+        """Train; default hyperparameters are the configuration's."""
+
+
+def make_train(env: Any, config: Config) -> Train:
     """A pure function that trains from nothing to `config.total_steps`.
 
     Args:

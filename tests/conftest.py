@@ -5,6 +5,8 @@ import os
 import shutil
 import tempfile
 
+import pytest
+
 os.environ.setdefault("JAX_NUM_CPU_DEVICES", "2")
 if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     # Of this session alone; its workers and the programs that it starts share it.
@@ -15,3 +17,28 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 from gasil_envs.physics import native
 
 native.reserve_threads(2)
+
+
+@pytest.fixture(scope="session")
+def untrained_hopper(tmp_path_factory):
+    """The folder of a run on hopper with a first checkpoint: no training compiles."""
+    import jax
+    import numpy as np
+
+    import gasil_jax
+    from gasil_jax import checkpoint, run
+    from gasil_jax.environments import Settings
+
+    out = tmp_path_factory.mktemp("hopper") / "run"
+    config = gasil_jax.Config(
+        num_envs=1, batch_steps=64, hidden_sizes=(8,), discriminator_hidden_sizes=(8,)
+    )
+    settings = Settings(physics="mujoco")
+    options = run.Options(env="hopper", settings=settings, config=config)
+    out.mkdir()
+    run.write_config(options, out)
+    env = run.make_env(options)
+    init = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))
+    states = jax.jit(init)(np.arange(1, dtype=np.uint32))
+    checkpoint.write(out / "checkpoints", 0, states, {"score": None})
+    return out

@@ -1,12 +1,220 @@
-"""The experiments run from end to end at toy size."""
+"""The experiments at toy size, from end to end; pages are what their CSV files say."""
 
-from experiments import point_mass
+import collections
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+from experiments import (
+    command,
+    comparison,
+    delayed_mujoco,
+    hyperparameters,
+    mujoco,
+    point_mass,
+    point_mass_moments,
+    random_search,
+    report,
+    stochastic_walker2d,
+    summary,
+    trials,
+)
+
+TOY = (
+    *("--batch-steps", "256", "--num-envs", "4", "--hidden-sizes", "8"),
+    *("--discriminator-hidden-sizes", "8", "--num-epochs", "1"),
+)
 
 
-def test_the_point_mass_is_trained_and_drawn(tmp_path, capsys):
-    size = ("--seeds", "2", "--total-steps", "10240", "--moments", "5")
-    assert point_mass.main([*size, "--out", str(tmp_path)]) == 0
-    assert "ppo+gasil  final return" in capsys.readouterr().out
-    names = {path.name for path in tmp_path.iterdir()}
-    assert names == {*("point_mass_curves.png", "point_mass_moments.png")}
-    assert point_mass.main(["--moments", "2"]) == 2
+@pytest.fixture
+def toy(monkeypatch):
+    """Every trial on the point mass, with small networks and batches."""
+    monkeypatch.setattr(trials, "_FLAGS", ("--preset", "paper", *TOY))
+    for module in (comparison, stochastic_walker2d, hyperparameters, random_search):
+
+        def make(*arguments, make=module.make):
+            return [
+                dataclasses.replace(trial, env="point_mass")
+                for trial in make(*arguments)
+            ]
+
+        monkeypatch.setattr(module, "make", make)
+
+
+@pytest.mark.parametrize(
+    ("module", "only"),
+    [
+        (mujoco, "hopper/ppo"),
+        (delayed_mujoco, "ant/ppo+bc"),
+        (stochastic_walker2d, "noise 0.05/ppo"),
+        (hyperparameters, "discriminator_updates/1"),
+    ],
+)
+def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, capsys):
+    name = module.FIGURE.name
+    folders = ("--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results"))
+    arguments = ("--only", only, "--seeds", "2", "--total-steps", "512", *folders)
+    assert module.main([*arguments, "--part", "1/1"]) == 0
+    with (tmp_path / "results" / name / f"{only}.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["seed"] for row in rows} == {"0", "1"}
+    curves = tmp_path / "runs" / name / only / "1-of-1" / "curves.npz"
+    returns = np.load(curves)["episode_return"][0]
+    for row in rows:
+        iteration = int(row["env_steps"]) // 256 - 1
+        value = returns[int(row["seed"]), iteration]
+        expected = "" if np.isnan(value) else f"{value:.6g}"
+        assert row["episode_return"] == expected
+    page = tmp_path / "results" / f"{name}.md"
+    assert only.split("/")[0] in page.read_text()
+    # Nothing is trained twice, and other settings do not get in between.
+    capsys.readouterr()
+    assert module.main(arguments) == 0
+    assert f"{name}: {only}" not in capsys.readouterr().out
+    changed = [*arguments, "--total-steps", "1024", "--report"]
+    assert module.main(changed) == 2
+    assert "is of other settings" in capsys.readouterr().err
+
+
+def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
+    monkeypatch.setitem(random_search.SPACES, "ppo", {"learning_rate": (1e-3, 1e-4)})
+    monkeypatch.setattr(random_search, "_RUNS", 4)
+    monkeypatch.setattr(trials, "RESULTS", tmp_path / "results")
+    folders = ("--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results"))
+    arguments = ("--only", "hopper/ppo", "--total-steps", "512", *folders)
+    for part in ("1/2", "2/2"):
+        assert random_search.main([*arguments, "--part", part]) == 0
+    assert not (tmp_path / "results").exists()
+    assert random_search.main([*arguments, "--report"]) == 0
+    with (tmp_path / "results" / "random_search" / "hopper" / "ppo.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    final = {}
+    for row in rows:
+        final.setdefault(int(row["point"]), []).append(float(row["episode_return"]))
+    assert {(row["point"], row["seed"]) for row in rows} == {
+        (point, seed) for point in "01" for seed in ("1000", "1001")
+    }
+    better = max(final, key=lambda point: np.mean(final[point]))
+    chosen = random_search.best("hopper", "ppo", 1)
+    assert chosen == {"learning_rate": (1e-3, 1e-4)[better]}
+    assert random_search.best("hopper", "ppo", random_search.DELAY) is None
+
+
+@pytest.mark.parametrize(
+    ("points", "seeds", "parts"),
+    [(16, 2, 16), (16, 2, 32), (16, 2, 5), (1, 10, 3), (1, 10, 12), (4, 8, 8)],
+)
+def test_parts_cover_every_run_once(points, seeds, parts):
+    every = tuple({"alpha": float(number)} for number in range(points))
+    trial = trials.Trial("a/b", "hopper", "ppo", points=every, seeds=seeds)
+    seen = collections.Counter()
+    for part in range(1, parts + 1):
+        share = trials.divide(trial, part, parts)
+        for point in () if share is None else share.points:
+            for offset in range(share.seeds):
+                seen[point["alpha"], share.first_seed + offset] += 1
+    assert len(seen) == points * seeds and set(seen.values()) == {1}
+
+
+def test_points_are_drawn_equally_often():
+    space = random_search.SPACES["ppo+gasil"]
+    points = random_search.draw(space, 16)
+    assert len({tuple(point.items()) for point in points}) == 16
+    for name, values in space.items():
+        counts = collections.Counter(point[name] for point in points)
+        assert counts == dict.fromkeys(values, 16 // len(values))
+    for env, agent in (("hopper", "ppo"), ("ant", "ppo+gasil")):
+        trial = random_search.search(env, agent, 20)
+        assert len(trial.points) * trial.seeds == 32
+
+
+def test_a_difference_and_its_interval():
+    rng = np.random.default_rng(3)
+    ours, other = rng.normal(5.0, 1.0, 10), rng.normal(0.0, 1.0, 10)
+    middle, low, high = report.difference(ours, other)
+    assert 3.0 < low < middle < high < 7.0
+    assert report.verdict(low, high) == "yes"
+    assert report.verdict(-high, -low) == "no, it is lower"
+    assert report.verdict(*report.difference(ours, ours)[1:]) == "not clear"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--only", "hoper"), "only is 'hoper'"),
+        (("--part", "3/2"), "part is '3/2'"),
+        (("--seeds", "0"), "seeds is 0"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
+    assert mujoco.main([*arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+PUBLISHED = (
+    point_mass,
+    mujoco,
+    delayed_mujoco,
+    stochastic_walker2d,
+    hyperparameters,
+)
+
+
+@pytest.mark.parametrize("module", [*PUBLISHED, random_search])
+def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypatch):
+    """A page made anew from the committed CSV files is the committed page."""
+    wanted = []
+    monkeypatch.setattr(report, "draw", lambda shown, path: None)
+
+    def remember(figure, make, quick, arguments, write=report.write):
+        wanted.extend(make())
+        return write
+
+    monkeypatch.setattr(command, "main", remember)
+    write = module.main()
+    page = trials.RESULTS / f"{module.FIGURE.name}.md"
+    if not page.exists():
+        pytest.skip("not run yet")
+    target = tmp_path / "results"
+    target.mkdir()
+    (target / module.FIGURE.name).symlink_to(trials.RESULTS / module.FIGURE.name)
+    write(module.FIGURE, wanted, target)
+    assert (target / page.name).read_text() == page.read_text()
+    # The files say themselves what they are of.
+    for trial in wanted:
+        described = trials.RESULTS / module.FIGURE.name / f"{trial.name}.json"
+        if described.exists():
+            settings = json.loads(described.read_text())["settings"]
+            assert settings == json.loads(json.dumps(trial.settings()))
+
+
+def test_the_summary_is_that_of_the_csv_files():
+    path = trials.RESULTS / "README.md"
+    assert path.read_text() == summary.page()
+
+
+def test_an_optimum_is_named_by_where_it_is(tmp_path):
+    def results(mean):
+        returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
+        trial = trials.Trial("x/y", "hopper", "ppo")
+        return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
+
+    shown = {"a": {"1": results(1.0), "2": results(9.0), "3": results(8.0)}}
+    said = report.optimum(shown)
+    assert "2 is best, in the middle; better than 1: yes, better than 3: yes" in said
+    shown = {"a": {"1": results(1.0), "2": results(0.9)}}
+    assert "1 is best, at an end; better than 2: yes" in report.optimum(shown)
+
+
+def test_moments_of_the_point_mass_are_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr(point_mass_moments, "SHARES", (0.0, 1.0))
+    monkeypatch.setattr(point_mass, "AGENTS", ("ppo+gasil",))
+    arguments = ["--total-steps", "6144", "--out", str(tmp_path)]
+    assert point_mass_moments.main(arguments) == 0
+    picture = (tmp_path / "point_mass_moments.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    assert point_mass_moments.main(["--total-steps", "0"]) == 2

@@ -1,5 +1,6 @@
 """What the README tells people to type works."""
 
+import itertools
 import pathlib
 import re
 import shlex
@@ -21,32 +22,109 @@ from gasil_jax import (
     run,
     sweep,
 )
+from gasil_jax import export_minari as export
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
-SCALING = (README.parent / "docs" / "scaling.md").read_text()
+DOCUMENTS = (README, *sorted((README.parent / "docs").glob("*.md")))
 
 PROGRAMS = {
     f"gasil_jax.{module.__name__.split('.')[-1]}": module
-    for module in (run, sweep, halving, merge, evaluate, plot, render)
+    for module in (run, sweep, halving, merge, evaluate, plot, render, export)
+}
+SMALL = (
+    *("--total-steps", "256", "--batch-steps", "128", "--num-envs", "2"),
+    *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
+    *("--discriminator-hidden-sizes", "8"),
+)
+#: What stands for an option's value when a command is run.
+TOY = {"--env": "point_mass", "--seeds": "2", "--episodes": "2"}
+#: In a command that needs a run of a locomotion task.
+LOCOMOTION = ("--gymnasium", ".html")
+#: How commands begin that are not run here, and why.
+NOT_RUN = {
+    "python -m pip install": "it changes the environment; .ci/run does it",
+    "python -m experiments.benchmark": "it measures for minutes",
+    "python -m gasil_jax.sweep --env hopper --num-envs 32": "it measures on GPUs",
+    "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
+    "and tests/test_ray.py train shards",
+    "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",
+    "python -m gasil_jax.halving": "tests/test_halving.py",
 }
 
 
 def commands():
-    """Lines that start with $, those that end with a backslash joined."""
-    for block in re.findall(r"```console\n(.*?)```", TEXT + SCALING, re.DOTALL):
+    """Lines that start with $, those that end with a backslash joined, once each.
+
+    Without the variables that are set before a command.
+    """
+    text = "\n".join(path.read_text() for path in DOCUMENTS)
+    found = {}
+    for block in re.findall(r"```console\n(.*?)```", text, re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
-                yield re.sub(r"^[A-Z_]+=\S+ ", "", line[2:])  # without variables
+                line = re.sub(r"^[A-Z_]+=\S+ ", "", line[2:])
+                found[shlex.join(shlex.split(line, comments=True))] = None
+    return list(found)
 
 
-@pytest.mark.parametrize(
-    "line", [line for line in commands() if line.startswith("python -m gasil_jax")]
-)
+OURS = [line for line in commands() if line.startswith("python -m gasil_jax")]
+
+
+@pytest.mark.parametrize("line", OURS)
 def test_a_command_is_understood(line):
-    _, _, program, *arguments = shlex.split(line, comments=True)
+    _, _, program, *arguments = shlex.split(line)
     kind = PROGRAMS[program].Options
     command_line.parse(kind, arguments, program)
+
+
+def test_other_commands_are_named_with_a_reason():
+    for line in commands():
+        assert line in OURS or any(map(line.startswith, NOT_RUN)), line
+    for start in NOT_RUN:
+        assert any(line.startswith(start) for line in commands()), start
+
+
+def as_toy(line, finished, locomotion, folder):
+    """The program and the arguments of a command, made small, writing to `folder`."""
+    _, _, program, *arguments = shlex.split(line)
+    needs_locomotion = any(mark in line for mark in LOCOMOTION)
+    for i, (option, value) in enumerate(zip(["", *arguments], arguments)):
+        if option in TOY:
+            arguments[i] = TOY[option]
+        elif option == "--out":
+            arguments[i] = str(folder / value)
+        elif value == "RUN":
+            arguments[i] = str(locomotion if needs_locomotion else finished)
+    if program in ("gasil_jax.run", "gasil_jax.sweep"):
+        arguments += [*SMALL, "--out", str(folder)]
+    return PROGRAMS[program], arguments
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
+def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper):
+    """On the point mass and for some hundred steps; the runs come before the rest."""
+    pytest.importorskip("minari")
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    wanted = [line for line in OURS if not line.startswith(tuple(NOT_RUN))]
+    training = [line for line in wanted if line.startswith("python -m gasil_jax.run")]
+    assert training
+    finished = tmp_path / "0"
+    rest = [line for line in wanted if line not in training]
+    for number, line in enumerate([*training, *rest]):
+        folder = tmp_path / str(number)
+        if line in rest:
+            folder.mkdir()
+        program, arguments = as_toy(line, finished, untrained_hopper, folder)
+        status = program.main(arguments)
+        captured = capsys.readouterr()
+        assert status == 0, (line, captured.err)
+        assert captured.out, line
+        # What a command names as its output is there.
+        for option, value in itertools.pairwise(shlex.split(line)):
+            if option == "--out":
+                assert (folder / value).stat().st_size > 0, line
 
 
 def test_options_in_the_table_exist():
@@ -85,13 +163,10 @@ def test_the_python_runs(tmp_path, monkeypatch):
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
 
 
-def test_the_example_runs(tmp_path, monkeypatch, capsys):
+def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     import runpy
 
-    env = gasil_jax.make_env("hopper", physics="mujoco")
-    states = jax.vmap(
-        lambda seed: gasil_jax.init(env, gasil_jax.Config(), jax.random.key(seed))
-    )(np.arange(1, dtype=np.uint32))
+    env, _, _, states = evaluate.load(untrained_hopper)
     policy.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
     script = README.parent / "examples" / "gymnasium_rollout.py"
     arguments = [str(script), str(tmp_path), "Hopper-v5", "--episodes", "2"]

@@ -1,13 +1,23 @@
 """Films of a run's policy."""
 
+import base64
+import json
+import pathlib
+import re
 import subprocess
 import sys
+import types
+import zlib
 
+import gymnasium
+import jax
+import mujoco
 import numpy as np
 import pytest
 from PIL import Image
 
-from gasil_jax import render, run
+from gasil_envs import locomotion
+from gasil_jax import batch, evaluate, policy, render, run
 
 SMALL = (
     *("--seeds", "2", "--total-steps", "256", "--batch-steps", "128"),
@@ -40,11 +50,8 @@ def test_the_point_mass_is_drawn(point_mass, suffix, tmp_path, capsys):
         assert np.abs(np.asarray(image.convert("RGB"), int) - first).max() > 50
 
 
-def test_locomotion_is_drawn(tmp_path):
-    out = tmp_path / "run"
-    arguments = ("--env", "hopper", "--physics", "mujoco", *SMALL, "--out", str(out))
-    assert run.main(arguments) == 0
-    path = tmp_path / "film.gif"
+def test_locomotion_is_drawn(untrained_hopper, tmp_path):
+    out, path = untrained_hopper, tmp_path / "film.gif"
     # In a process of its own: MuJoCo chooses its OpenGL when it is imported.
     command = [sys.executable, "-m", "gasil_jax.render", str(out), "--steps", "40"]
     result = subprocess.run(
@@ -60,10 +67,53 @@ def test_locomotion_is_drawn(tmp_path):
     assert np.asarray(image.convert("RGB")).std() > 10
 
 
+def system_in(page):
+    """The model and states that a page for Brax's viewer holds."""
+    encoded = re.search(r'"([A-Za-z0-9+/=]{300,})"', page).group(1)
+    return json.loads(zlib.decompress(base64.b64decode(encoded)))
+
+
+def test_a_page_has_the_simulations_bodies(untrained_hopper, tmp_path, capsys):
+    path = tmp_path / "walk.html"
+    arguments = [str(untrained_hopper), "--out", str(path), "--steps", "3"]
+    assert render.main(arguments) == 0
+    assert "4 frames" in capsys.readouterr().out
+    shown = system_in(path.read_text())
+    env, _, _, states = evaluate.load(untrained_hopper)
+    act = policy.from_state(batch.member(states, 0), env)
+    mean = lambda observation, key: act(observation)
+    frames, _ = render.episode(env, mean, jax.random.key(0), 3)
+    model = env.unwrapped.model
+    assert shown["opt"]["timestep"] == pytest.approx(env.unwrapped.dt)
+    assert set(shown["geoms"]) == {"torso", "thigh", "leg", "foot", "world"}
+    assert len(shown["states"]["x"]) == len(frames) == 4
+    data = mujoco.MjData(model)
+    for placed, state in zip(shown["states"]["x"], frames, strict=True):
+        data.qpos[:] = state.physics.qpos
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(placed["pos"], data.xpos[1:], atol=1e-6)
+        np.testing.assert_allclose(placed["rot"], data.xquat[1:], atol=1e-6)
+    # The model that simulates is as it was: Brax opens limits of what it is given.
+    assert np.isfinite(model.jnt_range).all()
+
+
+@pytest.mark.parametrize("name", locomotion.TASKS)
+def test_every_model_makes_a_page(name):
+    assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+    path = assets / locomotion.TASKS[name].xml
+    model = mujoco.MjModel.from_xml_path(str(path))
+    env = types.SimpleNamespace(model=model, dt=0.02)
+    env.unwrapped = env
+    start = types.SimpleNamespace(qpos=model.qpos0)
+    page = render.locomotion_page(env, [types.SimpleNamespace(physics=start)])
+    assert len(system_in(page)["states"]["x"][0]["pos"]) == model.nbody - 1
+
+
 def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
     (tmp_path / "there.gif").touch()
     for arguments, message in (
-        (["--out", "film.avi"], "must end in .mp4, .gif, .png"),
+        (["--out", "film.avi"], "must end in .mp4, .gif, .png, .html"),
+        (["--out", "film.html"], "of the point mass it must end in .mp4, .gif, .png"),
         (["--out", str(tmp_path / "there.gif")], "which exists"),
         (["--seed", "9"], "seed is 9: the run has 0 to 1"),
         (["--steps", "0"], "steps is 0"),

@@ -63,29 +63,38 @@ def test_sampling_follows_the_priorities():
     np.testing.assert_allclose(weight, importance, rtol=1e-4)
 
 
+def test_scale_is_the_standard_deviation_of_what_is_stored():
+    returns = np.array([3.0, -1.0, 7.0, 1e6], np.float32)
+    replay = self_imitation.init_replay(4, 1, 1).replace(
+        return_=jnp.array(returns), priority=jnp.array([1.0, 0.1, 2.0, 0.0])
+    )
+    scale = self_imitation.return_scale(replay)
+    np.testing.assert_allclose(scale, returns[:3].std(), rtol=1e-6)
+    assert self_imitation.return_scale(self_imitation.init_replay(4, 1, 1)) > 0
+
+
 def test_loss_and_its_gradient_against_numpy():
     rng = np.random.default_rng(2)
-    log_prob, value, return_ = rng.normal(size=(3, 100)) * [[4.0], [1.0], [1.0]]
-    weight = rng.random(100)
-    advantage = np.clip(return_ - value, 0.0, 1.0)
+    # Some log probabilities far down: their gradient is not to vanish.
+    log_prob, value, return_ = rng.normal(size=(3, 100)) * [[40.0], [5.0], [5.0]]
+    weight, scale = rng.random(100), 4.0
+    advantage = np.clip((return_ - value) / scale, 0.0, 1.0)
     count = max(np.sum(advantage > 0), 64)
 
     def total(log_prob, value):
         arrays = (log_prob, value, return_, weight)
         arrays = (jnp.asarray(x, jnp.float32) for x in arrays)
-        return self_imitation.loss(*arrays, 0.01)[0]
+        return self_imitation.loss(*arrays, scale, 0.01)[0]
 
     by_log_prob, by_value = jax.grad(total, argnums=(0, 1))(
         jnp.asarray(log_prob, jnp.float32), jnp.asarray(value, jnp.float32)
     )
-    free = -log_prob < 5.0
-    expected = -weight * advantage * free / count
+    expected = -weight * advantage / count
     np.testing.assert_allclose(by_log_prob, expected, rtol=1e-4, atol=1e-8)
-    np.testing.assert_allclose(
-        by_value, -0.01 * weight * advantage / count, rtol=1e-4, atol=1e-8
-    )
-    policy_part = np.sum(weight * advantage * np.minimum(-log_prob, 5.0)) / count
-    value_part = -0.01 * np.sum(weight * advantage * value) / count
+    expected = -0.01 * weight * np.clip(return_ - value, 0.0, scale) / count
+    np.testing.assert_allclose(by_value, expected, rtol=1e-4, atol=1e-8)
+    policy_part = -np.sum(weight * advantage * log_prob) / count
+    value_part = -0.01 * scale * np.sum(weight * advantage * value) / count
     np.testing.assert_allclose(
         total(log_prob, value), policy_part + value_part, rtol=1e-4
     )

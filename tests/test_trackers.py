@@ -1,11 +1,13 @@
 """Metrics in TensorBoard and Weights & Biases."""
 
+import contextlib
 import sys
+import time
 
 import numpy as np
 import pytest
 
-from gasil_jax import run, trackers
+from gasil_jax import progress, run, trackers
 
 SMALL = (
     *("--env", "point_mass", "--seeds", "2", "--first-seed", "3"),
@@ -42,9 +44,16 @@ def test_the_means_and_the_members_are_given():
     ]
 
 
-def test_a_run_in_tensorboard(tmp_path):
+def test_a_run_in_tensorboard(tmp_path, monkeypatch):
     pytest.importorskip("tensorboardX")
-    out = tmp_path / "out"
+    out, said = tmp_path / "out", []
+
+    def announced(title, name):
+        said.append(name)
+        return contextlib.nullcontext()
+
+    for module in (run, progress):
+        monkeypatch.setattr(module, "announced", announced)
     assert run.main([*SMALL, "--log", "tensorboard", "--out", str(out)]) == 0
     (path,) = (out / "tensorboard").iterdir()
     content = path.read_bytes()
@@ -52,14 +61,41 @@ def test_a_run_in_tensorboard(tmp_path):
     # Episodes of 50 steps end in every second iteration.
     for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
         assert content.count(name) == 2
+    # What a run does before, beside and after training is said.
+    assert said == [
+        "building the environment",
+        "starting the devices",
+        "starting the trackers",
+        "reading the checkpoints",
+        "saving a checkpoint",
+        "closing the trackers",
+        "writing the curve, the policies and the summary",
+    ]
 
 
 def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     pytest.importorskip("wandb")
     monkeypatch.setenv("WANDB_MODE", "offline")
     out = tmp_path / "out"
-    assert run.main([*SMALL, "--log", "wandb", "--out", str(out)]) == 0
-    assert list(out.glob("wandb/offline-run-*/*.wandb"))
+    out.mkdir()
+    labels = {"seed": [3, 4]}
+    # A run and how it goes on, with more steps than it had.
+    for total_steps, steps in ((256, [128, 256]), (384, [384])):
+        (tracker,) = trackers.make(["wandb"], out, {"total_steps": total_steps})
+        returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
+        metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
+        trackers.log([tracker], labels, metrics)
+        tracker.close()
+        time.sleep(1.1)  # W&B names its folders by the second.
+    identifier = (out / "wandb-id").read_text()
+    paths = sorted(out.glob(f"wandb/offline-run-*/run-{identifier}.wandb"))
+    assert len(paths) == 2
+    for path, count in zip(paths, (2, 1), strict=True):
+        for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
+            assert path.read_bytes().count(name) >= count
+    # Another run in a folder of the same name is another one there.
+    (tmp_path / "other" / "out").mkdir(parents=True)
+    assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):

@@ -130,8 +130,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Observation (num_envs, obs), reward, terminated and truncated (num_envs,)."""
-        actions = jnp.asarray(actions, jnp.float32)
-        self._state = state = self._step(self._state, actions, _key(self.np_random))
+        given = jnp.asarray(actions, jnp.float32)
+        self._state = state = self._step(self._state, given, _key(self.np_random))
         truncated = np.array(_truncated(state))
         terminated = np.array(state.done > 0) & ~truncated
         reward = np.array(state.reward, np.float64)

@@ -170,8 +170,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
 )
 
 
-@struct.dataclass
-class LocomotionState:
+class LocomotionState(struct.PyTreeNode):
     """Physics state and the planar position (2,) that velocity is measured from."""
 
     physics: PhysicsState
@@ -256,9 +255,10 @@ class Locomotion(Env):
         """Start at rest with Gymnasium's noise on positions and velocities."""
         scale = self.task.reset_noise
         position_key, velocity_key = jax.random.split(rng)
-        qpos = self._start + jax.random.uniform(
+        noise = jax.random.uniform(
             position_key, self._start.shape, jnp.float32, -scale, scale
         )
+        qpos = noise + self._start
         shape = (self.model.nv,)
         if self.task.normal_velocity_noise:
             qvel = scale * jax.random.normal(velocity_key, shape, jnp.float32)

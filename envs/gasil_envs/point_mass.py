@@ -38,8 +38,7 @@ class Layout:
     episode_length: int = 50
 
 
-@struct.dataclass
-class PointMassState:
+class PointMassState(struct.PyTreeNode):
     """The agent's position (2,) and which objects are collected (objects,) bool."""
 
     position: jax.Array

@@ -37,15 +37,18 @@ class Settings:
 
 
 def _constructors() -> dict[str, Callable[[Settings], Env]]:
-    constructors = {"point_mass": lambda settings: point_mass.PointMass()}
-    for name in locomotion.TASKS:
-        constructors[name] = lambda settings, name=name: locomotion.Locomotion(
+    def of_task(name: str) -> Callable[[Settings], Env]:
+        return lambda settings: locomotion.Locomotion(
             name,
             physics=settings.physics,
             solver=settings.solver,
             integrator=settings.integrator,
         )
-    return constructors
+
+    return {
+        "point_mass": lambda settings: point_mass.PointMass(),
+        **{name: of_task(name) for name in locomotion.TASKS},
+    }
 
 
 def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:

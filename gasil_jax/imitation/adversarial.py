@@ -29,21 +29,22 @@ from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_pol
 from gasil_jax.networks import Discriminator
 
 
-@struct.dataclass
-class AdversarialState:
+class AdversarialState(struct.PyTreeNode):
     """The discriminator's parameters and its optimizer's state."""
 
     params: Any
     optimizer_state: Any
 
 
-def bonus(logit: jax.Array, alpha: jax.Array) -> jax.Array:
+def bonus(logit: jax.Array, alpha: jax.Array | float) -> jax.Array:
     """-alpha log D (paper, section 4.3) from the logit of D: (...) -> (...)."""
     return alpha * jax.nn.softplus(-logit)
 
 
 def loss(
-    policy_logit: jax.Array, good_logit: jax.Array, entropy_coefficient: jax.Array
+    policy_logit: jax.Array,
+    good_logit: jax.Array,
+    entropy_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, Metrics]:
     """What the discriminator descends: minus the paper's objective (equation 7).
 
@@ -70,7 +71,8 @@ def loss(
     return -log_likelihood - entropy_coefficient * entropy, metrics
 
 
-def _network(config: Config) -> Discriminator:
+def _network(config: Config) -> Any:
+    # Flax says of `apply` that it may give changed variables too: Any is narrower.
     return Discriminator(config.discriminator_hidden_sizes)
 
 

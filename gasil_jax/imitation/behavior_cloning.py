@@ -28,7 +28,7 @@ def _update_policy(
     state: tuple[()],
     params: Any,
     optimizer_state: Any,
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     context: Context,
     key: jax.Array,
 ) -> tuple[tuple[()], Any, Any, Metrics]:
@@ -45,10 +45,11 @@ def _update_policy(
             key, context.good_trajectories, config.behavior_cloning_minibatch_size
         )
         observation = normalization.normalize(context.normalizer, observation)
-        gradient, value = jax.grad(objective, has_aux=True)(
-            carry[0], observation, action
+        policy, policy_state = carry
+        gradient, value = jax.grad(objective, has_aux=True)(policy, observation, action)
+        carry = ppo.descend(
+            policy, policy_state, gradient, learning_rate, context.hyperparameters
         )
-        carry = ppo.descend(*carry, gradient, learning_rate, context.hyperparameters)
         return carry, value
 
     before = (params["policy"], optimizer_state["policy"])

@@ -14,8 +14,7 @@ from gasil_jax.rollout import Rollout
 Metrics = dict[str, jax.Array]
 
 
-@struct.dataclass
-class Context:
+class Context(struct.PyTreeNode):
     """What an imitation module sees of an iteration.
 
     Attributes:
@@ -58,7 +57,7 @@ class Imitation(NamedTuple):
         [Any, Context, jax.Array], tuple[Any, jax.Array, Metrics]
     ]
     update_policy: Callable[
-        [Any, Any, Any, jax.Array, Context, jax.Array],
+        [Any, Any, Any, jax.Array | float, Context, jax.Array],
         tuple[Any, Any, Any, Metrics],
     ]
     check: Callable[[Config, int, int], None] = lambda config, observation, action: None
@@ -68,7 +67,7 @@ def leave_policy(
     state: Any,
     params: Any,
     optimizer_state: Any,
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     context: Context,
     key: jax.Array,
 ) -> tuple[Any, Any, Any, Metrics]:

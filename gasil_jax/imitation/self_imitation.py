@@ -3,13 +3,15 @@
 A replay buffer holds (s, a, R) of the steps of ended episodes, R being the discounted
 return from that step on. After PPO's own steps, policy and value take
 `sil_updates` gradient steps on minibatches drawn with probability proportional to
-max(R - V(s), 0)^0.6, on the loss (equations 1 to 4 there)
+max(R - V(s), 0)^0.6, on `sil_coefficient` times the loss (equations 1 to 4 there)
 
     -E[w log pi(a | s) (R - V(s))+] + sil_value_coefficient / 2 E[w ((R - V(s))+)^2]
 
 with w the importance weights of the prioritized sampling. As in the authors' code the
-advantage is clipped at 1, -log pi at 5, and the mean is over the steps with a positive
-advantage but over no fewer than 64.
+advantage is clipped at one standard deviation of the returns (they divide rewards by
+it), and the mean is over the steps with a positive advantage but over no fewer than 64.
+The first term's advantage is in that unit too; the second's in the return's own, which
+is that of PPO's value loss here.
 """
 
 from typing import Any
@@ -29,12 +31,11 @@ _PRIORITY_EXPONENT = 0.6
 _IMPORTANCE_EXPONENT = 0.1
 _LEAST_PRIORITY = 1e-6
 _HIGHEST_ADVANTAGE = 1.0
-_HIGHEST_NEGATIVE_LOG_PROB = 5.0
+_LEAST_SCALE = 1e-8
 _LEAST_SAMPLES = 64
 
 
-@struct.dataclass
-class Replay:
+class Replay(struct.PyTreeNode):
     """The last `capacity` steps of ended episodes, a ring.
 
     Attributes:
@@ -64,7 +65,7 @@ def init_replay(capacity: int, observation_size: int, action_size: int) -> Repla
 
 
 def returns_to_go(
-    history: History, num_steps: int, gamma: jax.Array
+    history: History, num_steps: int, gamma: jax.Array | float
 ) -> tuple[jax.Array, jax.Array]:
     """Discounted returns of the steps whose episode ended in the last batch.
 
@@ -144,23 +145,39 @@ def sample(
     return place, weight(jnp.maximum(mass[place], least)) / weight(least)
 
 
+def return_scale(replay: Replay) -> jax.Array:
+    """The standard deviation of the returns in the replay, ()."""
+    filled = replay.priority > 0
+    size = jnp.maximum(jnp.sum(filled), 1)
+    mean = jnp.sum(jnp.where(filled, replay.return_, 0.0)) / size
+    square = jnp.sum(jnp.where(filled, (replay.return_ - mean) ** 2, 0.0)) / size
+    return jnp.maximum(jnp.sqrt(square), _LEAST_SCALE)
+
+
+def clipped_advantage(
+    return_: jax.Array, value: jax.Array, scale: jax.Array | float
+) -> jax.Array:
+    """(R - V)+ in units of `scale`, at most 1: (samples,)."""
+    return jnp.clip((return_ - value) / scale, 0.0, _HIGHEST_ADVANTAGE)
+
+
 def loss(
     log_prob: jax.Array,
     value: jax.Array,
     return_: jax.Array,
     weight: jax.Array,
-    value_coefficient: jax.Array,
+    scale: jax.Array | float,
+    value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
     """The loss of a minibatch, (), and the fraction of positive advantages, ()."""
     chex.assert_equal_shape([log_prob, value, return_, weight])
-    advantage = jnp.clip(return_ - value, 0.0, _HIGHEST_ADVANTAGE)
+    advantage = clipped_advantage(return_, value, scale)
     num_positive = jnp.sum(advantage > 0)
     num_samples = jnp.maximum(num_positive, _LEAST_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
-    negative_log_prob = jnp.minimum(-log_prob, _HIGHEST_NEGATIVE_LOG_PROB)
-    policy_loss = jnp.sum(weight * constant * negative_log_prob) / num_samples
+    policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
     # The gradient of half the clipped square, also where the clip is active.
-    value_loss = -jnp.sum(weight * constant * value) / num_samples
+    value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
     fraction = num_positive / advantage.shape[0]
     return policy_loss + value_coefficient * value_loss, fraction
 
@@ -183,12 +200,13 @@ def _update_policy(
     replay: Replay,
     params: Any,
     optimizer_state: Any,
-    learning_rate: jax.Array,
+    learning_rate: jax.Array | float,
     context: Context,
     key: jax.Array,
 ) -> tuple[Replay, Any, Any, Metrics]:
     config, hyperparameters = context.config, context.hyperparameters
     normalize = lambda x: normalization.normalize(context.normalizer, x)
+    scale = return_scale(replay)
 
     def objective(params: Any, rows: Replay, weight: jax.Array) -> Any:
         observation = normalize(rows.observation)
@@ -201,9 +219,10 @@ def _update_policy(
             value,
             rows.return_,
             weight,
+            scale,
             hyperparameters.sil_value_coefficient,
         )
-        return total, (value, fraction)
+        return hyperparameters.sil_coefficient * total, (value, fraction)
 
     def step(carry: Any, key: jax.Array) -> Any:
         params, optimizer_state, priority = carry
@@ -217,7 +236,7 @@ def _update_policy(
         params, optimizer_state = ppo.descend_each(
             params, optimizer_state, gradient, learning_rate, hyperparameters
         )
-        advantage = jnp.clip(rows.return_ - value, 0.0, _HIGHEST_ADVANTAGE)
+        advantage = clipped_advantage(rows.return_, value, scale)
         priority = priority.at[place].set(jnp.maximum(advantage, _LEAST_PRIORITY))
         return (params, optimizer_state, priority), fraction
 

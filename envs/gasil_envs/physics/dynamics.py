@@ -5,7 +5,7 @@ collision, inertia and bias forces are MJX's; constraint rows are built in
 `constraints`, and every linear system is solved in `newton`.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -185,7 +185,7 @@ def _runge_kutta(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     dt = model.opt.timestep
     qpos, qvel = data.qpos, data.qvel
 
-    def stage(carry, coefficients):
+    def stage(carry: Any, coefficients: Any) -> Any:
         data, velocity_sum, acceleration_sum = carry
         ahead, weight = coefficients
         # Both at once: the position moves with the velocity of the stage before.

@@ -9,8 +9,7 @@ from flax import struct
 Fields = dict[str, jax.Array]
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
     """All that a later step depends on, so that replacing it resets everything.
 
     Attributes:

@@ -25,8 +25,8 @@ dynamic).
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,7 @@ from flax import struct
 # C contacts, T tangents, E edges.
 
 
-@struct.dataclass
-class Contacts:
+class Contacts(struct.PyTreeNode):
     """Contacts that have as many edges each; float32.
 
     Attributes:
@@ -55,8 +54,7 @@ class Contacts:
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
 
 
-@struct.dataclass
-class Limits:
+class Limits(struct.PyTreeNode):
     """At most one limit on each degree of freedom; float32.
 
     Attributes:
@@ -70,8 +68,7 @@ class Limits:
     weight: jax.Array
 
 
-@struct.dataclass
-class Problem:
+class Problem(struct.PyTreeNode):
     """Constrained dynamics of one instant; float32.
 
     Attributes:
@@ -89,8 +86,7 @@ class Problem:
     contacts: tuple[Contacts, ...] = ()
 
 
-@struct.dataclass
-class Solution:
+class Solution(struct.PyTreeNode):
     """What the constraints do.
 
     Attributes:
@@ -253,10 +249,15 @@ def _spells_out(matrix: jax.Array) -> bool:
     return matrix.shape[0] * matrix.shape[1] <= most
 
 
+def _sum(terms: Iterable[jax.Array]) -> jax.Array:
+    # Of one term or more, which `sum`'s type does not know.
+    return cast(jax.Array, sum(terms))
+
+
 def _matvec(matrix: jax.Array, vector: jax.Array, spell_out: bool) -> jax.Array:
     """(N, V, B), (V, B) -> (N, B)."""
     if spell_out:
-        return sum(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
+        return _sum(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
     return jnp.sum(matrix * vector, axis=1)
 
 
@@ -265,7 +266,7 @@ def _matvec_transposed(
 ) -> jax.Array:
     """(N, V, B), (N, B) -> (V, B)."""
     if spell_out:
-        return sum(matrix[n] * vector[n] for n in range(vector.shape[0]))
+        return _sum(matrix[n] * vector[n] for n in range(vector.shape[0]))
     return jnp.sum(matrix * vector[:, None], axis=0)
 
 
@@ -275,7 +276,7 @@ def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> ja
     if not spell_out:
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
     rows = [
-        sum(left[n, i] * right[n, : i + 1] for n in range(num_rows))
+        _sum(left[n, i] * right[n, : i + 1] for n in range(num_rows))
         for i in range(size)
     ]
     rows = [_materialize(row) for row in rows]
@@ -314,7 +315,9 @@ class _Rows:
         for group in problem.contacts:
             parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
         self._basis = _materialize(jnp.concatenate(parts)) if parts else None
-        self._spell_out = bool(parts) and for_speed and _spells_out(self._basis)
+        self._spell_out = (
+            self._basis is not None and for_speed and _spells_out(self._basis)
+        )
 
     def _split(self, along: jax.Array) -> list[list[jax.Array]]:
         """(rows of B, ...) to [normal (C, ...), tangents...] of each group."""
@@ -346,16 +349,16 @@ class _Rows:
         result = self._sign * of_limits
         if self._basis is None:
             return result
-        along = []
+        along: list[jax.Array] = []
         for edges, of_edges, (_, tangents) in zip(
             self._edges, of_groups, self._shapes, strict=True
         ):
-            along.append(sum(of_edges))
+            along.append(_sum(of_edges))
             for t in range(tangents):
                 signs = [signs[t] for signs in edges]
                 along.append(_sum_signed(of_edges, signs))
-        along = _materialize(jnp.concatenate(along))
-        return result + _matvec_transposed(self._basis, along, self._spell_out)
+        joined = _materialize(jnp.concatenate(along))
+        return result + _matvec_transposed(self._basis, joined, self._spell_out)
 
     def gram(self, weights: list[jax.Array]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""

@@ -1,0 +1,143 @@
+"""The command line that the experiments share."""
+
+import dataclasses
+import pathlib
+import re
+import sys
+from collections.abc import Callable, Sequence
+
+from experiments import report, trials
+from experiments.report import Figure
+from experiments.trials import Trial
+from gasil_jax import command_line
+from gasil_jax.command_line import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train what has not been trained yet, then write tables, figure and page.
+
+    Attributes:
+      only: trials to train, PANEL or PANEL/CURVE; default all.
+      quick: a small version for two CPU cores, below runs/quick, in minutes.
+      seeds: of each trial; default the experiment's.
+      total_steps: of each seed; default the experiment's.
+      part: I/N: train only the I-th of N parts of each trial, to share it between
+        processes; once all are there, run without it to put them together.
+      report: train nothing, write tables and figure of what is there.
+      list: print the trials and whether they are complete, and do nothing else.
+      physics: of locomotion: mjx or mujoco.
+      devices: host devices that members are sharded over; default the cores.
+      runs: where training writes.
+      results: where tables, figure and page go.
+    """
+
+    only: tuple[str, ...] = ()
+    quick: bool = False
+    seeds: int | None = None
+    total_steps: int | None = None
+    part: str = "1/1"
+    report: bool = False
+    list: bool = False
+    physics: str = "mjx"
+    devices: int | None = None
+    runs: pathlib.Path = pathlib.Path("runs")
+    results: pathlib.Path = trials.RESULTS
+
+
+#: Seeds and steps of the quick version.
+_QUICK = {"seeds": 3, "total_steps": 100_000, "rows": 20}
+
+
+def main(
+    figure: Figure,
+    make: Callable[[], Sequence[Trial]],
+    quick: Callable[[Sequence[Trial]], Sequence[Trial]],
+    arguments: Sequence[str] | None,
+    write: Callable[[Figure, Sequence[Trial], pathlib.Path], None] = report.write,
+) -> int:
+    """Run an experiment's command line; returns the exit status.
+
+    Args:
+      figure: what it shows.
+      make: its trials.
+      quick: those of them that the quick version has.
+      arguments: default what the program was started with.
+      write: figure and page.
+    """
+    try:
+        options = command_line.parse(Options, arguments, f"experiments.{figure.name}")
+        return _run(options, figure, make, quick, write)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _run(
+    options: Options,
+    figure: Figure,
+    make: Callable[[], Sequence[Trial]],
+    quick: Callable[[Sequence[Trial]], Sequence[Trial]],
+    write: Callable[[Figure, Sequence[Trial], pathlib.Path], None],
+) -> int:
+    part, parts = _part(options.part)
+    wanted = list(make())
+    runs, results = options.runs / figure.name, options.results
+    if options.quick:
+        wanted = [dataclasses.replace(trial, **_QUICK) for trial in quick(wanted)]
+        runs = options.runs / "quick" / figure.name
+        results = options.runs / "quick" / "results"
+    changes = {
+        name: getattr(options, name)
+        for name in ("seeds", "total_steps")
+        if getattr(options, name) is not None
+    }
+    for name, value in changes.items():
+        if value < 1:
+            raise InputError(f"{name} is {value}: it must be 1 or more")
+    wanted = [dataclasses.replace(trial, **changes) for trial in wanted]
+    chosen = _choose(wanted, options.only)
+    folder = results / figure.name
+    if options.list:
+        for trial in chosen:
+            known = trials.read(trial, folder)
+            done = 0 if known is None else len(known.seeds)
+            print(f"{trial.name}: {done} of {trial.seeds} seeds")
+        return 0
+    flags = ["--physics", options.physics]
+    if options.devices is not None:
+        flags += ["--devices", str(options.devices)]
+    for trial in chosen:
+        known = trials.read(trial, folder)
+        complete = known is not None and len(known.seeds) >= trial.seeds
+        if not options.report and not complete:
+            print(f"{figure.name}: {trial.name}", flush=True)
+            if status := trials.train(trial, runs, part, parts, flags):
+                return status
+        # Parts may run side by side; their results are put together by one process.
+        if parts == 1:
+            trials.collect(trial, runs, folder)
+    if parts == 1:
+        write(figure, wanted, results)
+        print(f"in {results / figure.name}.md")
+    return 0
+
+
+def _part(text: str) -> tuple[int, int]:
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    part, parts = map(int, found.groups()) if found else (0, 0)
+    if not 1 <= part <= parts:
+        raise InputError(f"part is {text!r}: it must be I/N, I from 1 to N")
+    return part, parts
+
+
+def _choose(wanted: Sequence[Trial], only: Sequence[str]) -> list[Trial]:
+    fits = lambda trial, name: name in (trial.name, trial.name.split("/")[0])
+    for name in only:
+        if not any(fits(trial, name) for trial in wanted):
+            panels = dict.fromkeys(trial.name.split("/")[0] for trial in wanted)
+            raise InputError(
+                f"only is {name!r}: it must be PANEL or PANEL/CURVE, of the panels "
+                f"{', '.join(panels)}"
+            )
+    return [t for t in wanted if not only or any(fits(t, name) for name in only)]

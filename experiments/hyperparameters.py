@@ -1,0 +1,49 @@
+"""GASIL's numbers (paper, figure 8): ``python -m experiments.hyperparameters``.
+
+PPO+GASIL on Walker2d with what the search found best for it, but for one number.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from experiments import command, random_search, report
+from experiments.report import Figure
+from experiments.trials import Trial
+
+VALUES = {
+    "buffer_steps": (500, 1000, 2000, 5000, 10000),
+    "discriminator_updates": (1, 5, 10, 20),
+}
+
+FIGURE = Figure(
+    name="hyperparameters",
+    title="Effect of GASIL's hyperparameters (paper, figure 8)",
+    claim="The agent performs poorly when the buffer is too small (500 steps) or too "
+    "large (5000 steps), and with too few or too many discriminator updates.",
+    favourite=None,
+    conclude=report.optimum,
+)
+
+
+def make() -> list[Trial]:
+    """A panel for each hyperparameter, a curve for each of its values."""
+    tuned = random_search.best("walker2d", "ppo+gasil", 1) or {}
+    return [
+        Trial(
+            name=f"{name}/{value}",
+            env="walker2d",
+            agent="ppo+gasil",
+            points=({**tuned, name: value},),
+        )
+        for name, values in VALUES.items()
+        for value in values
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return command.main(FIGURE, make, list, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,221 @@
+"""What is learned on the point mass (paper, figures 3 and 4).
+
+``python -m experiments.point_mass_moments`` trains one seed of PPO and of PPO+GASIL and
+draws them at several moments of training: episodes of the policy, the trajectories in
+the buffer, and the discriminator's reward. An arrow is the action that the
+discriminator pays most at a place, of 16 directions at full speed, with every object
+still there; the stronger its colour the higher the reward. ``--animate`` makes a film.
+"""
+
+import argparse
+import itertools
+import pathlib
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+
+import gasil_jax
+from experiments import point_mass
+from gasil_jax import batch, normalization, plotting, policy
+from gasil_jax.imitation import adversarial
+from gasil_jax.networks import Discriminator
+
+_EPISODES = 20
+
+
+def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
+    """The state of seed 0 at `moments`, in shares of training, increasing from 0."""
+    runs = batch.make_batch(env, config, [0])
+    states, advance = runs.compile()
+    ends = [max(1, round(share * config.num_iterations)) for share in moments]
+    found = []
+    for first, end in itertools.pairwise([0, *ends]):
+        for done in range(first, end, runs.chunk):
+            count = min(runs.chunk, end - done)
+            states, _ = runs.train(advance, states, done, count)
+        found.append(jax.device_get(batch.member(runs.trim(states), 0)))
+    return found
+
+
+def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
+    """Places (episodes, steps + 1, 2) of episodes drawn from the policy."""
+    act = policy.from_state(state, env)
+
+    def one(key: jax.Array) -> jax.Array:
+        reset_key, key = jax.random.split(key)
+        start = env.reset(reset_key)
+
+        def step(state: Any, key: jax.Array) -> Any:
+            state = env.step(state, act(state.obs, key))
+            return state, state.pipeline_state.position
+
+        keys = jax.random.split(key, env.unwrapped.episode_length)
+        places = jax.lax.scan(step, start, keys)[1]
+        return jnp.concatenate([start.pipeline_state.position[None], places])
+
+    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(key, _EPISODES)))
+
+
+def buffer_paths(state: Any) -> list[np.ndarray]:
+    """Places (steps, 2) of each episode in the buffer, the best first."""
+    buffer = state.good_trajectories
+    size = int(buffer.size)
+    starts = np.flatnonzero(np.asarray(buffer.time[:size]) == 0)
+    places = np.asarray(buffer.observation[:size, :2])
+    return np.split(places, starts[1:]) if size else []
+
+
+def reward_field(
+    env: Any, config: gasil_jax.Config, state: Any, num_places: int = 17
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Places (n, 2), the best direction there (n, 2), and its -log D (n,)."""
+    line = np.linspace(-0.95, 0.95, num_places, dtype=np.float32)
+    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    angle = np.arange(16) * (2.0 * np.pi / 16)
+    actions = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
+    there = np.ones((len(places), env.observation_size - 2), np.float32)
+    observation = normalization.normalize(
+        state.normalizer, jnp.asarray(np.concatenate([places, there], axis=1))
+    )
+    network = Discriminator(config.discriminator_hidden_sizes)
+    logit = jax.vmap(
+        lambda action: network.apply(
+            state.imitation.params,
+            observation,
+            jnp.broadcast_to(action, (len(places), 2)),
+        )
+    )(jnp.asarray(actions))
+    reward = np.asarray(adversarial.bonus(logit, jnp.float32(1.0)))
+    return places, actions[reward.argmax(axis=0)], reward.max(axis=0)
+
+
+#: An agent's columns, and what draws each.
+_COLUMNS = ("policy", "good trajectories", "discriminator's reward")
+
+
+def _columns(agent: str) -> tuple[str, ...]:
+    return _COLUMNS if agent == "ppo+gasil" else _COLUMNS[:2]
+
+
+def draw_moment(
+    panels: Sequence[Any], env: Any, config: gasil_jax.Config, state: Any
+) -> None:
+    """One moment of an agent: its policy, its buffer, and its discriminator if any."""
+    layout = env.unwrapped.layout
+    for panel in panels:
+        panel.clear()
+        none = np.zeros(len(env.unwrapped.objects), bool)
+        plotting.point_mass_layout(panel, layout, none)
+        panel.set(xticks=[], yticks=[])
+    for path in policy_paths(env, state, jax.random.key(1)):
+        panels[0].plot(*path.T, color="0.2", linewidth=0.7, alpha=0.6)
+    for path in buffer_paths(state):
+        panels[1].plot(*path.T, color="#0072B2", linewidth=0.7, alpha=0.6)
+    if len(panels) == len(_COLUMNS):
+        places, direction, reward = reward_field(env, config, state)
+        strength = (reward - reward.min()) / max(np.ptp(reward), 1e-6)
+        panels[2].quiver(*places.T, *direction.T, alpha=strength, scale=28, width=0.006)
+
+
+Moments = Mapping[str, tuple[gasil_jax.Config, Sequence[Any]]]
+
+
+def _draw_row(panels: Sequence[Any], env: Any, moments: Moments, number: int) -> str:
+    """Every agent at one moment; returns how far training is."""
+    steps = 0
+    for agent, (config, states) in moments.items():
+        mine, panels = np.split(panels, [len(_columns(agent))])
+        draw_moment(mine, env, config, states[number])
+        steps = int(states[number].iteration) * config.batch_steps
+    return f"{steps:,} steps"
+
+
+def _titles(panels: Sequence[Any], moments: Moments) -> None:
+    titles = [f"{agent}: {name}" for agent in moments for name in _columns(agent)]
+    for panel, title in zip(panels, titles, strict=True):
+        panel.set_title(title, fontsize=9)
+
+
+def draw(env: Any, moments: Moments, path: pathlib.Path) -> None:
+    """Figures 3 and 4 side by side: a row for each moment.
+
+    Args:
+      env: the point mass.
+      moments: agent -> its configuration and its states.
+      path: PNG.
+    """
+    import matplotlib.pyplot as plt
+
+    rows = min(len(states) for _, states in moments.values())
+    columns = sum(len(_columns(agent)) for agent in moments)
+    size = (2.4 * columns, 2.5 * rows)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=size, layout="constrained", squeeze=False
+    )
+    for number, row in enumerate(grid):
+        row[0].set_ylabel(_draw_row(row, env, moments, number))
+    _titles(grid[0], moments)
+    plotting.save(figure, path, dpi=75)
+
+
+def animate(env: Any, moments: Moments, path: pathlib.Path) -> None:
+    """The same as a film, a frame for each moment."""
+    import matplotlib.pyplot as plt
+    from matplotlib.animation import FuncAnimation, PillowWriter
+
+    frames = min(len(states) for _, states in moments.values())
+    columns = sum(len(_columns(agent)) for agent in moments)
+    figure, panels = plt.subplots(
+        1, columns, figsize=(2.6 * columns, 3.0), layout="constrained"
+    )
+
+    def frame(number: int) -> None:
+        figure.suptitle(_draw_row(panels, env, moments, number))
+        _titles(panels, moments)
+
+    film = FuncAnimation(figure, frame, frames=frames)
+    film.save(path, writer=PillowWriter(fps=2), dpi=80)
+    plt.close(figure)
+
+
+#: Shares of training: more of the early ones, most happens there.
+SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train one seed of both agents and draw; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--total-steps", type=int, default=point_mass.STEPS)
+    parser.add_argument("--animate", type=int, default=0, help="frames of a film")
+    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("."))
+    options = parser.parse_args(arguments)
+    if options.total_steps < 1 or options.animate < 0:
+        print(
+            "error: total-steps must be 1 or more, animate 0 or more", file=sys.stderr
+        )
+        return 2
+    jax.config.update("jax_default_matmul_precision", "highest")
+    matplotlib.use("Agg")
+    env = gasil_jax.make_env("point_mass")
+    shares = np.linspace(0, 1, options.animate) if options.animate else SHARES
+    moments = {}
+    for agent in point_mass.AGENTS:
+        config = point_mass.config(agent).replace(total_steps=options.total_steps)
+        moments[agent] = config, train(env, config, shares)
+    if options.animate:
+        path = options.out / "point_mass.gif"
+        animate(env, moments, path)
+    else:
+        path = options.out / "point_mass_moments.png"
+        draw(env, moments, path)
+    print(f"in {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

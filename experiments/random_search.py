@@ -1,0 +1,169 @@
+"""The appendix's search (table 1): ``python -m experiments.random_search``.
+
+Every agent gets the same number of runs of full length on a task, 32 of 1M steps: PPO
+the appendix's four learning rates with eight seeds each; the others the higher two of
+them (PPO's search shows what the lower two cost in 1M steps). PPO+BC and PPO+SIL have
+one hyperparameter more, so eight points with four seeds each; PPO+GASIL has the
+appendix's four, of which sixteen points with two seeds each are drawn, so that each
+value is drawn equally often. The seeds are other than those of the figures. The best
+point by its mean final return is what the figures use.
+"""
+
+import itertools
+import pathlib
+import sys
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments import command, report, trials
+from experiments.report import Figure
+from experiments.trials import AGENTS, TASKS, Trial
+
+Point = Mapping[str, Any]
+
+DELAY = 20
+_FIRST_SEED = 1000
+_RUNS = 32
+
+#: Lengths other than the trial's own; humanoid is tuned over a third of its figure's.
+STEPS = {"point_mass": 500_000}
+_LEARNING_RATES = (3e-4, 1e-4, 5e-5, 3e-5)
+_HIGHER = _LEARNING_RATES[:2]
+
+#: What each agent's search draws from.
+SPACES: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
+    "ppo": {"learning_rate": _LEARNING_RATES},
+    "ppo+bc": {
+        "learning_rate": _HIGHER,
+        "behavior_cloning_coefficient": (0.01, 0.1, 0.3, 1.0),
+    },
+    "ppo+sil": {
+        "learning_rate": _HIGHER,
+        "sil_coefficient": (0.01, 0.1, 0.3, 1.0),
+    },
+    "ppo+gasil": {
+        "learning_rate": _HIGHER,
+        "discriminator_updates": (1, 5, 10, 20),
+        "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+        "buffer_steps": (1000, 10000),
+        "alpha": (0.02, 0.1, 0.2, 1.0),
+    },
+}
+
+FIGURE = Figure(
+    name="random_search",
+    title="Hyperparameters of every agent (paper, table 1)",
+    claim="A random search over the appendix's ranges, for every task.",
+    favourite=None,
+)
+
+
+def draw(space: Mapping[str, Sequence[Any]], count: int) -> tuple[Point, ...]:
+    """At most `count` distinct points, each value of a hyperparameter equally often.
+
+    All there are where there are no more than `count`; else a Latin hypercube.
+    """
+    every = list(itertools.product(*space.values()))
+    if len(every) <= count:
+        return tuple(dict(zip(space, values, strict=True)) for values in every)
+    rng = np.random.default_rng(0)
+    while True:
+        columns = [
+            rng.permutation(np.resize(np.arange(len(values)), count))
+            for values in space.values()
+        ]
+        drawn = list(zip(*(column.tolist() for column in columns), strict=True))
+        if len(set(drawn)) == count:
+            break
+    return tuple(
+        {
+            name: values[index]
+            for (name, values), index in zip(space.items(), places, strict=True)
+        }
+        for places in drawn
+    )
+
+
+def panel(env: str, reward_delay: int) -> str:
+    """The name of a task."""
+    return env if reward_delay == 1 else f"{env}-delayed"
+
+
+def search(env: str, agent: str, reward_delay: int) -> Trial:
+    """The trial that tunes an agent on a task."""
+    points = draw(SPACES[agent], 16)
+    return Trial(
+        name=f"{panel(env, reward_delay)}/{agent}",
+        env=env,
+        agent=agent,
+        points=points,
+        reward_delay=reward_delay,
+        seeds=_RUNS // len(points),
+        first_seed=_FIRST_SEED,
+        total_steps=STEPS.get(env, 1_000_000),
+        rows=10,
+    )
+
+
+def make() -> list[Trial]:
+    """Every task, dense and delayed, and agent; the point mass' two."""
+    tasks = [
+        search(env, agent, delay)
+        for env in TASKS
+        for delay in (1, DELAY)
+        for agent in AGENTS
+    ]
+    return tasks + [search("point_mass", agent, 1) for agent in ("ppo", "ppo+gasil")]
+
+
+def _score(known: trials.Results) -> np.ndarray:
+    """What points are compared by, (points,); -inf where a seed ended no episode."""
+    score = known.final.mean(axis=1)
+    return np.where(np.isfinite(score), score, -np.inf)
+
+
+def best(env: str, agent: str, reward_delay: int) -> Point | None:
+    """The best point that the search has found; None where it has not been run."""
+    trial = search(env, agent, reward_delay)
+    known = trials.read(trial, trials.RESULTS / FIGURE.name)
+    return None if known is None else trial.points[int(_score(known).argmax())]
+
+
+def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
+    """The page: each search's best point, and how far apart the points are."""
+    lines = [
+        f"# {figure.title}",
+        "",
+        " ".join(__doc__.split("\n\n", 1)[1].split()),
+        "",
+        "| task | agent | points x seeds | best point | its mean | median | worst |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, curves in report.panels(wanted, results / figure.name).items():
+        for agent, known in curves.items():
+            score = _score(known)
+            chosen = known.trial.points[int(score.argmax())]
+            said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
+            numbers = (score.max(), float(np.median(score)), score.min())
+            lines.append(
+                f"| {name} | {agent} | {len(score)} x {len(known.seeds)} | {said} | "
+                + " | ".join(f"{number:.0f}" for number in numbers)
+                + " |"
+            )
+    (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
+
+
+def quick(wanted: Sequence[Trial]) -> list[Trial]:
+    """Hopper's searches."""
+    return [trial for trial in wanted if trial.name.startswith("hopper/")]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return command.main(FIGURE, make, quick, arguments, write)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,45 @@
+"""Noise on Walker2d (paper, figure 6): ``python -m experiments.stochastic_walker2d``.
+
+Both agents have what the search found best for them without noise.
+"""
+
+import sys
+from collections.abc import Sequence
+
+from experiments import command, random_search
+from experiments.report import Figure
+from experiments.trials import Trial
+
+AGENTS = ("ppo", "ppo+gasil")
+NOISES = (0.0, 0.05, 0.1, 0.5)
+
+FIGURE = Figure(
+    name="stochastic_walker2d",
+    title="Walker2d with noisy observations (paper, figure 6)",
+    claim="The gap between PPO and PPO+GASIL is larger when Gaussian noise, of "
+    "standard deviation 0.05, 0.1 and 0.5, is added to the observations.",
+)
+
+
+def make() -> list[Trial]:
+    """Both agents at every noise."""
+    return [
+        Trial(
+            name=f"noise {noise:g}/{agent}",
+            env="walker2d",
+            agent=agent,
+            obs_noise=noise,
+            points=(random_search.best("walker2d", agent, 1) or {},),
+        )
+        for noise in NOISES
+        for agent in AGENTS
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return command.main(FIGURE, make, list, arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,66 @@
+"""All figures in one page: ``python -m experiments.summary``."""
+
+import sys
+from collections.abc import Sequence
+
+from experiments import (
+    comparison,
+    delayed_mujoco,
+    hyperparameters,
+    mujoco,
+    point_mass,
+    random_search,
+    report,
+    stochastic_walker2d,
+    trials,
+)
+
+#: Each figure with the function that makes its trials.
+FIGURES = (
+    (point_mass.FIGURE, point_mass.make),
+    (mujoco.FIGURE, lambda: comparison.make(1)),
+    (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
+    (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
+    (hyperparameters.FIGURE, hyperparameters.make),
+)
+
+
+def page() -> str:
+    """Claim by claim, what was measured: Markdown, from the CSV files alone."""
+    parts = [
+        "# The paper's claims, measured",
+        "Written by `python -m experiments.summary` from the CSV files in this folder. "
+        "Numbers are interquartile means over seeds of the return in the last tenth of "
+        "training, with 95% bootstrap intervals; both sides of every comparison were "
+        "tuned with the same number of runs ([how](random_search.md)).",
+    ]
+    for figure, make in FIGURES:
+        wanted = make()
+        shown = report.panels(wanted, trials.RESULTS / figure.name)
+        missing = [
+            trial.name
+            for trial in wanted
+            if trial.name.split("/")[1] not in shown.get(trial.name.split("/")[0], {})
+        ]
+        parts += [f"## {figure.title}", f"**Claim.** {figure.claim}"]
+        if shown:
+            parts += [
+                figure.conclusions(shown),
+                f"[Tables, curves and settings]({figure.name}.md).",
+                figure.more,
+            ]
+        if missing:
+            parts.append(f"Not run yet: {', '.join(missing)}.")
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the page; returns the exit status."""
+    path = trials.RESULTS / "README.md"
+    path.write_text(page())
+    print(f"in {path}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

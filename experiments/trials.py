@@ -1,0 +1,279 @@
+"""What an experiment trains: trials, each a sweep that can be resumed and divided.
+
+A trial's results are two small files of their own, PANEL/CURVE.csv (returns over
+training, a row for each point, seed and part of training) and PANEL/CURVE.json (its
+settings and what it ran with), so that each lands as soon as it is there, and several
+machines can share an experiment.
+"""
+
+import csv
+import dataclasses
+import json
+import pathlib
+import subprocess
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax import logging, sweep
+from gasil_jax.command_line import InputError
+
+#: The paper's agents, as figures 5 and 7 compare them.
+AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
+TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
+RESULTS = pathlib.Path(__file__).parent / "results"
+
+# The appendix's values, which a trial's points stand on; no tuned preset.
+_FLAGS = ("--preset", "paper", "--num-envs", "32")
+
+
+@dataclasses.dataclass(frozen=True)
+class Trial:
+    """Seeds x points of one agent in one environment.
+
+    Attributes:
+      name: PANEL/CURVE.
+      env: environment's name.
+      agent: agent's name.
+      points: hyperparameters of each, over the appendix's.
+      reward_delay: of the environment.
+      obs_noise: of the environment.
+      seeds: how many.
+      first_seed: the number of the first.
+      total_steps: of a seed.
+      rows: of a seed in the results: so many equal parts of training.
+      alpha_schedule: (steps, factor) points.
+    """
+
+    name: str
+    env: str
+    agent: str
+    points: tuple[Mapping[str, Any], ...] = ({},)
+    reward_delay: int = 1
+    obs_noise: float = 0.0
+    seeds: int = 10
+    first_seed: int = 0
+    total_steps: int = 1_000_000
+    rows: int = 50
+    alpha_schedule: tuple[tuple[float, float], ...] = ()
+
+    def settings(self) -> dict[str, Any]:
+        """What decides the results, but for the seeds."""
+        fields = dataclasses.asdict(self)
+        for name in ("name", "seeds", "first_seed"):
+            del fields[name]
+        if not self.alpha_schedule:
+            del fields["alpha_schedule"]
+        return fields | {"points": [dict(point) for point in self.points]}
+
+
+def divide(trial: Trial, part: int, parts: int) -> Trial | None:
+    """Part `part`, from 1, of `parts`; None where nothing is left for it.
+
+    Every so manieth point; of a point that several parts share, some of its seeds.
+    """
+    sharing = max(1, parts // len(trial.points))
+    points = trial.points[(part - 1) // sharing :: max(1, parts // sharing)]
+    bounds = np.linspace(0, trial.seeds, sharing + 1).round().astype(int).tolist()
+    first, last = bounds[(part - 1) % sharing :][:2]
+    if not points or first == last or (part - 1) // sharing >= len(trial.points):
+        return None
+    return dataclasses.replace(
+        trial,
+        points=points,
+        first_seed=trial.first_seed + first,
+        seeds=last - first,
+    )
+
+
+def train(
+    trial: Trial, runs: pathlib.Path, part: int, parts: int, flags: Sequence[str] = ()
+) -> int:
+    """Train a part of a trial or go on with it; returns the exit status.
+
+    Args:
+      trial: the whole of it.
+      runs: folder of the experiment's runs.
+      part: from 1.
+      parts: how many.
+      flags: more of them, for the sweep's command line.
+    """
+    share = divide(trial, part, parts)
+    if share is None:
+        return 0
+    place = runs / trial.name / f"{part}-of-{parts}"
+    points = json.dumps([dict(point) for point in share.points])
+    listed = place.with_suffix(".json")
+    place.parent.mkdir(parents=True, exist_ok=True)
+    if not listed.exists():
+        listed.write_text(points)
+    elif json.loads(listed.read_text()) != json.loads(points):
+        raise InputError(f"{place} is of other hyperparameters: move it away")
+    if (place / "summary.json").exists():
+        return 0
+    schedule = [str(number) for pair in share.alpha_schedule for number in pair]
+    return sweep.main(
+        [
+            *("--env", share.env, "--agent", share.agent, *_FLAGS),
+            *("--reward-delay", str(share.reward_delay)),
+            *("--obs-noise", str(share.obs_noise)),
+            *("--seeds", str(share.seeds), "--first-seed", str(share.first_seed)),
+            *("--total-steps", str(share.total_steps), "--out", str(place)),
+            *("--resume", "--points-file", str(listed)),
+            *("--alpha-schedule", *schedule, *flags),
+        ]
+    )
+
+
+def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> bool:
+    """Put what has been trained of a trial into its results; whether it is complete.
+
+    Rows that are there already, of another machine, stay.
+
+    Raises:
+      InputError: the results are of other settings.
+    """
+    target = results / f"{trial.name}.csv"
+    described = target.with_suffix(".json")
+    rows = {(row["point"], row["seed"]): [] for row in _read(target)}
+    for row in _read(target):
+        rows[row["point"], row["seed"]].append(row)
+    made = []
+    if described.exists():
+        before = json.loads(described.read_text())
+        if before["settings"] != json.loads(json.dumps(trial.settings())):
+            raise InputError(f"{target} is of other settings: move it away")
+        made = before["made"]
+    found = len(rows)
+    for summary in sorted((runs / trial.name).glob("*/summary.json")):
+        new = dict(_rows(trial, summary.parent))
+        by = _made(summary.parent)
+        if not set(new) <= set(rows) and by not in made:
+            made.append(by)
+        rows = new | rows
+    if len(rows) > found:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with target.open("w", newline="") as file:
+            writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            for key in sorted(rows, key=lambda key: tuple(map(int, key))):
+                writer.writerows(rows[key])
+        logging.write_json(described, {"settings": trial.settings(), "made": made})
+    return len(rows) >= len(trial.points) * trial.seeds
+
+
+_COLUMNS = ("point", "seed", "env_steps", "episode_return")
+
+
+def _read(path: pathlib.Path) -> list[dict[str, str]]:
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _rows(trial: Trial, folder: pathlib.Path) -> Iterable[tuple[Any, Any]]:
+    """(point, seed) -> rows of the results, of a sweep that has ended."""
+    described = json.loads((folder / "config.json").read_text())
+    every = [json.loads(json.dumps(dict(point))) for point in trial.points]
+    with np.load(folder / "curves.npz") as curves:
+        returns, steps = curves["episode_return"], curves["env_steps"]
+    parts = np.array_split(np.arange(returns.shape[-1]), trial.rows)
+    parts = [part for part in parts if len(part)]
+    for place, point in enumerate(described["points"]):
+        for offset in range(described["seeds"]):
+            key = (str(every.index(point)), str(described["first_seed"] + offset))
+            rows = []
+            for part in parts:
+                seen = returns[place, offset, part]
+                seen = seen[np.isfinite(seen)]
+                mean = f"{seen.mean():.6g}" if len(seen) else ""
+                end = int(steps[place, offset, part[-1]])
+                rows.append(dict(zip(_COLUMNS, (*key, end, mean))))
+            yield key, rows
+
+
+def _made(folder: pathlib.Path) -> dict[str, Any]:
+    described = json.loads((folder / "config.json").read_text())
+    summary = json.loads((folder / "summary.json").read_text())
+    return {
+        "physics": described["settings"]["physics"],
+        "versions": summary["versions"],
+        "commit": _commit(),
+    }
+
+
+def _commit() -> str | None:
+    """The checkout's commit, with a "+" where files differ from it."""
+    asked = ("git", "describe", "--always", "--abbrev=12", "--dirty=+")
+    try:
+        said = subprocess.run(
+            asked, cwd=pathlib.Path(__file__).parent, capture_output=True, text=True
+        )
+    except OSError:
+        return None
+    return said.stdout.strip() or None
+
+
+@dataclasses.dataclass(frozen=True)
+class Results:
+    """What is known of a trial.
+
+    Attributes:
+      trial: which.
+      seeds: their numbers, (seeds,): those that every point has.
+      env_steps: (rows,), at the end of each part of training.
+      returns: (points, seeds, rows), NaN where no episode ended.
+      made: by what.
+    """
+
+    trial: Trial
+    seeds: np.ndarray
+    env_steps: np.ndarray
+    returns: np.ndarray
+    made: Sequence[Mapping[str, Any]]
+
+    @property
+    def final(self) -> np.ndarray:
+        """Mean return over the last tenth of training, (points, seeds)."""
+        return self.part(0.9, 1.0)
+
+    def part(self, begin: float, end: float) -> np.ndarray:
+        """Mean return over a part of training, from share to share, (points, seeds)."""
+        share = self.env_steps / self.env_steps[-1]
+        rows = self.returns[..., (share > begin) & (share <= end)]
+        count = np.isfinite(rows).sum(axis=-1)
+        return np.where(count > 0, np.nansum(rows, -1) / np.maximum(count, 1), np.nan)
+
+
+def read(trial: Trial, results: pathlib.Path) -> Results | None:
+    """The results of a trial; None where no seed is complete."""
+    target = results / f"{trial.name}.csv"
+    rows = _read(target)
+    seeds_of: dict[int, set[int]] = {}
+    for row in rows:
+        seeds_of.setdefault(int(row["point"]), set()).add(int(row["seed"]))
+    if set(seeds_of) != set(range(len(trial.points))):
+        return None
+    seeds = sorted(set.intersection(*seeds_of.values()))
+    if not seeds:
+        return None
+    steps = sorted({int(row["env_steps"]) for row in rows})
+    returns = np.full((len(trial.points), len(seeds), len(steps)), np.nan)
+    for row in rows:
+        if int(row["seed"]) in seeds and row["episode_return"]:
+            place = (
+                int(row["point"]),
+                seeds.index(int(row["seed"])),
+                steps.index(int(row["env_steps"])),
+            )
+            returns[place] = float(row["episode_return"])
+    described = json.loads(target.with_suffix(".json").read_text())
+    return Results(
+        trial=trial,
+        seeds=np.array(seeds),
+        env_steps=np.array(steps),
+        returns=returns,
+        made=described["made"],
+    )
