@@ -9,6 +9,7 @@ machines can share an experiment.
 import csv
 import dataclasses
 import json
+import os
 import pathlib
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import logging, sweep
+from gasil_jax import logging, run_folder, shards, sweep, sweep_tables
 from gasil_jax.command_line import InputError
 
 #: The paper's agents, as figures 5 and 7 compare them.
@@ -68,25 +69,6 @@ class Trial:
         return fields | {"points": [dict(point) for point in self.points]}
 
 
-def divide(trial: Trial, part: int, parts: int) -> Trial | None:
-    """Part `part`, from 1, of `parts`; None where nothing is left for it.
-
-    Every so manieth point; of a point that several parts share, some of its seeds.
-    """
-    sharing = max(1, parts // len(trial.points))
-    points = trial.points[(part - 1) // sharing :: max(1, parts // sharing)]
-    bounds = np.linspace(0, trial.seeds, sharing + 1).round().astype(int).tolist()
-    first, last = bounds[(part - 1) % sharing :][:2]
-    if not points or first == last or (part - 1) // sharing >= len(trial.points):
-        return None
-    return dataclasses.replace(
-        trial,
-        points=points,
-        first_seed=trial.first_seed + first,
-        seeds=last - first,
-    )
-
-
 def train(
     trial: Trial, runs: pathlib.Path, part: int, parts: int, flags: Sequence[str] = ()
 ) -> int:
@@ -96,31 +78,38 @@ def train(
       trial: the whole of it.
       runs: folder of the experiment's runs.
       part: from 1.
-      parts: how many.
+      parts: how many; a sweep's shards if more than one.
       flags: more of them, for the sweep's command line.
+
+    Raises:
+      InputError: what is there is of other hyperparameters.
     """
-    share = divide(trial, part, parts)
-    if share is None:
+    parts = min(parts, len(trial.points) * trial.seeds)
+    if part > parts:
         return 0
-    place = runs / trial.name / f"{part}-of-{parts}"
-    points = json.dumps([dict(point) for point in share.points])
-    listed = place.with_suffix(".json")
+    place = runs / trial.name
+    listed = place.with_name(f"{place.name}.json")
+    points = json.dumps([dict(point) for point in trial.points])
     place.parent.mkdir(parents=True, exist_ok=True)
     if not listed.exists():
-        listed.write_text(points)
+        # Whole at once: other parts may be reading it.
+        written = listed.with_name(f"{listed.name}.{os.getpid()}")
+        written.write_text(points)
+        written.replace(listed)
     elif json.loads(listed.read_text()) != json.loads(points):
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
         return 0
-    schedule = [str(number) for pair in share.alpha_schedule for number in pair]
+    schedule = [str(number) for pair in trial.alpha_schedule for number in pair]
     return sweep.main(
         [
-            *("--env", share.env, "--agent", share.agent, *_FLAGS),
-            *("--reward-delay", str(share.reward_delay)),
-            *("--obs-noise", str(share.obs_noise)),
-            *("--seeds", str(share.seeds), "--first-seed", str(share.first_seed)),
-            *("--total-steps", str(share.total_steps), "--out", str(place)),
+            *("--env", trial.env, "--agent", trial.agent, *_FLAGS),
+            *("--reward-delay", str(trial.reward_delay)),
+            *("--obs-noise", str(trial.obs_noise)),
+            *("--seeds", str(trial.seeds), "--first-seed", str(trial.first_seed)),
+            *("--total-steps", str(trial.total_steps), "--out", str(place)),
             *("--resume", "--points-file", str(listed)),
+            *(("--shard", f"{part}/{parts}") if parts > 1 else ()),
             *("--alpha-schedule", *schedule, *flags),
         ]
     )
@@ -136,9 +125,9 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> bool:
     """
     target = results / f"{trial.name}.csv"
     described = target.with_suffix(".json")
-    rows = {(row["point"], row["seed"]): [] for row in _read(target)}
+    rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in _read(target):
-        rows[row["point"], row["seed"]].append(row)
+        rows.setdefault((row["point"], row["seed"]), []).append(row)
     made = []
     if described.exists():
         before = json.loads(described.read_text())
@@ -146,9 +135,12 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> bool:
             raise InputError(f"{target} is of other settings: move it away")
         made = before["made"]
     found = len(rows)
-    for summary in sorted((runs / trial.name).glob("*/summary.json")):
-        new = dict(_rows(trial, summary.parent))
-        by = _made(summary.parent)
+    place = runs / trial.name
+    for trained in map(_trained, [place, *sorted(shards.root(place).glob("*-of-*"))]):
+        if trained is None:
+            continue
+        new = dict(_rows(trial, trained))
+        by = _made(trained)
         if not set(new) <= set(rows) and by not in made:
             made.append(by)
         rows = new | rows
@@ -173,33 +165,44 @@ def _read(path: pathlib.Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def _rows(trial: Trial, folder: pathlib.Path) -> Iterable[tuple[Any, Any]]:
-    """(point, seed) -> rows of the results, of a sweep that has ended."""
-    described = json.loads((folder / "config.json").read_text())
-    every = [json.loads(json.dumps(dict(point))) for point in trial.points]
-    with np.load(folder / "curves.npz") as curves:
-        returns, steps = curves["episode_return"], curves["env_steps"]
-    parts = np.array_split(np.arange(returns.shape[-1]), trial.rows)
-    parts = [part for part in parts if len(part)]
-    for place, point in enumerate(described["points"]):
-        for offset in range(described["seeds"]):
-            key = (str(every.index(point)), str(described["first_seed"] + offset))
-            rows = []
-            for part in parts:
-                seen = returns[place, offset, part]
-                seen = seen[np.isfinite(seen)]
-                mean = f"{seen.mean():.6g}" if len(seen) else ""
-                end = int(steps[place, offset, part[-1]])
-                rows.append(dict(zip(_COLUMNS, (*key, end, mean))))
-            yield key, rows
+def _trained(folder: pathlib.Path) -> sweep_tables.Trained | None:
+    """A sweep or shard that has ended; None where there is none."""
+    if not run_folder.is_described(folder):
+        return None
+    described = run_folder.read(folder)
+    first = described["first_seed"]
+    seeds = range(first, first + described["seeds"])
+    programs = shards.programs(described["config"], described["points"], seeds)
+    if described["shard"] is not None:
+        programs = shards.share(programs, shards.parse(described["shard"]))
+    elif shards.root(folder).is_dir():
+        return None  # The tables of shards, which are read themselves.
+    trained = sweep_tables.Trained(folder, programs)
+    return None if trained.unfinished() else trained
 
 
-def _made(folder: pathlib.Path) -> dict[str, Any]:
-    described = json.loads((folder / "config.json").read_text())
-    summary = json.loads((folder / "summary.json").read_text())
+def _rows(
+    trial: Trial, trained: sweep_tables.Trained
+) -> Iterable[tuple[tuple[str, str], list[dict[str, Any]]]]:
+    """(point, seed) -> rows of the results."""
+    for (point, seed), metrics in trained.members().items():
+        returns, steps = metrics["episode_return"], metrics["env_steps"]
+        rows = []
+        for part in np.array_split(np.arange(len(steps)), trial.rows):
+            if not len(part):
+                continue
+            seen = returns[part][np.isfinite(returns[part])]
+            mean = f"{seen.mean():.6g}" if len(seen) else ""
+            values = (point, seed, int(steps[part[-1]]), mean)
+            rows.append(dict(zip(_COLUMNS, values, strict=True)))
+        yield (str(point), str(seed)), rows
+
+
+def _made(trained: sweep_tables.Trained) -> dict[str, Any]:
+    described = run_folder.read(trained.folder)
     return {
-        "physics": described["settings"]["physics"],
-        "versions": summary["versions"],
+        "physics": described["settings"].physics,
+        "versions": trained.trainings()[0]["versions"],
         "commit": _commit(),
     }
 

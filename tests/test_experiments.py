@@ -61,7 +61,7 @@ def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, c
     with (tmp_path / "results" / name / f"{only}.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["seed"] for row in rows} == {"0", "1"}
-    curves = tmp_path / "runs" / name / only / "1-of-1" / "curves.npz"
+    curves = tmp_path / "runs" / name / only / "curves.npz"
     returns = np.load(curves)["episode_return"][0]
     for row in rows:
         iteration = int(row["env_steps"]) // 256 - 1
@@ -101,22 +101,6 @@ def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
     chosen = random_search.best("hopper", "ppo", 1)
     assert chosen == {"learning_rate": (1e-3, 1e-4)[better]}
     assert random_search.best("hopper", "ppo", random_search.DELAY) is None
-
-
-@pytest.mark.parametrize(
-    ("points", "seeds", "parts"),
-    [(16, 2, 16), (16, 2, 32), (16, 2, 5), (1, 10, 3), (1, 10, 12), (4, 8, 8)],
-)
-def test_parts_cover_every_run_once(points, seeds, parts):
-    every = tuple({"alpha": float(number)} for number in range(points))
-    trial = trials.Trial("a/b", "hopper", "ppo", points=every, seeds=seeds)
-    seen = collections.Counter()
-    for part in range(1, parts + 1):
-        share = trials.divide(trial, part, parts)
-        for point in () if share is None else share.points:
-            for offset in range(share.seeds):
-                seen[point["alpha"], share.first_seed + offset] += 1
-    assert len(seen) == points * seeds and set(seen.values()) == {1}
 
 
 def test_points_are_drawn_equally_often():
