@@ -103,6 +103,38 @@ def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
     assert random_search.best("hopper", "ppo", random_search.DELAY) is None
 
 
+def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
+    """What looks best with few seeds is not taken if more seeds say otherwise."""
+    monkeypatch.setattr(trials, "RESULTS", tmp_path)
+    rates = (5e-4, 4e-4, 3e-4, 2e-4, 1e-4)
+    monkeypatch.setitem(random_search.SPACES, "ppo", {"learning_rate": rates})
+    monkeypatch.setattr(random_search, "_RUNS", 10)
+    arguments = ("hopper", "ppo", 1)
+
+    def write(trial, scores):
+        target = tmp_path / "random_search" / f"{trial.name}.csv"
+        target.parent.mkdir(parents=True, exist_ok=True)
+        lines = ["point,seed,env_steps,episode_return"]
+        for point, score in enumerate(scores):
+            for seed in range(trial.first_seed, trial.first_seed + trial.seeds):
+                lines.append(f"{point},{seed},100,{score}")
+        target.write_text("\n".join(lines) + "\n")
+        described = {"settings": trial.settings(), "made": []}
+        target.with_suffix(".json").write_text(json.dumps(described))
+
+    assert random_search.confirmation(*arguments) is None
+    write(random_search.search(*arguments), (1.0, 9.0, 3.0, 8.0, 7.0))
+    assert random_search.best(*arguments) == {"learning_rate": 4e-4}
+    second = random_search.confirmation(*arguments)
+    kept = [point["learning_rate"] for point in second.points]
+    assert kept == [4e-4, 2e-4, 1e-4, 3e-4]
+    first = random_search.search(*arguments)
+    assert first.first_seed + first.seeds <= second.first_seed
+    # 2 seeds with 9 and 4 with 2; 8 and 7: 8 x 2 + 7 x 4 is more.
+    write(second, (2.0, 7.0, 6.0, 3.0))
+    assert random_search.best(*arguments) == {"learning_rate": 2e-4}
+
+
 def test_points_are_drawn_equally_often():
     space = random_search.SPACES["ppo+gasil"]
     points = random_search.draw(space, 16)
