@@ -19,6 +19,15 @@ from gasil_envs.physics import native
 native.reserve_threads(2)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """One worker for the tests that share a module's fixture: it is made once."""
+    for item in items:
+        found = item._fixtureinfo.name2fixturedefs.values()
+        if any(definitions[-1].scope == "module" for definitions in found):
+            item.add_marker(pytest.mark.xdist_group(item.module.__name__))
+
+
 @pytest.fixture(scope="session")
 def untrained_hopper(tmp_path_factory):
     """The folder of a run on hopper with a first checkpoint: no training compiles."""

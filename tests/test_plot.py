@@ -53,14 +53,15 @@ def test_runs_are_drawn(tmp_path, capsys):
         *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
     )
     folders = []
-    for agent in ("ppo", "ppo+gasil"):
-        folders.append(str(tmp_path / agent))
-        assert run.main([*small, "--agent", agent, "--out", folders[-1]]) == 0
+    for name, first_seed in (("ppo", "0"), ("others", "3")):
+        folders.append(str(tmp_path / name))
+        more = ("--agent", "ppo", "--first-seed", first_seed, "--out", folders[-1])
+        assert run.main([*small, *more]) == 0
     capsys.readouterr()
     out = tmp_path / "figure.png"
     assert plot.main([*folders, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "point_mass, ppo+gasil" in printed and "95% interval" in printed
+    assert "point_mass, ppo" in printed and "95% interval" in printed
     assert out.read_bytes().startswith(b"\x89PNG")
     curves = plot.read(tmp_path / "ppo")
     assert curves.returns.shape == (3, 8) and curves.env_steps[-1] == 2048

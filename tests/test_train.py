@@ -54,7 +54,7 @@ def test_vmap_over_every_hyperparameter_equals_single_runs():
 def test_it_trains_an_environment_of_brax():
     env = gasil_jax.make_env("brax:inverted_pendulum")
     assert isinstance(env.unwrapped, brax.envs.inverted_pendulum.InvertedPendulum)
-    config = SMALL.replace(total_steps=1024, max_episode_steps=50)
+    config = SMALL.replace(agent="ppo", total_steps=1024, max_episode_steps=50)
     state, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
     assert np.all(np.isfinite(metrics["policy_loss"]))
     # One point for each step upright, and no episode above the limit.
