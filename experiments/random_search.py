@@ -22,8 +22,7 @@ import numpy as np
 from experiments import command, report, trials
 from experiments.report import Figure
 from experiments.trials import AGENTS, TASKS, Trial
-
-Point = Mapping[str, Any]
+from gasil_jax.points import Point
 
 DELAY = 20
 _FIRST_SEED = 1000

@@ -30,7 +30,8 @@ from gasil_jax import run, run_folder, shards, sweep, trackers
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config
 from gasil_jax.interruption import Interrupted
-from gasil_jax.shards import Point, Program
+from gasil_jax.points import Point
+from gasil_jax.shards import Program
 
 _PROGRAM = "gasil_jax.halving"
 _STUDY = "halving"

@@ -8,14 +8,12 @@ program, so that a shard compiles as few programs as may be.
 import dataclasses
 import pathlib
 import re
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from gasil_jax import run_folder
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
-
-Point = Mapping[str, Any]
+from gasil_jax.points import Point
 
 _FLOATS = {field.name for field in dataclasses.fields(Hyperparameters)}
 

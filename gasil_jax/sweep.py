@@ -13,37 +13,18 @@ shards/3-of-8, without the tables, which gasil_jax.merge makes of all shards.
 
 import argparse
 import dataclasses
-import itertools
-import json
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 from gasil_jax import launch, merge, run, run_folder, shards, sweep_tables, trackers
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, Hyperparameters, nearest
 from gasil_jax.interruption import Interrupted, Interruption
-from gasil_jax.shards import Point, Program
+from gasil_jax.points import Point, make_points
+from gasil_jax.shards import Program
 
 _PROGRAM = "gasil_jax.sweep"
-_HYPERPARAMETERS = {f.name: float for f in dataclasses.fields(Hyperparameters)}
-_CONFIG = {
-    f.name: int
-    for f in dataclasses.fields(Config)
-    if f.type in (int, "int") and f.name not in ("total_steps", "num_envs")
-}
-
-#: The ranges of the paper's appendix, from which `--random` draws.
-PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
-    "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
-    "discriminator_updates": (1, 5, 10, 20),
-    "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
-    "buffer_steps": (1000, 10000),
-    "alpha": (0.02, 0.1, 0.2, 1.0),
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,105 +60,6 @@ class Options(PointOptions):
     shard: str | None = None
     launcher: str | None = None
     shards: int | None = None
-
-
-def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
-    """From NAME=VALUE,VALUE,... to values by name.
-
-    Raises:
-      InputError: no such name, or not a number.
-    """
-    kinds = {**_HYPERPARAMETERS, **_CONFIG}
-    values = {}
-    for entry in grid:
-        name, _, listed = entry.partition("=")
-        name = name.replace("-", "_")
-        if name not in kinds:
-            raise InputError(f"grid: {_unknown_name(name)}")
-        try:
-            values[name] = tuple(kinds[name](value) for value in listed.split(","))
-        except ValueError:
-            kind = "numbers" if kinds[name] is float else "whole numbers"
-            raise InputError(
-                f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
-            ) from None
-    return values
-
-
-def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The points that a file lists.
-
-    Raises:
-      InputError: it can't be read, or has something else in it.
-    """
-    try:
-        points = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise InputError(
-            f"points_file is {path}, which can't be read: {error}"
-        ) from None
-    if not isinstance(points, list) or not points:
-        raise InputError(
-            f"points_file is {path}: it must hold a list of points, one or more"
-        )
-    kinds = {**_HYPERPARAMETERS, **_CONFIG}
-    for point in points:
-        if not isinstance(point, dict):
-            raise InputError(f"points_file is {path}: {point!r} is not a point")
-        for name, value in point.items():
-            if name not in kinds:
-                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
-            whole = kinds[name] is int
-            if isinstance(value, bool) or not isinstance(
-                value, int if whole else int | float
-            ):
-                kind = "a whole number" if whole else "a number"
-                raise InputError(
-                    f"points_file is {path}: {name} is {value!r}, not {kind}"
-                )
-    return [
-        {name: kinds[name](value) for name, value in point.items()} for point in points
-    ]
-
-
-def _unknown_name(name: str) -> str:
-    kinds = (*_HYPERPARAMETERS, *_CONFIG)
-    return (
-        f"{name!r} can't vary: did you mean {nearest(name, kinds)!r}? "
-        f"(one of {', '.join(kinds)})"
-    )
-
-
-def make_points(options: PointOptions) -> list[dict[str, Any]]:
-    """The points of a sweep, without repetitions.
-
-    Raises:
-      InputError: there is nothing to vary.
-    """
-    if options.points_file is not None:
-        if options.grid or options.random is not None:
-            raise InputError("points_file stands in place of grid and random")
-        return read_points(pathlib.Path(options.points_file))
-    values: Mapping[str, tuple[Any, ...]] = parse_grid(options.grid)
-    if options.random is None:
-        if not values:
-            raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or "
-                "--points-file"
-            )
-        return [
-            dict(zip(values, point, strict=True))
-            for point in itertools.product(*values.values())
-        ]
-    if options.random < 1:
-        raise InputError(f"random is {options.random}: it must be 1 or more")
-    values = values or PAPER_RANGES
-    every = list(itertools.product(*values.values()))
-    count = min(options.random, len(every))
-    chosen = np.random.default_rng(options.first_seed).choice(
-        len(every), count, replace=False
-    )
-    return [dict(zip(values, every[i], strict=True)) for i in chosen]
 
 
 def train(
@@ -278,7 +160,9 @@ def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
       InputError: the value and what is allowed.
     """
     run.check(options)
-    points = make_points(options)
+    points = make_points(
+        options.grid, options.random, options.points_file, options.first_seed
+    )
     for point in points:
         config = options.config.updated(point)
         run.check(dataclasses.replace(options, config=config))

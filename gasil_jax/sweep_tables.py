@@ -17,8 +17,9 @@ import numpy as np
 
 from gasil_jax import logging
 from gasil_jax.command_line import InputError
+from gasil_jax.points import Point
 from gasil_jax.run import final_returns
-from gasil_jax.shards import Point, Program
+from gasil_jax.shards import Program
 
 #: What metrics.csv calls the members.
 LABELS = ("point", "seed")

@@ -13,6 +13,7 @@ from test_resume import finish, wait_for
 
 from gasil_jax import command_line, merge, run, shards, sweep
 from gasil_jax.config import Config
+from gasil_jax.points import PAPER_RANGES
 
 SMALL = (
     *("--env", "point_mass", "--total-steps", "512", "--batch-steps", "256"),
@@ -21,14 +22,14 @@ SMALL = (
 )
 
 
-def options(*arguments):
-    return command_line.parse(sweep.Options, ["--env", "point_mass", *arguments], "x")
+def points_of(*arguments):
+    given = ["--env", "point_mass", *arguments]
+    options = command_line.parse(sweep.Options, given, "x")
+    return sweep.plan(options)[0]
 
 
 def test_a_grid_is_every_combination():
-    points = sweep.make_points(
-        options("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
-    )
+    points = points_of("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
     assert points == [
         {"alpha": 0.1, "discriminator_updates": 1},
         {"alpha": 0.1, "discriminator_updates": 5},
@@ -44,17 +45,17 @@ def test_a_grid_is_every_combination():
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges():
-    points = sweep.make_points(options("--random", "16"))
+    points = points_of("--random", "16")
     assert len({tuple(point.items()) for point in points}) == 16
     for point in points:
-        assert set(point) == set(sweep.PAPER_RANGES)
-        assert all(value in sweep.PAPER_RANGES[name] for name, value in point.items())
+        assert set(point) == set(PAPER_RANGES)
+        assert all(value in PAPER_RANGES[name] for name, value in point.items())
 
 
 def test_points_from_a_file(tmp_path):
     path = tmp_path / "points.json"
     path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
-    points = sweep.make_points(options("--points-file", str(path)))
+    points = points_of("--points-file", str(path))
     assert points == [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
     for text, message in (
         ("[", "can't be read"),
@@ -65,7 +66,7 @@ def test_points_from_a_file(tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(command_line.InputError, match=message):
-            sweep.make_points(options("--points-file", str(path)))
+            points_of("--points-file", str(path))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,136 @@
+"""The points of a sweep: hyperparameters, and counts of `Config`, by name."""
+
+import dataclasses
+import itertools
+import json
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters, nearest
+
+Point = Mapping[str, Any]
+
+_HYPERPARAMETERS = {f.name: float for f in dataclasses.fields(Hyperparameters)}
+_CONFIG = {
+    f.name: int
+    for f in dataclasses.fields(Config)
+    if f.type in (int, "int") and f.name not in ("total_steps", "num_envs")
+}
+
+#: The ranges of the paper's appendix, from which `--random` draws.
+PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
+    "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
+    "discriminator_updates": (1, 5, 10, 20),
+    "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+    "buffer_steps": (1000, 10000),
+    "alpha": (0.02, 0.1, 0.2, 1.0),
+}
+
+
+def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """From NAME=VALUE,VALUE,... to values by name.
+
+    Raises:
+      InputError: no such name, or not a number.
+    """
+    kinds = {**_HYPERPARAMETERS, **_CONFIG}
+    values = {}
+    for entry in grid:
+        name, _, listed = entry.partition("=")
+        name = name.replace("-", "_")
+        if name not in kinds:
+            raise InputError(f"grid: {_unknown_name(name)}")
+        try:
+            values[name] = tuple(kinds[name](value) for value in listed.split(","))
+        except ValueError:
+            kind = "numbers" if kinds[name] is float else "whole numbers"
+            raise InputError(
+                f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
+            ) from None
+    return values
+
+
+def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The points that a file lists.
+
+    Raises:
+      InputError: it can't be read, or has something else in it.
+    """
+    try:
+        points = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
+    if not isinstance(points, list) or not points:
+        raise InputError(
+            f"points_file is {path}: it must hold a list of points, one or more"
+        )
+    kinds = {**_HYPERPARAMETERS, **_CONFIG}
+    for point in points:
+        if not isinstance(point, dict):
+            raise InputError(f"points_file is {path}: {point!r} is not a point")
+        for name, value in point.items():
+            if name not in kinds:
+                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
+            whole = kinds[name] is int
+            if isinstance(value, bool) or not isinstance(
+                value, int if whole else int | float
+            ):
+                kind = "a whole number" if whole else "a number"
+                raise InputError(
+                    f"points_file is {path}: {name} is {value!r}, not {kind}"
+                )
+    return [
+        {name: kinds[name](value) for name, value in point.items()} for point in points
+    ]
+
+
+def _unknown_name(name: str) -> str:
+    kinds = (*_HYPERPARAMETERS, *_CONFIG)
+    return (
+        f"{name!r} can't vary: did you mean {nearest(name, kinds)!r}? "
+        f"(one of {', '.join(kinds)})"
+    )
+
+
+def make_points(
+    grid: Sequence[str], random: int | None, points_file: str | None, seed: int
+) -> list[dict[str, Any]]:
+    """The points of a sweep, without repetitions.
+
+    Args:
+      grid: NAME=VALUE,VALUE,... for what varies.
+      random: draw so many of the grid's points, or of `PAPER_RANGES` without a grid.
+      points_file: a file that lists them, in place of both.
+      seed: of the draws.
+
+    Raises:
+      InputError: there is nothing to vary, or it can't.
+    """
+    if points_file is not None:
+        if grid or random is not None:
+            raise InputError("points_file stands in place of grid and random")
+        return read_points(pathlib.Path(points_file))
+    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid)
+    if random is None:
+        if not values:
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random or "
+                "--points-file"
+            )
+        return [
+            dict(zip(values, point, strict=True))
+            for point in itertools.product(*values.values())
+        ]
+    if random < 1:
+        raise InputError(f"random is {random}: it must be 1 or more")
+    values = values or PAPER_RANGES
+    every = list(itertools.product(*values.values()))
+    count = min(random, len(every))
+    chosen = np.random.default_rng(seed).choice(len(every), count, replace=False)
+    return [dict(zip(values, every[i], strict=True)) for i in chosen]
