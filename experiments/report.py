@@ -186,7 +186,10 @@ def draw(shown: Mapping[str, Mapping[str, Results]], path: pathlib.Path) -> None
         layout="constrained",
         squeeze=False,
     )
-    names = list(dict.fromkeys(curve for curves in shown.values() for curve in curves))
+    every = [curve for curves in shown.values() for curve in curves]
+    # An agent has the same colour in every figure.
+    names = list(trials.AGENTS if set(every) <= set(trials.AGENTS) else ())
+    names += [curve for curve in dict.fromkeys(every) if curve not in names]
     for axes, (panel, curves) in zip(grid.flat, shown.items()):
         for curve, known in curves.items():
             color = plot.COLORS[names.index(curve) % len(plot.COLORS)]
