@@ -246,12 +246,13 @@ def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> Non
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    size = (8.0, 1.0 + 0.35 * len(points))
+    size = (11.0, 1.4 + 0.35 * len(points))
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     for row in range(len(points)):
         axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
         axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
-    axes.set_yticks(range(len(points)), [_label(point) for point in points])
+    labels = [_label(point) for point in points]
+    axes.set_yticks(range(len(points)), labels, fontsize=8)
     axes.set(xlabel="final return (each seed; the bar is their mean)")
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)
