@@ -2,14 +2,13 @@
 
 import dataclasses
 import pathlib
-import re
 import sys
 from collections.abc import Callable, Sequence
 
 from experiments import report, trials
 from experiments.report import Figure
 from experiments.trials import Trial
-from gasil_jax import command_line
+from gasil_jax import command_line, shards
 from gasil_jax.command_line import InputError
 
 
@@ -80,7 +79,7 @@ def _run(
     quick: Callable[[Sequence[Trial]], Sequence[Trial]],
     write: Callable[[Figure, Sequence[Trial], pathlib.Path], None],
 ) -> int:
-    part, parts = _part(options.part)
+    part = shards.parse(options.part, "part")
     wanted = list(make())
     runs, results = options.runs / figure.name, options.results
     if options.quick:
@@ -109,26 +108,17 @@ def _run(
         flags += ["--devices", str(options.devices)]
     for trial in chosen:
         known = trials.read(trial, folder)
-        complete = known is not None and len(known.seeds) >= trial.seeds
-        if not options.report and not complete:
+        if not options.report and not (known is not None and known.complete):
             print(f"{figure.name}: {trial.name}", flush=True)
-            if status := trials.train(trial, runs, part, parts, flags):
+            if status := trials.train(trial, runs, part.number, part.count, flags):
                 return status
         # Parts may run side by side; their results are put together by one process.
-        if parts == 1:
+        if part.count == 1:
             trials.collect(trial, runs, folder)
-    if parts == 1:
+    if part.count == 1:
         write(figure, wanted, results)
         print(f"in {results / figure.name}.md")
     return 0
-
-
-def _part(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"(\d+)/(\d+)", text)
-    part, parts = map(int, found.groups()) if found else (0, 0)
-    if not 1 <= part <= parts:
-        raise InputError(f"part is {text!r}: it must be I/N, I from 1 to N")
-    return part, parts
 
 
 def _choose(wanted: Sequence[Trial], only: Sequence[str]) -> list[Trial]:

@@ -1,9 +1,10 @@
 """The four agents on the six tasks, each with what the search found best for it."""
 
+from typing import Any
+
 from experiments import random_search
 from experiments.trials import AGENTS, TASKS, Trial
-
-Schedule = tuple[tuple[float, float], ...]
+from gasil_jax import presets
 
 #: Humanoid's length; the other tasks' is the trial's default.
 _STEPS = {"humanoid": 3_000_000}
@@ -22,18 +23,17 @@ def make(reward_delay: int) -> list[Trial]:
             points=(random_search.best(env, agent, reward_delay) or {},),
             reward_delay=reward_delay,
             total_steps=_STEPS.get(env, 1_000_000),
-            alpha_schedule=_schedule(env, agent, reward_delay),
+            alpha_schedule=_alpha_schedule(env, agent, reward_delay),
         )
         for env in TASKS
         for agent in AGENTS
     ]
 
 
-def _schedule(env: str, agent: str, reward_delay: int) -> Schedule:
-    """The paper's rule for Humanoid; alpha is fixed in all else."""
-    if (env, agent, reward_delay) == ("humanoid", "ppo+gasil", 1):
-        return ((2e6, 0.0), (3e6, 1.0))
-    return ()
+def _alpha_schedule(env: str, agent: str, reward_delay: int) -> Any:
+    """The paper's of the dense tasks; where rewards are delayed alpha is fixed."""
+    paper = presets.preset(env, agent, "paper").alpha_schedule
+    return paper if reward_delay == 1 else ()
 
 
 def quick(wanted: list[Trial]) -> list[Trial]:

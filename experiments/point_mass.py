@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 import gasil_jax
-from experiments import command, random_search, report
+from experiments import command, random_search, report, trials
 from experiments.report import Figure
 from experiments.trials import Results, Trial
 from gasil_jax import presets
@@ -64,7 +64,9 @@ def config(agent: str) -> gasil_jax.Config:
     """The configuration of an agent's trial."""
     (trial,) = (trial for trial in make() if trial.agent == agent)
     base = presets.preset("point_mass", agent, "paper")
-    return base.replace(total_steps=STEPS, num_envs=32).updated(trial.points[0])
+    return base.replace(total_steps=STEPS, num_envs=trials.NUM_ENVS).updated(
+        trial.points[0]
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

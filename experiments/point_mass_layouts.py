@@ -1,9 +1,10 @@
 """A search for the point mass' layout: ``python -m experiments.point_mass_layouts``.
 
-The paper prints no coordinates. Layouts are drawn from a family: a blue object or two
-below the start, greens above, and between them a row of orange distractors with gaps.
-In each, PPO and PPO+GASIL are trained at the same learning rates with the same seeds,
-other than those of the figures, and each layout's returns go into a CSV file.
+The paper prints no coordinates. Layouts are drawn from two families: a blue object or
+two below the start, greens above, and between them a row of orange distractors; and
+greens on two sides with distractors between and beyond. In each, PPO and PPO+GASIL are
+trained at the same learning rates with the same seeds, other than those of the figures,
+and each layout's returns go into a CSV file.
 """
 
 import argparse
@@ -15,12 +16,12 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
+from experiments import point_mass
 from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
 from gasil_jax import batch, presets
 from gasil_jax.environments import available_cores
 
-AGENTS = ("ppo", "ppo+gasil")
 LEARNING_RATES = (1e-3, 3e-4, 1e-4)
 _FIRST_SEED = 1000
 
@@ -28,9 +29,9 @@ _FIRST_SEED = 1000
 Places = tuple[tuple[float, float], ...]
 
 
-def _row(count: int, spacing: float, x: float, y: float) -> Places:
-    """Places in a row, centred at x."""
-    first = x - spacing * (count - 1) / 2
+def _row(count: int, spacing: float, y: float) -> Places:
+    """Places in a row, centred."""
+    first = -spacing * (count - 1) / 2
     return tuple(
         (round(float(first + i * spacing), 3), round(float(y), 3)) for i in range(count)
     )
@@ -45,14 +46,13 @@ def draw(number: int) -> Layout:
 def _behind(rng: np.random.Generator) -> Layout:
     barrier = rng.choice((0.3, 0.35, 0.4, 0.45))
     return Layout(
-        blue=_row(rng.choice((1, 1, 2)), 0.6, 0.0, -rng.choice((0.3, 0.4, 0.5))),
+        blue=_row(rng.choice((1, 1, 2)), 0.6, -rng.choice((0.3, 0.4, 0.5))),
         green=_row(
             rng.choice((2, 3, 4)),
             rng.choice((0.3, 0.4)),
-            0.0,
             barrier + rng.choice((0.25, 0.35, 0.45)),
         ),
-        orange=_row(rng.choice((3, 5, 7)), rng.choice((0.2, 0.25, 0.3)), 0.0, barrier),
+        orange=_row(rng.choice((3, 5, 7)), rng.choice((0.2, 0.25, 0.3)), barrier),
         start_spread=float(rng.choice((0.1, 0.2))),
         radius=float(rng.choice((0.1, 0.12, 0.15))),
         max_speed=float(rng.choice((0.05, 0.07, 0.1))),
@@ -64,7 +64,7 @@ def _two_sides(rng: np.random.Generator) -> Layout:
     x, y = rng.choice((0.3, 0.4, 0.5)), rng.choice((0.1, 0.3, 0.5))
     wall = int(rng.choice((1, 3)))
     low = rng.choice((-0.6, -0.7))
-    blue = ((-0.5, low), (0.5, low), (0.0, low), (0.0, 0.85))
+    blue = ((-0.5, low), (0.5, low))
     green = ((-x, y), (x, y), *(((0.0, y + 0.4),) if rng.random() < 0.5 else ()))
     return Layout(
         blue=blue[: int(rng.choice((0, 1, 2)))],
@@ -90,11 +90,10 @@ def evaluate(
     """
     env = wrappers.EpisodeLimit(PointMass(layout), layout.episode_length)
     rows = []
-    for agent in AGENTS:
-        config = presets.preset("point_mass", agent, "tuned").replace(
-            total_steps=total_steps
+    for agent in point_mass.AGENTS:
+        config = presets.preset("point_mass", agent, "tuned").updated(
+            {"total_steps": total_steps, "alpha": alpha}
         )
-        config = config.updated({"alpha": alpha})
         numbers = list(range(_FIRST_SEED, _FIRST_SEED + seeds))
         hyperparameters = [
             config.hyperparameters.replace(learning_rate=rate)

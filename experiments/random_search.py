@@ -132,7 +132,7 @@ def _complete(trial: Trial | None) -> trials.Results | None:
     if trial is None:
         return None
     known = trials.read(trial, trials.RESULTS / FIGURE.name)
-    return known if known is not None and len(known.seeds) >= trial.seeds else None
+    return known if known is not None and known.complete else None
 
 
 def make() -> list[Trial]:

@@ -26,7 +26,8 @@ TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 # The appendix's values, which a trial's points stand on; no tuned preset.
-_FLAGS = ("--preset", "paper", "--num-envs", "32")
+NUM_ENVS = 32
+_FLAGS = ("--preset", "paper", "--num-envs", str(NUM_ENVS))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +116,8 @@ def train(
     )
 
 
-def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> bool:
-    """Put what has been trained of a trial into its results; whether it is complete.
+def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
+    """Put what has been trained of a trial into its results.
 
     Rows that are there already, of another machine, stay.
 
@@ -152,7 +153,6 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> bool:
             for key in sorted(rows, key=lambda key: tuple(map(int, key))):
                 writer.writerows(rows[key])
         logging.write_json(described, {"settings": trial.settings(), "made": made})
-    return len(rows) >= len(trial.points) * trial.seeds
 
 
 _COLUMNS = ("point", "seed", "env_steps", "episode_return")
@@ -170,14 +170,9 @@ def _trained(folder: pathlib.Path) -> sweep_tables.Trained | None:
     if not run_folder.is_described(folder):
         return None
     described = run_folder.read(folder)
-    first = described["first_seed"]
-    seeds = range(first, first + described["seeds"])
-    programs = shards.programs(described["config"], described["points"], seeds)
-    if described["shard"] is not None:
-        programs = shards.share(programs, shards.parse(described["shard"]))
-    elif shards.root(folder).is_dir():
+    if described["shard"] is None and shards.root(folder).is_dir():
         return None  # The tables of shards, which are read themselves.
-    trained = sweep_tables.Trained(folder, programs)
+    trained = sweep_tables.Trained.described(folder, described)
     return None if trained.unfinished() else trained
 
 
@@ -236,6 +231,11 @@ class Results:
     env_steps: np.ndarray
     returns: np.ndarray
     made: Sequence[Mapping[str, Any]]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all seeds of the trial are there."""
+        return len(self.seeds) >= self.trial.seeds
 
     @property
     def final(self) -> np.ndarray:

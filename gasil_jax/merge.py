@@ -119,11 +119,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
     described = next(iter(every.values()))
     points = described["points"]
     seeds = range(described["first_seed"], described["first_seed"] + described["seeds"])
-    whole = shards.programs(described["config"], points, seeds)
-    parts = [
-        sweep_tables.Trained(path, shards.share(whole, shards.parse(content["shard"])))
-        for path, content in every.items()
-    ]
+    parts = [sweep_tables.Trained.described(*shard) for shard in every.items()]
     unfinished = [
         content["shard"]
         for part, content in zip(parts, every.values(), strict=True)

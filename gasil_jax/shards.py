@@ -111,8 +111,12 @@ def refuse_sharded(out: pathlib.Path) -> None:
         )
 
 
-def parse(text: str) -> Shard:
+def parse(text: str, name: str = "shard") -> Shard:
     """From "3/8".
+
+    Args:
+      text: that.
+      name: what a refusal calls it.
 
     Raises:
       InputError: it is no such thing.
@@ -121,7 +125,7 @@ def parse(text: str) -> Shard:
     shard = Shard(*map(int, found.groups())) if found else None
     if shard is None or shard.number > shard.count:
         raise InputError(
-            f"shard is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
+            f"{name} is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
         )
     return shard
 

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import logging
+from gasil_jax import logging, shards
 from gasil_jax.command_line import InputError
 from gasil_jax.points import Point
 from gasil_jax.run import final_returns
@@ -70,6 +70,16 @@ class Trained:
 
     folder: pathlib.Path
     programs: Sequence[Program]
+
+    @classmethod
+    def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
+        """What a folder trains, by its config.json as `run_folder.read` reads it."""
+        first = content["first_seed"]
+        seeds = range(first, first + content["seeds"])
+        programs = shards.programs(content["config"], content["points"], seeds)
+        if content["shard"] is not None:
+            programs = shards.share(programs, shards.parse(content["shard"]))
+        return cls(folder, programs)
 
     def unfinished(self) -> list[int]:
         """Numbers of the programs that are not trained to their end."""
