@@ -1,12 +1,14 @@
 """Speed and fidelity: ``python -m experiments.benchmark``.
 
-Two tables on the default device, and the same as JSON. "physics": each way of building
+Tables, and the same as JSON. "physics": each way of building
 a task, random actions under jit, vmap and scan, with the relative error of one step
 (the worst entry of the observation, median over the environments) against C MuJoCo
 with the model's own integrator, which is Gymnasium's. "training": whole PPO+GASIL, many
 seeds at once, beside the physics alone with as many environments, and beside
 Stable-Baselines3's PPO on Gymnasium's task where that is installed (the extra
-"benchmark"): one process, and one on every core.
+"benchmark"): one process, and one on every core. "scaling", if asked for: that
+training on 1, 2, 4 ... devices, each with as many seeds: a perfect ratio is the number
+of devices.
 
 All rows of a task are compiled first and then timed in turn, again and again, so that a
 ratio is of numbers from the same minutes; a speed is the median of the repeats.
@@ -166,7 +168,13 @@ def physics_table(options: argparse.Namespace) -> Iterator[list[Row]]:
             yield rows
 
 
-def training_row(env_name: str, name: str, options: argparse.Namespace) -> Row:
+def training_row(
+    env_name: str,
+    name: str,
+    options: argparse.Namespace,
+    seeds: int,
+    devices: Sequence[jax.Device],
+) -> Row:
     """PPO+GASIL with the tuned preset, `options.iterations` in a repeat."""
     env = gasil_envs.make(env_name, **VARIANTS[name])
     config = presets.preset(env_name, "ppo+gasil", "tuned")
@@ -174,7 +182,7 @@ def training_row(env_name: str, name: str, options: argparse.Namespace) -> Row:
         config = config.replace(num_envs=options.training_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    runs = batch.make_batch(env, config, range(options.seeds))
+    runs = batch.make_batch(env, config, range(seeds), devices=devices)
     began = time.perf_counter()
     states, advance = runs.compile()
     compile_seconds = time.perf_counter() - began
@@ -185,10 +193,10 @@ def training_row(env_name: str, name: str, options: argparse.Namespace) -> Row:
         began = time.perf_counter()
         states, _ = jax.block_until_ready(advance(held.pop(), count))
         held.append(states)
-        steps = options.iterations * config.batch_steps * options.seeds
+        steps = options.iterations * config.batch_steps * seeds
         return steps / (time.perf_counter() - began)
 
-    num_envs = options.seeds * config.num_envs
+    num_envs = seeds * config.num_envs
     return Row(env_name, f"ppo+gasil, {name}", num_envs, run, compile_seconds)
 
 
@@ -250,7 +258,24 @@ def training_table(options: argparse.Namespace) -> Iterator[list[Row]]:
             title = f"physics alone, {name}"
             row = physics_row(env_name, name, settings, num_envs, options.num_steps)
             rows.append(dataclasses.replace(row, name=title))
-            rows.append(training_row(env_name, name, options))
+            rows.append(
+                training_row(env_name, name, options, options.seeds, jax.devices())
+            )
+        yield rows
+
+
+def scaling_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+    """A list of rows for each task: 1, 2, 4 ... devices, all of them at last."""
+    devices = jax.devices()
+    doubled = [2**power for power in range(len(devices)) if 2**power < len(devices)]
+    for env_name in options.envs:
+        rows = []
+        for count in (*doubled, len(devices)):
+            row = training_row(
+                env_name, "ours", options, count * options.seeds, devices[:count]
+            )
+            title = f"{row.name}, {count} device{'s' * (count > 1)}"
+            rows.append(dataclasses.replace(row, name=title))
         yield rows
 
 
@@ -279,14 +304,18 @@ def show(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 _COLUMNS = "envs     steps/s  ratio compile s  error of a step"
-TABLES = {"physics": physics_table, "training": training_table}
+TABLES = {
+    "physics": physics_table,
+    "training": training_table,
+    "scaling": scaling_table,
+}
 
 
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Options from the command line."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     add = parser.add_argument
-    add("--tables", nargs="+", choices=TABLES, default=tuple(TABLES))
+    add("--tables", nargs="+", choices=TABLES, default=("physics", "training"))
     add("--envs", nargs="+", choices=TASKS, default=("walker2d",))
     add("--variants", nargs="+", choices=VARIANTS, default=tuple(VARIANTS))
     add("--num-envs", type=int, nargs="+", default=(64,), help="of the physics table")
@@ -294,7 +323,7 @@ def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     add("--skip-errors", action="store_true", help="they take a compilation more")
     add("--repeats", type=int, default=5)
     add("--devices", type=int, help="CPU devices; default the cores")
-    add("--seeds", type=int, default=10, help="of the training table")
+    add("--seeds", type=int, default=10, help="of training; in scaling a device's")
     add("--training-envs", type=int, help="of a seed; default the preset's")
     add(
         "--training-variants",

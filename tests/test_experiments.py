@@ -3,6 +3,7 @@
 import collections
 import csv
 import dataclasses
+import itertools
 import json
 
 import numpy as np
@@ -135,13 +136,14 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     assert random_search.best(*arguments) == {"learning_rate": 2e-4}
 
 
-def test_points_are_drawn_equally_often():
+def test_every_pair_of_values_is_drawn_equally_often():
     space = random_search.SPACES["ppo+gasil"]
-    points = random_search.draw(space, 16)
+    points = random_search.draw(space)
     assert len({tuple(point.items()) for point in points}) == 16
-    for name, values in space.items():
-        counts = collections.Counter(point[name] for point in points)
-        assert counts == dict.fromkeys(values, 16 // len(values))
+    for one, other in itertools.combinations(space, 2):
+        counts = collections.Counter((point[one], point[other]) for point in points)
+        pairs = list(itertools.product(space[one], space[other]))
+        assert counts == dict.fromkeys(pairs, 16 // len(pairs))
     for env, agent in (("hopper", "ppo"), ("ant", "ppo+gasil")):
         trial = random_search.search(env, agent, 20)
         assert len(trial.points) * trial.seeds == 32
