@@ -107,6 +107,7 @@ def _run(
     if options.devices is not None:
         flags += ["--devices", str(options.devices)]
     for trial in chosen:
+        trials.adopt(trial, folder)
         known = trials.read(trial, folder)
         if not options.report and not (known is not None and known.complete):
             print(f"{figure.name}: {trial.name}", flush=True)

@@ -11,6 +11,7 @@ import dataclasses
 import json
 import os
 import pathlib
+import shutil
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -153,6 +154,27 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
             for key in sorted(rows, key=lambda key: tuple(map(int, key))):
                 writer.writerows(rows[key])
         logging.write_json(described, {"settings": trial.settings(), "made": made})
+
+
+def adopt(trial: Trial, results: pathlib.Path) -> None:
+    """Take over what another figure beside `results` has of the very same runs."""
+    target = results / f"{trial.name}.csv"
+    if target.exists():
+        return
+    settings = json.loads(json.dumps(trial.settings()))
+    for described in sorted(results.parent.glob("*/*/*.json")):
+        if json.loads(described.read_text())["settings"] != settings:
+            continue
+        other = dataclasses.replace(
+            trial, name=str(described.relative_to(results.parent).with_suffix(""))
+        )
+        known = read(other, results.parent)
+        seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
+        if known is not None and known.seeds.tolist() == list(seeds):
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy(described.with_suffix(".csv"), target)
+            shutil.copy(described, target.with_suffix(".json"))
+            return
 
 
 _COLUMNS = ("point", "seed", "env_steps", "episode_return")

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import json
 
+import jax
 import numpy as np
 import pytest
 
@@ -16,6 +17,7 @@ from experiments import (
     hyperparameters,
     mujoco,
     point_mass,
+    point_mass_layouts,
     point_mass_moments,
     random_search,
     report,
@@ -78,6 +80,29 @@ def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, c
     changed = [*arguments, "--total-steps", "1024", "--report"]
     assert module.main(changed) == 2
     assert "is of other settings" in capsys.readouterr().err
+
+
+def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
+    trial = trials.Trial("walker2d/ppo", "walker2d", "ppo", seeds=2)
+    there = tmp_path / "mujoco" / trial.name
+    there.parent.mkdir(parents=True)
+    lines = ["point,seed,env_steps,episode_return", "0,0,100,1.5", "0,1,100,2.5"]
+    there.with_suffix(".csv").write_text("\n".join(lines) + "\n")
+    described = json.dumps({"settings": trial.settings(), "made": []})
+    there.with_suffix(".json").write_text(described)
+    here = tmp_path / "noise"
+    for other in (
+        {"obs_noise": 0.1},
+        {"seeds": 3},
+        {"first_seed": 1},
+        {"points": ({"alpha": 1.0},)},
+    ):
+        changed = dataclasses.replace(trial, name="0/ppo", **other)
+        trials.adopt(changed, here)
+        assert trials.read(changed, here) is None
+    same = dataclasses.replace(trial, name="0/ppo")
+    trials.adopt(same, here)
+    assert trials.read(same, here).final.tolist() == [[1.5, 2.5]]
 
 
 def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
@@ -226,6 +251,41 @@ def test_an_optimum_is_named_by_where_it_is(tmp_path):
     assert "2 is best, in the middle; better than 1: yes, better than 3: yes" in said
     shown = {"a": {"1": results(1.0), "2": results(0.9)}}
     assert "1 is best, at an end; better than 2: yes" in report.optimum(shown)
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_a_traced_layout_is_the_layout_itself(number):
+    layout = point_mass_layouts.draw(number)
+    plain = point_mass_layouts.PointMass(layout)
+    walk = lambda env, key: jax.lax.scan(
+        lambda state, action: (env.step(state, action),) * 2,
+        env.reset(key),
+        jax.random.uniform(key, (50, 2), minval=-1.0, maxval=1.0),
+    )[1]
+    key = jax.random.key(3)
+    wanted = walk(plain, key)
+    traced = jax.jit(
+        lambda where: walk(point_mass_layouts.TracedPointMass(where), key)
+    )(point_mass_layouts.places(layout))
+    np.testing.assert_allclose(traced.reward, wanted.reward, atol=1e-5)
+    seen = wanted.obs.shape[-1]
+    np.testing.assert_allclose(traced.obs[:, :seen], wanted.obs, atol=1e-5)
+    assert (traced.obs[:, seen:] == 1).all()  # What is not there is never collected.
+
+
+def test_the_layout_with_the_clearest_lead_is_first():
+    def rows(layout, ppo, gasil):
+        for agent, scores in (("ppo", ppo), ("ppo+gasil", gasil)):
+            for rate, final in scores:
+                row = {"layout": layout, "agent": agent, "learning_rate": rate}
+                yield row | {"alpha": 0, "seed": 0, "early": 0, "final": final}
+
+    # In 0 the best learning rates are alike, in 1 PPO+GASIL's is better.
+    first = rows(0, [(1, 5), (1, 6), (2, 1), (2, 1)], [(1, 0), (1, 0), (2, 6), (2, 5)])
+    second = rows(1, [(1, 5), (1, 6), (2, 1), (2, 1)], [(1, 0), (1, 1), (2, 9), (2, 8)])
+    (lead, said), (none, _) = point_mass_layouts.rank([*first, *second])
+    assert said.startswith("layout 1: PPO 0.0 early, 5.5 final at 1")
+    assert lead > 2 and none == 0
 
 
 def test_moments_of_the_point_mass_are_drawn(tmp_path, monkeypatch):
