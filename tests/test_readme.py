@@ -1,9 +1,11 @@
 """What the README tells people to type works."""
 
 import itertools
+import os
 import pathlib
 import re
 import shlex
+import subprocess
 import sys
 
 import jax
@@ -20,6 +22,7 @@ from gasil_jax import (
     policy,
     render,
     run,
+    shards,
     sweep,
 )
 from gasil_jax import export_minari as export
@@ -45,7 +48,6 @@ LOCOMOTION = ("--gymnasium", ".html")
 NOT_RUN = {
     "python -m pip install": "it changes the environment; .ci/run does it",
     "python -m experiments.benchmark": "it measures for minutes",
-    "python -m gasil_jax.sweep --env hopper --num-envs 32": "it measures on GPUs",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
     "and tests/test_ray.py train shards",
     "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",
@@ -83,6 +85,59 @@ def test_other_commands_are_named_with_a_reason():
         assert line in OURS or any(map(line.startswith, NOT_RUN)), line
     for start in NOT_RUN:
         assert any(line.startswith(start) for line in commands()), start
+
+
+SCALING = (README.parent / "docs" / "scaling.md").read_text()
+
+
+def calls_of(script, folder, **variables):
+    """The arguments of each `python` that a shell script starts, in any order."""
+    listed = folder / "calls"
+    listed.unlink(missing_ok=True)
+    stubs = {
+        "python": f'echo "$(printf "%q " "$@")" >> {listed}',
+        "srun": 'exec "$@"',
+    }
+    for name, body in stubs.items():
+        (folder / name).write_text(f"#!/bin/bash\n{body}\n")
+        (folder / name).chmod(0o755)
+    path = f"{folder}:{os.environ['PATH']}"
+    variables = {name: str(value) for name, value in variables.items()}
+    subprocess.run(["bash", "-euc", script], check=True, env={"PATH": path} | variables)
+    return [shlex.split(line)[2:] for line in listed.read_text().splitlines()]
+
+
+def shard_of(arguments):
+    options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
+    shard = shards.parse(options.shard, "shard")
+    return shard.number, shard.count, str(options.out)
+
+
+def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
+    """In a real shell, with stand-ins for the schedulers and for Python."""
+    shell, slurm = re.findall(r"```bash\n(.*?)```", SCALING, re.DOTALL)
+    *trained, merged = calls_of(shell, tmp_path)
+    assert sorted(shard_of(call) for call in trained) == [
+        (number, 4, "OUT") for number in range(1, 5)
+    ]
+    assert merged == ["OUT"]
+
+    first, last = map(int, re.search(r"--array=(\d+)-(\d+)", slurm).groups())
+    for index in (first, last):
+        (call,) = calls_of(
+            slurm, tmp_path, SLURM_ARRAY_TASK_ID=index, SCRATCH="/a place"
+        )
+        assert shard_of(call) == (index, last, "/a place/OUT")
+
+    yaml = pytest.importorskip("yaml")
+    (text,) = re.findall(r"```yaml\n(.*?)```", SCALING, re.DOTALL)
+    job = yaml.safe_load(text)["spec"]
+    (container,) = job["template"]["spec"]["containers"]
+    assert container["command"] == ["bash", "-c"]
+    (script,) = container["args"]
+    for index in (0, job["completions"] - 1):
+        (call,) = calls_of(script, tmp_path, JOB_COMPLETION_INDEX=index)
+        assert shard_of(call) == (index + 1, job["completions"], "/results/OUT")
 
 
 def as_toy(line, finished, locomotion, folder):
