@@ -35,6 +35,7 @@ _FIRST_SEED = 1000
 _RUNS = 32
 _SECOND_POINTS, _SECOND_SEEDS, _SECOND_FIRST_SEED = 4, 4, 2000
 _ENOUGH_SEEDS = 8
+_SECOND = "-best"
 
 #: Lengths other than the trial's own; humanoid is tuned over a third of its figure's.
 STEPS = {"point_mass": 500_000}
@@ -134,7 +135,7 @@ def confirmation(env: str, agent: str, reward_delay: int) -> Trial | None:
     best_first = np.argsort(-_score(known.final), kind="stable")
     return dataclasses.replace(
         trial,
-        name=f"{trial.name}-best",
+        name=trial.name + _SECOND,
         points=tuple(trial.points[i] for i in best_first[:_SECOND_POINTS]),
         seeds=_SECOND_SEEDS,
         first_seed=_SECOND_FIRST_SEED,
@@ -173,13 +174,24 @@ def best(env: str, agent: str, reward_delay: int) -> Point | None:
     known = _complete(trial)
     if known is None:
         return None
-    second = confirmation(env, agent, reward_delay)
-    confirmed = _complete(second)
-    if second is None or confirmed is None:
-        return trial.points[int(_score(known.final).argmax())]
-    places = [trial.points.index(point) for point in second.points]
-    final = np.concatenate([known.final[places], confirmed.final], axis=1)
-    return second.points[int(_score(final).argmax())]
+    second = _complete(confirmation(env, agent, reward_delay))
+    return _best(known, second)[0]
+
+
+def _best(
+    first: trials.Results, second: trials.Results | None
+) -> tuple[Point, np.ndarray]:
+    """The best point, and its final returns in both stages (seeds,).
+
+    Once there is a second stage, it is one of that stage's.
+    """
+    points, final = first.trial.points, first.final
+    if second is not None:
+        places = [points.index(point) for point in second.trial.points]
+        points = second.trial.points
+        final = np.concatenate([final[places], second.final], axis=1)
+    place = int(_score(final).argmax())
+    return points[place], final[place]
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
@@ -189,21 +201,32 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         "",
         " ".join(__doc__.split("\n\n", 1)[1].split()),
         "",
-        "| task | agent | points x seeds | best point | its mean | median | worst |",
-        "|---|---|---|---|---|---|---|",
+        "The best point's mean is over its seeds of both stages, where there are two; "
+        "median and worst are of the first stage's points.",
+        "",
+        "| task | agent | first stage | second | best point | its mean | seeds "
+        "| median | worst |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, curves in report.panels(wanted, results / figure.name).items():
         for agent, known in curves.items():
-            score = _score(known.final)
-            chosen = known.trial.points[int(score.argmax())]
+            if agent.endswith(_SECOND):
+                continue
+            second = curves.get(agent + _SECOND)
+            if second is not None and not second.complete:
+                second = None
+            chosen, final = _best(known, second)
             said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
-            numbers = (score.max(), float(np.median(score)), score.min())
-            lines.append(
-                f"| {name} | {agent} | {len(score)} x {len(known.seeds)} | {said} | "
-                + " | ".join(f"{number:.0f}" for number in numbers)
-                + " |"
-            )
+            cells = [name, agent, _size(known), _size(second), said]
+            score = _score(known.final)
+            cells += [f"{final.mean():.0f}", str(len(final))]
+            cells += [f"{x:.0f}" for x in (np.median(score), score.min())]
+            lines.append(f"| {' | '.join(cells)} |")
     (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
+
+
+def _size(known: trials.Results | None) -> str:
+    return "" if known is None else f"{len(known.trial.points)} x {len(known.seeds)}"
 
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
