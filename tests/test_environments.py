@@ -157,7 +157,7 @@ def test_point_mass_against_a_plain_python_twin():
 
 def test_point_mass_layout_is_data():
     layout = point_mass.Layout(
-        blue=(), green=((0.0, 0.0),), orange=(), start_spread=0.0
+        blue=(), green=((0.0, 0.0),), orange=(), start=(0.0, 0.0), start_spread=0.0
     )
     env = point_mass.PointMass(layout)
     assert env.observation_size == 3

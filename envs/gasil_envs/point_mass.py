@@ -2,9 +2,10 @@
 
 The action is the agent's velocity. Objects are collected once: blue +5, green +10,
 orange distractors -5. An actuation cost proportional to the L2 norm of the action
-discourages speed. The paper prints no coordinates; `Layout`'s defaults are ours and
-are laid out so that its story can happen: a blue object tempts nearby, three greens
-lie at the top behind a row of distractors with gaps to steer through.
+discourages speed. The paper prints no coordinates; `Layout`'s defaults are ours, found
+by a search for a layout in which its story happens (experiments/point_mass_layouts.py):
+two blue objects tempt on both sides of the start, three greens lie further up, and
+distractors on both sides of them.
 """
 
 import dataclasses
@@ -24,13 +25,16 @@ class Layout:
     The agent starts uniformly within `start_spread` of `start` in each coordinate.
     """
 
-    blue: tuple[tuple[float, float], ...] = ((0.0, -0.4),)
-    green: tuple[tuple[float, float], ...] = ((-0.4, 0.6), (0.0, 0.75), (0.4, 0.6))
-    orange: tuple[tuple[float, float], ...] = ((-0.4, 0.3), (0.0, 0.4), (0.4, 0.3))
-    start: tuple[float, float] = (0.0, 0.0)
-    start_spread: float = 0.2
+    blue: tuple[tuple[float, float], ...] = ((-0.25, -0.12), (0.25, -0.12))
+    green: tuple[tuple[float, float], ...] = ((-0.23, 0.28), (0.23, 0.28), (0.0, 0.58))
+    orange: tuple[tuple[float, float], ...] = (
+        *((-0.64, 0.11), (0.64, 0.11)),
+        *((-0.8, 0.5), (0.8, 0.5)),
+    )
+    start: tuple[float, float] = (0.0, -0.2)
+    start_spread: float = 0.1
     radius: float = 0.15
-    max_speed: float = 0.1
+    max_speed: float = 0.05
     actuation_cost: float = 0.02
     blue_reward: float = 5.0
     green_reward: float = 10.0
