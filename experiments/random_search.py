@@ -7,14 +7,16 @@ one hyperparameter more, so eight points with four seeds each; PPO+GASIL has the
 appendix's four, 256 points, of which an orthogonal array of sixteen gets two seeds
 each: any two hyperparameters have every pair of their values equally often. Then the
 best four points get four seeds more, for the best of many points on few seeds is partly
-the luckiest; PPO's points have eight from the start. On the point mass both agents have
-the learning rates 1e-3, 3e-4, 1e-4 and 3e-5. The seeds are other than those of the
-figures, which use the point with the best mean final return.
+the luckiest; PPO's points have eight from the start. The seeds are other than those of the
+figures, which use the point with the best mean final return. On the point mass both
+agents have the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and
+PPO+GASIL else what its preset has (alpha 1, 20 updates at 3e-4).
 
-A first search drew PPO+GASIL's points otherwise, each value equally often but not each
-pair: no point had 20 discriminator updates with the learning rate 3e-4, nor alpha 1
-with more than one update at it. Its runs, and figures from them, are in
-`results/first_search/`; nothing else uses them.
+Nothing uses what is in `results/first_search/`: a first search that drew PPO+GASIL's
+points otherwise, each value equally often but not each pair (no point had 20
+discriminator updates with the learning rate 3e-4, nor alpha 1 with more than one update
+at it), figures from it and of a point that more seeds replaced, and a search of all of
+PPO+GASIL's hyperparameters on the point mass.
 """
 
 import dataclasses
@@ -64,6 +66,16 @@ SPACES: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
     },
 }
 
+_OTHER_SPACES: Mapping[tuple[str, str], Mapping[str, tuple[Any, ...]]] = {
+    ("point_mass", "ppo"): {"learning_rate": _POINT_MASS_LEARNING_RATES},
+    ("point_mass", "ppo+gasil"): {
+        "learning_rate": _POINT_MASS_LEARNING_RATES,
+        "discriminator_updates": (20,),
+        "discriminator_learning_rate": (3e-4,),
+        "alpha": (1.0,),
+    },
+}
+
 FIGURE = Figure(
     name="random_search",
     title="Hyperparameters of every agent (paper, table 1)",
@@ -106,9 +118,7 @@ def draw(space: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
 
 def space(env: str, agent: str) -> Mapping[str, tuple[Any, ...]]:
     """What an agent's search on a task draws from."""
-    if env == "point_mass":
-        return {**SPACES[agent], "learning_rate": _POINT_MASS_LEARNING_RATES}
-    return SPACES[agent]
+    return _OTHER_SPACES.get((env, agent), SPACES[agent])
 
 
 def panel(env: str, reward_delay: int) -> str:
