@@ -7,8 +7,8 @@ one hyperparameter more, so eight points with four seeds each; PPO+GASIL has the
 appendix's four, 256 points, of which an orthogonal array of sixteen gets two seeds
 each: any two hyperparameters have every pair of their values equally often. Then the
 best four points get four seeds more, for the best of many points on few seeds is partly
-the luckiest; PPO's points have eight from the start. The seeds are other than those of the
-figures, which use the point with the best mean final return. On the point mass both
+the luckiest; PPO's points have eight from the start. The seeds are other than those of
+the figures, which use the point with the best mean final return. On the point mass both
 agents have the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and
 PPO+GASIL else what its preset has (alpha 1, 20 updates at 3e-4).
 
