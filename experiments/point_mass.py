@@ -45,10 +45,10 @@ FIGURE = Figure(
     claim="PPO learns a sub-optimal policy quickly; PPO+GASIL learns a little more "
     "slowly at first and ends with a better policy.",
     conclude=conclude,
-    more="The paper prints no coordinates: the layout is the one of 128 drawn at random "
-    "in which PPO+GASIL was most clearly ahead, on new seeds too "
-    "(`experiments.point_mass_layouts`); elsewhere the two are often alike. Both agents' "
-    "learning rates are tuned over the same four values.\n\n"
+    more="The paper prints no coordinates: the layout is the one of 128 drawn at "
+    "random in which PPO+GASIL was most clearly ahead, on new seeds too "
+    "(`experiments.point_mass_layouts`); elsewhere the two are often alike. Both "
+    "agents' learning rates are tuned over the same four values.\n\n"
     "![policies, good trajectories and discriminator](point_mass_moments.png)",
 )
 

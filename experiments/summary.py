@@ -31,8 +31,8 @@ def page() -> str:
         "# The paper's claims, measured",
         "Written by `python -m experiments.summary` from the CSV files in this folder. "
         "Numbers are interquartile means over seeds of the return in the last tenth of "
-        "training, with 95% bootstrap intervals; both sides of every comparison were "
-        "tuned with the same number of runs ([how](random_search.md)).",
+        "training, with 95% bootstrap intervals; [how every agent was tuned]"
+        "(random_search.md).",
     ]
     for figure, make in FIGURES:
         wanted = make()
