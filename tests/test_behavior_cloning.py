@@ -28,7 +28,11 @@ def test_loss_is_the_mean_negative_log_likelihood():
 def trained(coefficient):
     env = gasil_jax.make_env("point_mass")
     config = gasil_jax.Config(
-        agent="ppo+bc", total_steps=2048, num_epochs=1, behavior_cloning_updates=100
+        agent="ppo+bc",
+        total_steps=2048,
+        num_epochs=1,
+        buffer_steps=100,  # The best two episodes: they differ from the rest.
+        behavior_cloning_updates=100,
     )
     hyperparameters = config.hyperparameters.replace(
         behavior_cloning_coefficient=coefficient, learning_rate=1e-3
