@@ -17,7 +17,7 @@ so far, but one seed learns to run and another never does, so that ten seeds lea
 intervals, and few of the differences are clear. What decides is the choice of its
 hyperparameters. A first search (`first_search/`, [why](random_search.md)) chose points
 whose ten seeds were no better than PPO. Other hyperparameters do better still where an
-episode ends with a fall, and a reward that is never negative pays for staying alive too:
+episode ends with a fall, and a reward that is never negative also pays for staying up:
 the discriminator's reward alone, agent `gasil` with alpha 1 and 20 updates at 3e-4,
 which no search chose, had on hopper 2580 ± 235 (mean and standard error of six seeds),
 on walker2d 2321 ± 242 (eight), and on halfcheetah, where nobody falls, 0 ± 278 (four;

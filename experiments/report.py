@@ -81,7 +81,7 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
-def _interval(scores: np.ndarray) -> str:
+def interval(scores: np.ndarray) -> str:
     """Interquartile mean and interval of (seeds,), without seeds that never ended."""
     middle = float(statistics.interquartile_mean(scores))
     low, high = statistics.bootstrap_interval(scores)
@@ -98,7 +98,7 @@ def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> 
     for panel, curves in shown.items():
         for curve, known in curves.items():
             scores = known.final[0]
-            cells = [panel, curve, str(len(scores)), _interval(scores)]
+            cells = [panel, curve, str(len(scores)), interval(scores)]
             if favourite:
                 cells += ["", ""]
                 if curve != favourite and favourite in curves:

@@ -25,6 +25,25 @@ FIGURES = (
 )
 
 
+def table() -> str:
+    """The locomotion tasks that have results, an agent a column: Markdown."""
+    lines = [
+        "| | PPO | PPO+BC | PPO+SIL | PPO+GASIL |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for figure, delay in (
+        (mujoco.FIGURE, 1),
+        (delayed_mujoco.FIGURE, random_search.DELAY),
+    ):
+        folder = trials.RESULTS / figure.name
+        for task, curves in report.panels(comparison.make(delay), folder).items():
+            name = task if delay == 1 else f"{task}, delayed"
+            known = [curves.get(agent) for agent in trials.AGENTS]
+            cells = ["" if x is None else report.interval(x.final[0]) for x in known]
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
 def page() -> str:
     """Claim by claim, what was measured: Markdown, from the CSV files alone."""
     parts = [
@@ -33,6 +52,7 @@ def page() -> str:
         "Numbers are interquartile means over seeds of the return in the last tenth of "
         "training, with 95% bootstrap intervals; [how every agent was tuned]"
         "(random_search.md).",
+        table(),
     ]
     for figure, make in FIGURES:
         wanted = make()

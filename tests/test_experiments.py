@@ -5,6 +5,7 @@ import csv
 import dataclasses
 import itertools
 import json
+import pathlib
 
 import jax
 import numpy as np
@@ -238,6 +239,8 @@ def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypa
 def test_the_summary_is_that_of_the_csv_files():
     path = trials.RESULTS / "README.md"
     assert path.read_text() == summary.page()
+    readme = pathlib.Path(__file__).parent.parent / "README.md"
+    assert summary.table() in readme.read_text()
 
 
 def test_an_optimum_is_named_by_where_it_is(tmp_path):
