@@ -107,6 +107,8 @@ def _run(
     if options.devices is not None:
         flags += ["--devices", str(options.devices)]
     for trial in chosen:
+        trials.check(trial, folder)
+    for trial in chosen:
         trials.adopt(trial, folder)
         known = trials.read(trial, folder)
         if not options.report and not (known is not None and known.complete):

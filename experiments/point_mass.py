@@ -26,8 +26,8 @@ def conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
         ours, other = curves["ppo+gasil"], curves["ppo"]
         for name, scores in (
             (
-                "in the first twentieth of training",
-                lambda known: known.part(0, 0.05)[0],
+                "in the first 30,000 steps",
+                lambda known: known.part(0, 30_000 / STEPS)[0],
             ),
             ("in the last tenth", lambda known: known.final[0]),
         ):

@@ -15,6 +15,7 @@ The environment's own layout was found so: 128 layouts (`--count 128 --chunk 128
 
 import csv
 import dataclasses
+import json
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
@@ -27,12 +28,15 @@ import numpy as np
 import gasil_jax
 from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
-from gasil_jax import command_line, presets
+from gasil_jax import command_line, logging, presets
+from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 
 AGENTS = ("ppo", "ppo+gasil")
 _MOST_OBJECTS = 12
 _FIRST_SEED = 1000
+# Added to the standard error: a lead of less is none, however alike the seeds are.
+_MARGIN = 0.2
 _COLUMNS = ("layout", "agent", "learning_rate", "alpha", "seed", "early", "final")
 
 
@@ -221,7 +225,7 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
     """How clearly PPO+GASIL is ahead in each layout, and a line about it, best first.
 
     Each agent has its best learning rate (and alpha) by the mean final return; the
-    figure is the difference of the means over its standard error.
+    figure is the difference of the means over its standard error and `_MARGIN`.
     """
     found = []
     for number in sorted({int(row["layout"]) for row in rows}):
@@ -239,7 +243,7 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
             best[agent] = (point, np.array(scores))
         (ppo_point, ppo), (point, gasil) = (best[agent] for agent in AGENTS)
         error = np.sqrt(sum(x[:, 1].var(ddof=1) / len(x) for x in (ppo, gasil)))
-        ahead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + 0.2)
+        ahead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + _MARGIN)
         said = (
             f"layout {number}: PPO {ppo[:, 0].mean():.1f} early, "
             f"{ppo[:, 1].mean():.1f} final at {ppo_point[0]:g}; PPO+GASIL "
@@ -250,14 +254,39 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
     return sorted(found, reverse=True)
 
 
+def _check(options: Options) -> None:
+    least = {"count": 1, "chunk": 1, "seeds": 2, "total_steps": 10 * 2048}
+    for name, low in least.items():
+        if (value := getattr(options, name)) < low:
+            raise InputError(f"{name} is {value}: it must be {low} or more")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate layouts that have not been; returns the exit status."""
-    options = command_line.parse(Options, arguments, "experiments.point_mass_layouts")
+    try:
+        options = command_line.parse(
+            Options, arguments, "experiments.point_mass_layouts"
+        )
+        _check(options)
+        return _run(options)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+
+
+def _run(options: Options) -> int:
     jax.config.update("jax_default_matmul_precision", "highest")
     numbers = options.layouts or tuple(
         range(options.first, options.first + options.count)
     )
     options.out.mkdir(parents=True, exist_ok=True)
+    described = options.out / "options.json"
+    wanted = dataclasses.asdict(options) | {"layouts": numbers, "out": None}
+    wanted = json.loads(json.dumps(wanted))
+    if not described.exists():
+        logging.write_json(described, wanted)
+    elif json.loads(described.read_text()) != wanted:
+        raise InputError(f"out is {options.out}, which is of other options")
     programs = {
         agent: jax.jit(jax.vmap(make_returns(configuration(agent, options))))
         for agent in AGENTS

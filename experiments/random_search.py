@@ -6,17 +6,18 @@ appendix's four learning rates with eight seeds each; the others the higher two 
 hyperparameter more, so eight points with four seeds each; PPO+GASIL has the appendix's
 four, 256 points, of which an orthogonal array of sixteen gets two seeds each: any two
 hyperparameters have every pair of their values equally often. Then the best four points
-get four seeds more, for the best of many points on few seeds is partly the luckiest;
-PPO's points have eight from the start. The seeds are other than those of the figures,
-which use the point with the best mean final return. On the point mass both agents have
-the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else what
-its preset has (alpha 1, 20 updates at 3e-4).
+get four seeds more, for the best of many points on few seeds is partly the luckiest
+(PPO's points have eight from the start); the command lists and trains them once the
+first stage is complete. The seeds are other than those of the figures, which use the
+point with the best mean return. On the point mass both agents have the learning rates
+1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else what its preset has
+(alpha 1, 20 updates at 3e-4).
 
 Nothing uses what is in `results/first_search/`: a first search that drew PPO+GASIL's
 points otherwise, each value equally often but not each pair (no point had 20
-discriminator updates with the learning rate 3e-4, nor alpha 1 with more than one update
-at it), figures from it and of a point that more seeds replaced, and a search of all of
-PPO+GASIL's hyperparameters on the point mass.
+discriminator updates with the policy's learning rate 3e-4, nor alpha 1 with more than
+one update at it), figures from it and of a point that more seeds replaced, and a search
+of all of PPO+GASIL's hyperparameters on the point mass.
 """
 
 import dataclasses
@@ -79,7 +80,7 @@ _OTHER_SPACES: Mapping[tuple[str, str], Mapping[str, tuple[Any, ...]]] = {
 FIGURE = Figure(
     name="random_search",
     title="Hyperparameters of every agent (paper, table 1)",
-    claim="A random search over the appendix's ranges, for every task.",
+    claim="A search over the appendix's ranges, for every task.",
     favourite=None,
 )
 
@@ -88,27 +89,35 @@ FIGURE = Figure(
 _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
 
 
-def draw(space: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
+def draw(values_of: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
     """At most sixteen distinct points of a space of up to five hyperparameters.
 
     All there are where there are no more than sixteen. Else an orthogonal array: any
     two hyperparameters have every pair of their values equally often, so that none is
-    judged by what it happened to be drawn with. Each must have two or four values.
+    judged by what it happened to be drawn with.
+
+    Raises:
+      ValueError: more than sixteen points of more than five hyperparameters, or of
+        other than two or four values.
     """
-    every = list(itertools.product(*space.values()))
+    every = list(itertools.product(*values_of.values()))
     if len(every) <= 16:
-        return tuple(dict(zip(space, values, strict=True)) for values in every)
+        return tuple(dict(zip(values_of, values, strict=True)) for values in every)
+    if len(values_of) > 5 or any(len(x) not in (2, 4) for x in values_of.values()):
+        raise ValueError(
+            f"{dict(values_of)}: at most five hyperparameters of two or four values"
+        )
     rng = np.random.default_rng(0)
     # Which value is which level is left to chance; two levels are one of two values.
     of_level = {
         name: [values[i % len(values)] for i in rng.permutation(4)]
-        for name, values in space.items()
+        for name, values in values_of.items()
     }
     return tuple(
         {
             name: of_level[name][level]
             for name, level in zip(
-                space, (a, b, *(a ^ times[b] for times in _TIMES)), strict=False
+                values_of, (a, b, *(a ^ times[b] for times in _TIMES)), strict=False
             )
         }
         for a in range(4)
@@ -151,7 +160,7 @@ def confirmation(env: str, agent: str, reward_delay: int) -> Trial | None:
     known = _complete(trial)
     if known is None or trial.seeds >= _ENOUGH_SEEDS:
         return None
-    best_first = np.argsort(-_score(known.final), kind="stable")
+    best_first = np.argsort(-_score(_final(known)), kind="stable")
     return dataclasses.replace(
         trial,
         name=trial.name + _SECOND,
@@ -188,13 +197,21 @@ def _score(final: np.ndarray) -> np.ndarray:
 
 
 def best(env: str, agent: str, reward_delay: int) -> Point | None:
-    """The best point that the search has found; None where it is not complete."""
+    """The best point so far; None where the first stage is not complete.
+
+    While the second is not, the first's best.
+    """
     trial = search(env, agent, reward_delay)
     known = _complete(trial)
     if known is None:
         return None
     second = _complete(confirmation(env, agent, reward_delay))
     return _best(known, second)[0]
+
+
+def _final(known: trials.Results) -> np.ndarray:
+    """Mean return over the last fifth of training, (points, seeds)."""
+    return known.part(0.8, 1.0)
 
 
 def _best(
@@ -204,11 +221,11 @@ def _best(
 
     Once there is a second stage, it is one of that stage's.
     """
-    points, final = first.trial.points, first.final
+    points, final = first.trial.points, _final(first)
     if second is not None:
         places = [points.index(point) for point in second.trial.points]
         points = second.trial.points
-        final = np.concatenate([final[places], second.final], axis=1)
+        final = np.concatenate([final[places], _final(second)], axis=1)
     place = int(_score(final).argmax())
     return points[place], final[place]
 
@@ -220,8 +237,9 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         "",
         " ".join(__doc__.split("\n\n", 1)[1].split()),
         "",
-        "The best point's mean is over its seeds of both stages, where there are two; "
-        "median and worst are of the first stage's points.",
+        "Returns are of the last fifth of training. The best point's mean is over its "
+        "seeds of both stages; median and worst are of the first stage's points. Where "
+        "an agent other than PPO has no second stage yet, its best point may change.",
         "",
         "| task | agent | first stage | second | best point | its mean | seeds "
         "| median | worst |",
@@ -237,10 +255,11 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
             chosen, final = _best(known, second)
             said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
             cells = [name, agent, _size(known), _size(second), said]
-            score = _score(known.final)
+            score = _score(_final(known))
             cells += [f"{final.mean():.0f}", str(len(final))]
             cells += [f"{x:.0f}" for x in (np.median(score), score.min())]
             lines.append(f"| {' | '.join(cells)} |")
+    results.mkdir(parents=True, exist_ok=True)
     (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
 
 

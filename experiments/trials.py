@@ -132,10 +132,8 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         rows.setdefault((row["point"], row["seed"]), []).append(row)
     made = []
     if described.exists():
-        before = json.loads(described.read_text())
-        if before["settings"] != json.loads(json.dumps(trial.settings())):
-            raise InputError(f"{target} is of other settings: move it away")
-        made = before["made"]
+        check(trial, results)
+        made = json.loads(described.read_text())["made"]
     found = len(rows)
     place = runs / trial.name
     for trained in map(_trained, [place, *sorted(shards.root(place).glob("*-of-*"))]):
@@ -156,14 +154,25 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         logging.write_json(described, {"settings": trial.settings(), "made": made})
 
 
+def _is_of(trial: Trial, described: pathlib.Path) -> bool:
+    settings = json.loads(described.read_text())["settings"]
+    return bool(settings == json.loads(json.dumps(trial.settings())))
+
+
+def check(trial: Trial, results: pathlib.Path) -> None:
+    """Raise `InputError` if the results of that name are of other settings."""
+    target = results / f"{trial.name}.csv"
+    if target.exists() and not _is_of(trial, target.with_suffix(".json")):
+        raise InputError(f"{target} is of other settings: move it away")
+
+
 def adopt(trial: Trial, results: pathlib.Path) -> None:
     """Take over what another figure beside `results` has of the very same runs."""
     target = results / f"{trial.name}.csv"
     if target.exists():
         return
-    settings = json.loads(json.dumps(trial.settings()))
     for described in sorted(results.parent.glob("*/*/*.json")):
-        if json.loads(described.read_text())["settings"] != settings:
+        if not _is_of(trial, described):
             continue
         other = dataclasses.replace(
             trial, name=str(described.relative_to(results.parent).with_suffix(""))
@@ -172,8 +181,11 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
         seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
         if known is not None and known.seeds.tolist() == list(seeds):
             target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy(described.with_suffix(".csv"), target)
+            # Whole at once, the CSV file last: other parts may be reading it.
             shutil.copy(described, target.with_suffix(".json"))
+            copied = target.with_name(f"{target.name}.{os.getpid()}")
+            shutil.copy(described.with_suffix(".csv"), copied)
+            copied.replace(target)
             return
 
 
@@ -265,17 +277,27 @@ class Results:
         return self.part(0.9, 1.0)
 
     def part(self, begin: float, end: float) -> np.ndarray:
-        """Mean return over a part of training, from share to share, (points, seeds)."""
-        share = self.env_steps / self.env_steps[-1]
-        rows = self.returns[..., (share > begin) & (share <= end)]
+        """Mean return over a part of training, from share to share, (points, seeds).
+
+        Of the rows whose middle is in it (a row's end may be just past a round share),
+        or of the row that the part's own middle is in.
+        """
+        ends = self.env_steps / self.env_steps[-1]
+        middle = (np.concatenate([[0.0], ends[:-1]]) + ends) / 2
+        chosen = (middle > begin) & (middle <= end)
+        if not chosen.any():
+            chosen[np.searchsorted(ends, (begin + end) / 2)] = True
+        rows = self.returns[..., chosen]
         count = np.isfinite(rows).sum(axis=-1)
         return np.where(count > 0, np.nansum(rows, -1) / np.maximum(count, 1), np.nan)
 
 
 def read(trial: Trial, results: pathlib.Path) -> Results | None:
-    """The results of a trial; None where no seed is complete."""
+    """The results of a trial; None where no seed is complete, or of other settings."""
     target = results / f"{trial.name}.csv"
     rows = _read(target)
+    if rows and not _is_of(trial, target.with_suffix(".json")):
+        return None
     seeds_of: dict[int, set[int]] = {}
     for row in rows:
         seeds_of.setdefault(int(row["point"]), set()).add(int(row["seed"]))

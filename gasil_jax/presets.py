@@ -1,8 +1,8 @@
 """Where a run's hyperparameters start from: one table, by environment and agent.
 
 A row overrides `Config`'s and `Hyperparameters`' defaults; a flag overrides a row.
-"tuned" has only what was measured (README, "What was measured"); "paper" has what the
-appendix names for a task, with the defaults, which are the appendix's, for the rest.
+"tuned" has only what was measured; "paper" has what the appendix names for a task, with
+the defaults, which are the appendix's, for the rest.
 """
 
 from collections.abc import Mapping

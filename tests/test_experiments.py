@@ -103,20 +103,29 @@ def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
         assert trials.read(changed, here) is None
     same = dataclasses.replace(trial, name="0/ppo")
     trials.adopt(same, here)
+    # Results of other settings are no results, and are not written over.
+    other = dataclasses.replace(same, obs_noise=0.1)
+    assert trials.read(other, here) is None
+    with pytest.raises(trials.InputError, match="of other settings"):
+        trials.check(other, here)
     assert trials.read(same, here).final.tolist() == [[1.5, 2.5]]
 
 
 def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
-    monkeypatch.setitem(random_search.SPACES, "ppo", {"learning_rate": (1e-3, 1e-4)})
+    space = {"learning_rate": (1e-3, 1e-4)}
+    monkeypatch.setitem(random_search._OTHER_SPACES, ("point_mass", "ppo"), space)
     monkeypatch.setattr(random_search, "_RUNS", 4)
+    monkeypatch.setitem(random_search.STEPS, "point_mass", 512)
     monkeypatch.setattr(trials, "RESULTS", tmp_path / "results")
     folders = ("--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results"))
-    arguments = ("--only", "hopper/ppo", "--total-steps", "512", *folders)
+    arguments = ("--only", "point_mass/ppo", *folders)
     for part in ("1/2", "2/2"):
         assert random_search.main([*arguments, "--part", part]) == 0
     assert not (tmp_path / "results").exists()
     assert random_search.main([*arguments, "--report"]) == 0
-    with (tmp_path / "results" / "random_search" / "hopper" / "ppo.csv").open() as file:
+    with (
+        tmp_path / "results" / "random_search" / "point_mass" / "ppo.csv"
+    ).open() as file:
         rows = list(csv.DictReader(file))
     final = {}
     for row in rows:
@@ -125,9 +134,9 @@ def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
         (point, seed) for point in "01" for seed in ("1000", "1001")
     }
     better = max(final, key=lambda point: np.mean(final[point]))
-    chosen = random_search.best("hopper", "ppo", 1)
+    chosen = random_search.best("point_mass", "ppo", 1)
     assert chosen == {"learning_rate": (1e-3, 1e-4)[better]}
-    assert random_search.best("hopper", "ppo", random_search.DELAY) is None
+    assert random_search.best("hopper", "ppo", 1) is None
 
 
 def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
@@ -144,7 +153,7 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
         lines = ["point,seed,env_steps,episode_return"]
         for point, score in enumerate(scores):
             for seed in range(trial.first_seed, trial.first_seed + trial.seeds):
-                lines.append(f"{point},{seed},100,{score}")
+                lines += [f"{point},{seed},80,0", f"{point},{seed},100,{score}"]
         target.write_text("\n".join(lines) + "\n")
         described = {"settings": trial.settings(), "made": []}
         target.with_suffix(".json").write_text(json.dumps(described))
@@ -243,6 +252,17 @@ def test_the_summary_is_that_of_the_csv_files():
     assert summary.table() in readme.read_text()
 
 
+def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
+    ends = np.array([11, 20, 31, 40, 51, 60, 71, 80, 91, 100])
+    trial = trials.Trial("x/y", "hopper", "ppo")
+    returns = np.arange(10.0)[None, None, :]
+    known = trials.Results(trial, np.arange(1), ends, returns, ())
+    assert known.final.item() == 9.0  # Though the ninth row ends after 90.
+    assert known.part(0.0, 0.2).item() == 0.5
+    assert known.part(0.0, 0.01).item() == 0.0
+    assert known.part(0.99, 1.0).item() == 9.0
+
+
 def test_an_optimum_is_named_by_where_it_is(tmp_path):
     def results(mean):
         returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
@@ -260,18 +280,26 @@ def test_an_optimum_is_named_by_where_it_is(tmp_path):
 def test_a_traced_layout_is_the_layout_itself(number):
     layout = point_mass_layouts.draw(number)
     plain = point_mass_layouts.PointMass(layout)
-    walk = lambda env, key: jax.lax.scan(
-        lambda state, action: (env.step(state, action),) * 2,
-        env.reset(key),
-        jax.random.uniform(key, (50, 2), minval=-1.0, maxval=1.0),
-    )[1]
+    target = plain.objects[0]
+
+    def walk(env, key):
+        def step(state, _):
+            state = env.step(
+                state, jax.numpy.clip(9.0 * (target - state.obs[:2]), -1, 1)
+            )
+            return state, state
+
+        return jax.lax.scan(step, env.reset(key), length=50)[1]
+
     key = jax.random.key(3)
     wanted = walk(plain, key)
     traced = jax.jit(
         lambda where: walk(point_mass_layouts.TracedPointMass(where), key)
     )(point_mass_layouts.places(layout))
     np.testing.assert_allclose(traced.reward, wanted.reward, atol=1e-5)
+    assert (wanted.reward > 1.0).any()  # Something is collected.
     seen = wanted.obs.shape[-1]
+    assert seen < traced.obs.shape[-1]
     np.testing.assert_allclose(traced.obs[:, :seen], wanted.obs, atol=1e-5)
     assert (traced.obs[:, seen:] == 1).all()  # What is not there is never collected.
 

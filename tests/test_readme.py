@@ -91,7 +91,7 @@ SCALING = (README.parent / "docs" / "scaling.md").read_text()
 
 
 def calls_of(script, folder, **variables):
-    """The arguments of each `python` that a shell script starts, in any order."""
+    """What each `python` is started with in a shell script, in any order."""
     listed = folder / "calls"
     listed.unlink(missing_ok=True)
     stubs = {
@@ -104,10 +104,12 @@ def calls_of(script, folder, **variables):
     path = f"{folder}:{os.environ['PATH']}"
     variables = {name: str(value) for name, value in variables.items()}
     subprocess.run(["bash", "-euc", script], check=True, env={"PATH": path} | variables)
-    return [shlex.split(line)[2:] for line in listed.read_text().splitlines()]
+    return [shlex.split(line) for line in listed.read_text().splitlines()]
 
 
-def shard_of(arguments):
+def shard_of(call):
+    assert call[:2] == ["-m", "gasil_jax.sweep"]
+    arguments = call[2:]
     options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
     shard = shards.parse(options.shard, "shard")
     return shard.number, shard.count, str(options.out)
@@ -120,7 +122,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     assert sorted(shard_of(call) for call in trained) == [
         (number, 4, "OUT") for number in range(1, 5)
     ]
-    assert merged == ["OUT"]
+    assert merged == ["-m", "gasil_jax.merge", "OUT"]
 
     first, last = map(int, re.search(r"--array=(\d+)-(\d+)", slurm).groups())
     for index in (first, last):
