@@ -20,7 +20,7 @@ import matplotlib
 import numpy as np
 
 import gasil_jax
-from experiments import point_mass
+from experiments import point_mass, trials
 from gasil_jax import batch, normalization, plotting, policy
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
@@ -192,7 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--total-steps", type=int, default=point_mass.STEPS)
     parser.add_argument("--animate", type=int, default=0, help="frames of a film")
-    parser.add_argument("--out", type=pathlib.Path, default=pathlib.Path("."))
+    parser.add_argument("--out", type=pathlib.Path, default=trials.RESULTS)
     options = parser.parse_args(arguments)
     if options.total_steps < 1 or options.animate < 0:
         print(
