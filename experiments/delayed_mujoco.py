@@ -14,7 +14,7 @@ FIGURE = Figure(
     "outperforms PPO+BC and PPO+SIL, on all tasks by a large margin.",
     more="""**What was tried, and what it says.** PPO+GASIL learns most on each task run
 so far, but one seed learns to run and another never does, so that ten seeds leave wide
-intervals, and few of the differences are clear. What decides is the choice of its
+intervals on a task. What decides is the choice of its
 hyperparameters. A first search (`first_search/`, [why](random_search.md)) chose points
 whose ten seeds were no better than PPO. Other hyperparameters do better still where an
 episode ends with a fall, and a reward that is never negative also pays for staying up:

@@ -47,15 +47,43 @@ def difference(ours: np.ndarray, other: np.ndarray) -> tuple[float, float, float
     Percentile bootstrap; each side's seeds, (seeds,), are drawn for themselves.
     """
     rng = np.random.default_rng(0)
-    drawn = [
-        statistics.interquartile_mean(
-            scores[rng.integers(len(scores), size=(10_000, len(scores)))], axis=1
-        )
-        for scores in (ours, other)
-    ]
-    low, high = np.percentile(drawn[0] - drawn[1], [2.5, 97.5])
+    drawn = _resampled(ours, rng) - _resampled(other, rng)
+    low, high = np.percentile(drawn, [2.5, 97.5])
     mean = statistics.interquartile_mean
     return float(mean(ours) - mean(other)), float(low), float(high)
+
+
+def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Interquartile means of bootstrap draws of (seeds,): (draws,)."""
+    rows = rng.integers(len(scores), size=(10_000, len(scores)))
+    return np.asarray(statistics.interquartile_mean(scores[rows], axis=1))
+
+
+def together(
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> tuple[float, float, float]:
+    """Mean over tasks of a difference as a share of the other's, and 95% interval.
+
+    Interquartile means; the bootstrap draws the seeds of each task and side anew.
+
+    Args:
+      pairs: scores (seeds,) of ours and of the other, for each task; the other's
+        interquartile means are above 0.
+    """
+    rng = np.random.default_rng(0)
+    mean = statistics.interquartile_mean
+    drawn = np.mean(
+        [
+            (_resampled(ours, rng) - _resampled(other, rng)) / mean(other)
+            for ours, other in pairs
+        ],
+        axis=0,
+    )
+    middle = np.mean(
+        [(mean(ours) - mean(other)) / mean(other) for ours, other in pairs]
+    )
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return float(middle), float(low), float(high)
 
 
 def verdict(low: float, high: float) -> str:
@@ -112,24 +140,35 @@ def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> 
 
 
 def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
-    """On how many tasks the favourite is better than each other curve."""
+    """On how many tasks the favourite is better than each other, and over all."""
     lines = []
     others = dict.fromkeys(
         curve for curves in shown.values() for curve in curves if curve != favourite
     )
     for other in others:
-        said = [
-            verdict(*difference(curves[favourite].final[0], curves[other].final[0])[1:])
+        pairs = [
+            (curves[favourite].final[0], curves[other].final[0])
             for curves in shown.values()
             if favourite in curves and other in curves
         ]
+        said = [verdict(*difference(*pair)[1:]) for pair in pairs]
         counts = ", ".join(
             f"{word} on {said.count(word)}"
             for word in ("yes", "not clear", "no, it is lower", "unknown")
             if word in said
         )
-        if said:
-            lines.append(f"- {favourite} better than {other}: {counts} of {len(said)}.")
+        if not said:
+            continue
+        line = f"- {favourite} better than {other}: {counts} of {len(said)}"
+        if len(pairs) > 1 and all(
+            statistics.interquartile_mean(scores) > 0 for _, scores in pairs
+        ):
+            middle, low, high = together(pairs)
+            line += (
+                f"; over all of them {100 * middle:+.0f}% [{100 * low:.0f}, "
+                f"{100 * high:.0f}], {verdict(low, high)}"
+            )
+        lines.append(f"{line}.")
     return "\n".join(lines)
 
 
@@ -218,7 +257,8 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
         "Final return is the mean over the last tenth of training of the episodes "
         "that the acting policy ended. Intervals are percentile bootstraps over "
         'seeds; "better?" says "yes" where the 95% interval of the difference of '
-        "interquartile means is above 0.",
+        'interquartile means is above 0. "Over all of them" is the mean over tasks of '
+        "that difference as a share of the other agent's.",
         table(shown, figure.favourite),
         figure.conclusions(shown),
         figure.more,

@@ -194,6 +194,24 @@ def test_a_difference_and_its_interval():
     assert report.verdict(*report.difference(ours, ours)[1:]) == "not clear"
 
 
+def test_a_difference_over_several_tasks():
+    """Tasks weigh alike whatever their scale, and are clearer than each alone."""
+    rng = np.random.default_rng(4)
+    pairs = [
+        (scale * rng.normal(1.5, 0.6, 10), scale * rng.normal(1.0, 0.6, 10))
+        for scale in (1.0, 1.0, 1.0, 1.0)
+    ]
+    middle, low, high = report.together(pairs)
+    assert low < middle < high
+    larger = [(1000.0 * ours, 1000.0 * other) for ours, other in pairs[:2]] + pairs[2:]
+    np.testing.assert_allclose(report.together(larger), (middle, low, high))
+    assert high - low < min(
+        report.together([pair])[2] - report.together([pair])[1] for pair in pairs
+    )
+    same = [(other, other) for _, other in pairs]
+    assert report.verdict(*report.together(same)[1:]) == "not clear"
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
