@@ -173,7 +173,10 @@ def confirmation(env: str, agent: str, reward_delay: int) -> Trial | None:
 def _complete(trial: Trial | None) -> trials.Results | None:
     if trial is None:
         return None
-    known = trials.read(trial, trials.RESULTS / FIGURE.name)
+    return _whole(trials.read(trial, trials.RESULTS / FIGURE.name))
+
+
+def _whole(known: trials.Results | None) -> trials.Results | None:
     return known if known is not None and known.complete else None
 
 
@@ -249,9 +252,7 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         for agent, known in curves.items():
             if agent.endswith(_SECOND):
                 continue
-            second = curves.get(agent + _SECOND)
-            if second is not None and not second.complete:
-                second = None
+            second = _whole(curves.get(agent + _SECOND))
             chosen, final = _best(known, second)
             said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
             cells = [name, agent, _size(known), _size(second), said]

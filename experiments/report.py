@@ -72,18 +72,13 @@ def together(
     """
     rng = np.random.default_rng(0)
     mean = statistics.interquartile_mean
-    drawn = np.mean(
-        [
-            (_resampled(ours, rng) - _resampled(other, rng)) / mean(other)
-            for ours, other in pairs
-        ],
-        axis=0,
-    )
-    middle = np.mean(
-        [(mean(ours) - mean(other)) / mean(other) for ours, other in pairs]
-    )
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return float(middle), float(low), float(high)
+    shares, drawn = [], []
+    for ours, other in pairs:
+        base = mean(other)
+        shares.append((mean(ours) - base) / base)
+        drawn.append((_resampled(ours, rng) - _resampled(other, rng)) / base)
+    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
+    return float(np.mean(shares)), float(low), float(high)
 
 
 def verdict(low: float, high: float) -> str:

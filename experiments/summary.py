@@ -28,7 +28,7 @@ FIGURES = (
 def table() -> str:
     """The locomotion tasks that have results, an agent a column: Markdown."""
     lines = [
-        "| | PPO | PPO+BC | PPO+SIL | PPO+GASIL |",
+        f"| | {' | '.join(agent.upper() for agent in trials.AGENTS)} |",
         "| --- | --- | --- | --- | --- |",
     ]
     for figure, delay in (

@@ -11,7 +11,6 @@ import dataclasses
 import json
 import os
 import pathlib
-import shutil
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
@@ -94,10 +93,7 @@ def train(
     points = json.dumps([dict(point) for point in trial.points])
     place.parent.mkdir(parents=True, exist_ok=True)
     if not listed.exists():
-        # Whole at once: other parts may be reading it.
-        written = listed.with_name(f"{listed.name}.{os.getpid()}")
-        written.write_text(points)
-        written.replace(listed)
+        _write_whole(listed, points)
     elif json.loads(listed.read_text()) != json.loads(points):
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
@@ -154,6 +150,13 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         logging.write_json(described, {"settings": trial.settings(), "made": made})
 
 
+def _write_whole(path: pathlib.Path, text: str) -> None:
+    # At once, and each process by a name of its own: parts may run side by side.
+    written = path.with_name(f"{path.name}.{os.getpid()}")
+    written.write_text(text)
+    written.replace(path)
+
+
 def _is_of(trial: Trial, described: pathlib.Path) -> bool:
     settings = json.loads(described.read_text())["settings"]
     return bool(settings == json.loads(json.dumps(trial.settings())))
@@ -181,11 +184,10 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
         seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
         if known is not None and known.seeds.tolist() == list(seeds):
             target.parent.mkdir(parents=True, exist_ok=True)
-            # Whole at once, the CSV file last: other parts may be reading it.
-            shutil.copy(described, target.with_suffix(".json"))
-            copied = target.with_name(f"{target.name}.{os.getpid()}")
-            shutil.copy(described.with_suffix(".csv"), copied)
-            copied.replace(target)
+            # The CSV file last: where it is, its settings are.
+            for suffix in (".json", ".csv"):
+                text = described.with_suffix(suffix).read_text()
+                _write_whole(target.with_suffix(suffix), text)
             return
 
 
