@@ -27,6 +27,8 @@ class Options:
       list: print the trials and whether they are complete, and do nothing else.
       physics: of locomotion: mjx or mujoco.
       devices: host devices that members are sharded over; default the cores.
+      share_counts: points that differ in buffer size or discriminator updates share a
+        program, as in gasil_jax.sweep: best on a GPU.
       runs: where training writes.
       results: where tables, figure and page go.
     """
@@ -40,6 +42,7 @@ class Options:
     list: bool = False
     physics: str = "mjx"
     devices: int | None = None
+    share_counts: bool = False
     runs: pathlib.Path = pathlib.Path("runs")
     results: pathlib.Path = trials.RESULTS
 
@@ -106,6 +109,8 @@ def _run(
     flags = ["--physics", options.physics]
     if options.devices is not None:
         flags += ["--devices", str(options.devices)]
+    if options.share_counts:
+        flags.append("--share-counts")
     for trial in chosen:
         trials.check(trial, folder)
     for trial in chosen:

@@ -38,6 +38,10 @@ class Hyperparameters(struct.PyTreeNode):
       behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
       sil_coefficient: weight of the loss of PPO+SIL.
       sil_value_coefficient: weight of the value's part in it.
+      max_buffer_steps: of `Config.buffer_steps` so many are filled at most; None is
+        all of them. Traced, so that one program sweeps what else decides shapes.
+      max_discriminator_updates: the same of `Config.discriminator_updates`; the
+        others are computed too, and not used.
     """
 
     learning_rate: float = 3e-4
@@ -54,6 +58,8 @@ class Hyperparameters(struct.PyTreeNode):
     behavior_cloning_coefficient: float = 0.1
     sil_coefficient: float = 0.1
     sil_value_coefficient: float = 0.01
+    max_buffer_steps: float | None = None
+    max_discriminator_updates: float | None = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,6 +179,8 @@ _HYPERPARAMETER_RANGES = {
     "behavior_cloning_coefficient": (0.0, math.inf, True),
     "sil_coefficient": (0.0, math.inf, True),
     "sil_value_coefficient": (0.0, math.inf, True),
+    "max_buffer_steps": (1.0, math.inf, True),
+    "max_discriminator_updates": (1.0, math.inf, True),
 }
 
 

@@ -166,9 +166,15 @@ def ended_episodes(
 
 
 def insert(
-    good_trajectories: GoodTrajectories, history: History, episodes: Episodes
+    good_trajectories: GoodTrajectories,
+    history: History,
+    episodes: Episodes,
+    max_steps: jax.Array | float | None = None,
 ) -> GoodTrajectories:
     """Keep the best `capacity` steps of the buffer and the ended episodes.
+
+    At most `max_steps` of them, (), always the same of a buffer: it is then as if
+    that were its capacity, but may be traced.
 
     Sorts whole episodes, not steps, then gathers each kept step from where it is.
     Episodes with a return that is not finite are refused; `record`ed steps that are
@@ -195,6 +201,8 @@ def insert(
     order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
+    if max_steps is not None:
+        size = jnp.minimum(size, jnp.asarray(max_steps, jnp.int32))
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]

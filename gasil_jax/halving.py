@@ -282,12 +282,15 @@ def _batches(
 
     seeds = list(sweep.seeds_of(options))
     programs: dict[Config, batch.Batch] = {}
-    every = shards.programs(options.config, points, [0])
-    configs = {index: x.config for x in every for index, _ in x.members}
+    every = shards.programs(options.config, points, [0], options.share_counts)
+    of_point = {
+        index: (program.config, floats)
+        for program in every
+        for (index, _), floats in zip(program.members, program.hyperparameters)
+    }
 
     def batch_of(index: int) -> batch.Batch:
-        config = configs[index]
-        floats = options.config.updated(points[index]).hyperparameters
+        config, floats = of_point[index]
         members = (seeds, [floats] * len(seeds))
         if config not in programs:
             programs[config] = batch.make_batch(env, config, *members)
@@ -430,10 +433,7 @@ def _main(arguments: Sequence[str] | None) -> None:
 
 def _of_a_point(programs: Sequence[Program], seeds: Sequence[int]) -> list[Program]:
     """The programs, each with the members of one point."""
-    return [
-        dataclasses.replace(program, members=program.members[: len(seeds)])
-        for program in programs
-    ]
+    return [program.part(0, len(seeds)) for program in programs]
 
 
 if __name__ == "__main__":

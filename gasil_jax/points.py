@@ -14,7 +14,9 @@ from gasil_jax.config import Config, Hyperparameters, nearest
 
 Point = Mapping[str, Any]
 
-_HYPERPARAMETERS = {f.name: float for f in dataclasses.fields(Hyperparameters)}
+_HYPERPARAMETERS = {
+    f.name: float for f in dataclasses.fields(Hyperparameters) if f.type is float
+}
 _CONFIG = {
     f.name: int
     for f in dataclasses.fields(Config)

@@ -1,8 +1,9 @@
 """How a sweep is cut: into programs that compile once, and into shards that run apart.
 
 A member is a point with a seed. The members of a program differ in `Hyperparameters`
-alone. A shard is one of n near-equal parts of all members, which are taken program by
-program, so that a shard compiles as few programs as may be.
+alone, which can stand for two counts of `Config` too, so that these share a program
+where that is asked for. A shard is one of n near-equal parts of all members, which
+are taken program by program, so that a shard compiles as few programs as may be.
 """
 
 import dataclasses
@@ -15,7 +16,11 @@ from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.points import Point
 
-_FLOATS = {field.name for field in dataclasses.fields(Hyperparameters)}
+# The count of `Config` -> the hyperparameter that limits it.
+_LIMITS = {
+    "buffer_steps": "max_buffer_steps",
+    "discriminator_updates": "max_discriminator_updates",
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,11 +31,21 @@ class Program:
       number: among the programs of the whole sweep; names its folder.
       config: that its members share.
       members: (index of the point, absolute seed number) of each.
+      hyperparameters: of each.
     """
 
     number: int
     config: Config
     members: tuple[tuple[int, int], ...]
+    hyperparameters: tuple[Hyperparameters, ...]
+
+    def part(self, begin: int, end: int) -> "Program":
+        """The same program with some of its members, from place to place."""
+        return dataclasses.replace(
+            self,
+            members=self.members[begin:end],
+            hyperparameters=self.hyperparameters[begin:end],
+        )
 
     def folder(self, sweep: pathlib.Path) -> pathlib.Path:
         """Where it is in the folder of a sweep or shard."""
@@ -38,7 +53,10 @@ class Program:
 
 
 def programs(
-    config: Config, points: Sequence[Point], seeds: Sequence[int]
+    config: Config,
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    share_counts: bool = False,
 ) -> list[Program]:
     """The programs of a sweep, all points with all seeds.
 
@@ -46,15 +64,37 @@ def programs(
       config: what the points are changes of.
       points: hyperparameters and fields of `Config` by name.
       seeds: absolute seed numbers.
+      share_counts: whether points that differ in the buffer's steps or the
+        discriminator's updates share a program, that of the largest.
     """
+    configs = [config.updated(point) for point in points]
+    if share_counts:
+        configs = _limited(configs)
     groups: dict[Config, list[int]] = {}
-    for index, point in enumerate(points):
-        fields = {name: x for name, x in point.items() if name not in _FLOATS}
-        groups.setdefault(config.updated(fields), []).append(index)
+    for index, own in enumerate(configs):
+        shared = own.replace(hyperparameters=config.hyperparameters)
+        groups.setdefault(shared, []).append(index)
     return [
-        Program(number, shared, tuple((i, seed) for i in indices for seed in seeds))
+        Program(
+            number,
+            shared,
+            tuple((i, seed) for i in indices for seed in seeds),
+            tuple(configs[i].hyperparameters for i in indices for _ in seeds),
+        )
         for number, (shared, indices) in enumerate(groups.items())
     ]
+
+
+def _limited(configs: Sequence[Config]) -> list[Config]:
+    """The largest counts for all, each limited to its own where they differ."""
+    for count, limit in _LIMITS.items():
+        own = [getattr(config, count) for config in configs]
+        if len(set(own)) > 1:
+            configs = [
+                config.updated({count: max(own), limit: number})
+                for config, number in zip(configs, own, strict=True)
+            ]
+    return list(configs)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +189,8 @@ def share(whole: Sequence[Program], shard: Shard) -> list[Program]:
     mine, before = [], 0
     for program in whole:
         size = len(program.members)
-        members = program.members[max(0, first - before) : max(0, last - before)]
-        if members:
-            mine.append(dataclasses.replace(program, members=members))
+        part = program.part(max(0, first - before), max(0, last - before))
+        if part.members:
+            mine.append(part)
         before += size
     return mine

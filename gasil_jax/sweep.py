@@ -2,7 +2,8 @@
 
 Points that differ only in `Hyperparameters` run in one compiled program, seeds x
 points vmapped and sharded; those that differ in a field of `Config` (buffer size,
-discriminator updates) are grouped, and each group compiles once.
+discriminator updates) are grouped, and each group compiles once. With --share-counts
+these two don't divide the points: all run in the program of the largest.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
 curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png, and
@@ -37,11 +38,15 @@ class PointOptions(run.Options):
         ranges of the paper's appendix.
       points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in
         place of grid and random.
+      share_counts: points that differ in buffer_steps or discriminator_updates share
+        a program too, which compiles once and has for each point the cost of the
+        largest: best on a GPU.
     """
 
     grid: tuple[str, ...] = ()
     random: int | None = None
     points_file: str | None = None
+    share_counts: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,10 +100,9 @@ def train(
         for program in programs:
             if sweep_tables.read_training(folder, program) is None:
                 indices, seeds = zip(*program.members)
-                floats = [
-                    options.config.updated(points[i]).hyperparameters for i in indices
-                ]
-                runs = batch.make_batch(env, program.config, seeds, floats)
+                runs = batch.make_batch(
+                    env, program.config, seeds, program.hyperparameters
+                )
                 place = program.folder(folder)
                 place.mkdir(parents=True, exist_ok=True)
                 outcome = driver.drive(
@@ -166,7 +170,10 @@ def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
     for point in points:
         config = options.config.updated(point)
         run.check(dataclasses.replace(options, config=config))
-    return points, shards.programs(options.config, points, seeds_of(options))
+    programs = shards.programs(
+        options.config, points, seeds_of(options), options.share_counts
+    )
+    return points, programs
 
 
 def seeds_of(options: PointOptions) -> range:

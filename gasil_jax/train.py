@@ -133,7 +133,9 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length
     )
-    buffer = good_trajectories.insert(state.good_trajectories, history, episodes)
+    buffer = good_trajectories.insert(
+        state.good_trajectories, history, episodes, hp.max_buffer_steps
+    )
 
     # Update the discriminator, and shape the reward with it.
     context = Context(

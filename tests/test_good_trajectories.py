@@ -1,7 +1,5 @@
 """The buffer against a plain Python list that does the same."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,19 +28,19 @@ class ListBuffer:
         self.steps = sorted(self.steps)[:CAPACITY]
 
 
-@functools.partial(jax.jit)
-def push(buffer, history, observation, ended, return_, length):
+@jax.jit
+def push(buffer, history, observation, ended, return_, length, max_steps=None):
     action = -observation
     history = good_trajectories.record(
         history, observation, action, jnp.zeros_like(return_), ended
     )
     episodes = good_trajectories.ended_episodes(history, ended, return_, length)
-    return good_trajectories.insert(buffer, history, episodes), history
+    return good_trajectories.insert(buffer, history, episodes, max_steps), history
 
 
-def empty():
+def empty(capacity=CAPACITY):
     return (
-        good_trajectories.init(CAPACITY, 1, 1),
+        good_trajectories.init(capacity, 1, 1),
         good_trajectories.init_history(NUM_ENVS, NUM_STEPS, MAX_EPISODE, 1, 1),
     )
 
@@ -158,3 +156,28 @@ def test_vmapped_insertion_equals_one_by_one():
         jax.tree.map(
             lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), batched, alone
         )
+
+
+def test_limits_in_one_program_are_as_capacities():
+    rng = np.random.default_rng(1)
+    limits = jnp.array([2.0, 5.0, CAPACITY])
+    limited, history = jax.vmap(lambda _: empty(CAPACITY))(limits)
+    own = [empty(int(limit)) for limit in limits]
+    for _ in range(8):
+        observation = rng.normal(size=(NUM_STEPS, NUM_ENVS, 1)).astype(np.float32)
+        ended = rng.random((NUM_STEPS, NUM_ENVS)) < 0.6
+        return_ = rng.normal(size=ended.shape).astype(np.float32)
+        length = rng.integers(1, MAX_EPISODE, size=ended.shape).astype(np.int32)
+        batch = (observation, ended, return_, length)
+        limited, history = jax.vmap(push, in_axes=(0, 0, *[None] * 4, 0))(
+            limited, history, *batch, limits
+        )
+        own = [push(*each, *batch) for each in own]
+        for i, (expected, _) in enumerate(own):
+            assert limited.size[i] == expected.size
+            filled = slice(int(expected.size))
+            for name in ("observation", "action", "return_", "time"):
+                np.testing.assert_array_equal(
+                    getattr(limited, name)[i][filled], getattr(expected, name)[filled]
+                )
+    assert [int(buffer.size) for buffer, _ in own] == [2, 5, CAPACITY]

@@ -128,6 +128,18 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert summary["env_steps_per_second"] > 0
     assert summary["device_count"] == jax.local_device_count()
 
+    # One program for both numbers of updates.
+    shared = tmp_path / "shared"
+    where = ("--share-counts", "--out", str(shared))
+    assert sweep.main([*SMALL, "--seeds", "2", *grid, *where]) == 0
+    assert [path.name for path in (shared / "programs").iterdir()] == ["0"]
+    in_one = np.load(shared / "curves.npz")
+    for name in ("episode_return", "bonus", "discriminator_loss", "good_steps"):
+        # The last point has diverged: what is left of it is rounding.
+        np.testing.assert_allclose(
+            in_one[name][:2], curves[name][:2], rtol=1e-3, err_msg=name
+        )
+
     # A half of the points has a program for itself, of the same shapes.
     parts = tmp_path / "parts"
     part = lambda number: sweep.main(

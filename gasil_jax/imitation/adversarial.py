@@ -120,7 +120,11 @@ _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
 def _train_discriminator(
     state: AdversarialState, source: Source, context: Context, key: jax.Array
 ) -> tuple[AdversarialState, Metrics]:
-    """`discriminator_updates` gradient steps; none count while there is no source."""
+    """Gradient steps on the discriminator; none count while there is no source.
+
+    `Config.discriminator_updates` of them, of which the first
+    `Hyperparameters.max_discriminator_updates` count.
+    """
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters
     network, transform = _network(config), optax.scale_by_adam()
@@ -136,7 +140,8 @@ def _train_discriminator(
             hyperparameters.discriminator_entropy_coefficient,
         )
 
-    def step(state: AdversarialState, key: jax.Array) -> Any:
+    def step(state: AdversarialState, key_and_counts: tuple[Any, Any]) -> Any:
+        key, counts = key_and_counts
         policy_key, good_key = jax.random.split(key)
         rows = jax.random.randint(
             policy_key, (minibatch_size,), 0, observation.shape[0]
@@ -154,18 +159,23 @@ def _train_discriminator(
             state.params,
             updates,
         )
-        return AdversarialState(params, optimizer_state), metrics
+        return choose(counts, AdversarialState(params, optimizer_state), state), metrics
 
+    choose = lambda condition, new, old: jax.tree.map(
+        lambda a, b: jnp.where(condition, a, b), new, old
+    )
+    num_updates = config.discriminator_updates
+    most = hyperparameters.max_discriminator_updates
+    counts = jnp.arange(num_updates) < (num_updates if most is None else most)
     trained, metrics = jax.lax.scan(
-        step, state, jax.random.split(key, config.discriminator_updates)
+        step, state, (jax.random.split(key, num_updates), counts)
     )
     ready = source.is_ready(context)
-    state = jax.tree.map(lambda a, b: jnp.where(ready, a, b), trained, state)
     metrics = {
-        name: jnp.where(ready, jnp.mean(value), jnp.nan)
+        name: jnp.where(ready, jnp.mean(value, where=counts), jnp.nan)
         for name, value in metrics.items()
     }
-    return state, metrics
+    return choose(ready, trained, state), metrics
 
 
 def _update_and_reward(
