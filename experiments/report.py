@@ -167,6 +167,42 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
     return "\n".join(lines)
 
 
+def gaps(shown: Mapping[str, Mapping[str, Results]], favourite: str, other: str) -> str:
+    """How far the favourite is ahead in each panel, and whether by more than in the
+    first, where every difference is one of interquartile means.
+    """
+    both = {
+        panel: (curves[favourite].final[0], curves[other].final[0])
+        for panel, curves in shown.items()
+        if favourite in curves and other in curves
+    }
+    if not both:
+        return ""
+    mean = statistics.interquartile_mean
+    rng = np.random.default_rng(0)
+    middle = {name: float(mean(x) - mean(y)) for name, (x, y) in both.items()}
+    drawn = {
+        name: _resampled(x, rng) - _resampled(y, rng) for name, (x, y) in both.items()
+    }
+    first = next(iter(both))
+    within = lambda draws: np.percentile(draws, [2.5, 97.5])
+    said = lambda value, low, high: (
+        f"{_number(value)} [{_number(low)}, {_number(high)}]"
+    )
+    lines = [
+        f"- {first}: {favourite} ahead of {other} by "
+        f"{said(middle[first], *within(drawn[first]))}."
+    ]
+    for panel in list(both)[1:]:
+        growth = within(drawn[panel] - drawn[first])
+        lines.append(
+            f"- {panel}: by {said(middle[panel], *within(drawn[panel]))}; more than at "
+            f"{first} by {said(middle[panel] - middle[first], *growth)}: "
+            f"{verdict(*growth)}."
+        )
+    return "\n".join(lines)
+
+
 def optimum(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """Of panels whose curves are values in order: the best, against both ends."""
     lines = []

@@ -278,12 +278,29 @@ def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
     assert known.part(0.99, 1.0).item() == 9.0
 
 
-def test_an_optimum_is_named_by_where_it_is(tmp_path):
-    def results(mean):
-        returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
-        trial = trials.Trial("x/y", "hopper", "ppo")
-        return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
+def results(mean):
+    returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
+    trial = trials.Trial("x/y", "hopper", "ppo")
+    return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
 
+
+def test_a_gap_is_compared_with_that_of_the_first_panel():
+    shown = {
+        "calm": {"ours": results(7.0), "other": results(5.0)},
+        "alone": {"ours": results(9.0)},
+        "windy": {"ours": results(6.0), "other": results(1.0)},
+        "stormy": {"ours": results(1.0), "other": results(0.0)},
+    }
+    first, *others = report.gaps(shown, "ours", "other").splitlines()
+    assert first.startswith("- calm: ours ahead of other by 2.0 [")
+    assert [line.split(": ")[0] for line in others] == ["- windy", "- stormy"]
+    assert "by 5.0 [" in others[0] and "calm by 3.0 [" in others[0]
+    assert others[0].endswith(": yes.")
+    assert "calm by -1.0 [" in others[1] and others[1].endswith("it is lower.")
+    assert report.gaps({"alone": shown["alone"]}, "ours", "other") == ""
+
+
+def test_an_optimum_is_named_by_where_it_is():
     shown = {"a": {"1": results(1.0), "2": results(9.0), "3": results(8.0)}}
     said = report.optimum(shown)
     assert "2 is best, in the middle; better than 1: yes, better than 3: yes" in said
