@@ -229,14 +229,18 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     for panel, curves in shown.items():
         for curve, known in curves.items():
             point = known.trial.points[0]
-            values = ", ".join(f"{name} {value:g}" for name, value in point.items())
+            values = [f"{name} {value:g}" for name, value in point.items()]
+            if known.trial.num_envs != trials.NUM_ENVS:
+                values.append(f"{known.trial.num_envs} environments")
             made = {
                 f"{made['physics']} physics, jax {made['versions'].get('jax', '?')}, "
                 f"commit {made['commit'] or 'unknown'}"
                 for made in known.made
             }
             made_by = "; ".join(sorted(made))
-            lines.append(f"| {panel} | {curve} | {values or 'defaults'} | {made_by} |")
+            lines.append(
+                f"| {panel} | {curve} | {', '.join(values) or 'defaults'} | {made_by} |"
+            )
     return "\n".join(lines)
 
 

@@ -28,7 +28,7 @@ from experiments import (
 )
 
 TOY = (
-    *("--batch-steps", "256", "--num-envs", "4", "--hidden-sizes", "8"),
+    *("--batch-steps", "256", "--hidden-sizes", "8"),
     *("--discriminator-hidden-sizes", "8", "--num-epochs", "1"),
 )
 
@@ -37,6 +37,7 @@ TOY = (
 def toy(monkeypatch):
     """Every trial on the point mass, with small networks and batches."""
     monkeypatch.setattr(trials, "_FLAGS", ("--preset", "paper", *TOY))
+    monkeypatch.setattr(trials, "NUM_ENVS", 4)
     for module in (comparison, stochastic_walker2d, hyperparameters, random_search):
 
         def make(*arguments, make=module.make):
