@@ -37,22 +37,20 @@ SELF_TAUGHT = [name for name in gasil_jax.agents() if name != "gail"]
 
 def test_vmap_over_every_hyperparameter_equals_single_runs():
     env = gasil_jax.make_env("point_mass")
-    train = gasil_jax.make_train(env, SMALL)
+    # Its counts, limited, are as if they were smaller.
+    larger = SMALL.replace(buffer_steps=130, discriminator_updates=4)
+    train = gasil_jax.make_train(env, larger)
     key, plain = jax.random.key(0), SMALL.hyperparameters
-    half = jax.tree.map(lambda x: 0.5 * x, plain)
-    # Limits of the configuration's counts, too: as if these were smaller.
-    limited = (
-        plain.replace(max_buffer_steps=100, max_discriminator_updates=2),
-        half.replace(max_buffer_steps=50, max_discriminator_updates=1),
-    )
+    both = (plain, jax.tree.map(lambda x: 0.5 * x, plain))
+    limits = {
+        "max_buffer_steps": SMALL.buffer_steps,
+        "max_discriminator_updates": SMALL.discriminator_updates,
+    }
+    limited = [hyperparameters.replace(**limits) for hyperparameters in both]
     stacked = jax.tree.map(lambda *x: jnp.array(x), *limited)
     _, swept = jax.jit(jax.vmap(train, in_axes=(None, 0)))(key, stacked)
-    smaller = SMALL.replace(buffer_steps=50, discriminator_updates=1)
-    singles = (
-        trainer()(key, plain),
-        jax.jit(gasil_jax.make_train(env, smaller))(key, half),
-    )
-    for i, (_, single) in enumerate(singles):
+    for i, hyperparameters in enumerate(both):
+        _, single = trainer()(key, hyperparameters)
         for name in ("bonus", "policy_loss", "value_loss", "good_steps"):
             np.testing.assert_allclose(
                 swept[name][i], single[name], rtol=1e-3, atol=1e-5, err_msg=name
