@@ -4,6 +4,7 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -260,13 +261,10 @@ def draw(shown: Mapping[str, Mapping[str, Results]], path: pathlib.Path) -> None
         layout="constrained",
         squeeze=False,
     )
-    every = [curve for curves in shown.values() for curve in curves]
-    # An agent has the same colour in every figure.
-    names = list(trials.AGENTS if set(every) <= set(trials.AGENTS) else ())
-    names += [curve for curve in dict.fromkeys(every) if curve not in names]
     for axes, (panel, curves) in zip(grid.flat, shown.items()):
+        color_of = _colors(list(curves))
         for curve, known in curves.items():
-            color = plot.COLORS[names.index(curve) % len(plot.COLORS)]
+            color = color_of[curve]
             some = np.isfinite(known.returns[0]).all(axis=0)
             returns = known.returns[0][:, some]
             steps = known.env_steps[some] / 1e6
@@ -281,6 +279,16 @@ def draw(shown: Mapping[str, Mapping[str, Results]], path: pathlib.Path) -> None
     for row in grid:
         row[0].set_ylabel("episode return")
     plotting.save(figure, path, dpi=90)
+
+
+def _colors(curves: Sequence[str]) -> dict[str, Any]:
+    """An agent's is the same in every figure; values in order go from dark to light."""
+    import matplotlib
+
+    if set(curves) <= set(trials.AGENTS):
+        return dict(zip(trials.AGENTS, plot.COLORS, strict=False))
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
+    return dict(zip(curves, shades, strict=True))
 
 
 def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:

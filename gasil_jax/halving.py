@@ -405,6 +405,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             run.write_config(options, folder, points=points)
     # Another process may have been first, with other settings.
     options = run.parse(Options, arguments, _PROGRAM, folder)
+    sweep.check_points(points, folder)
     total, before = (
         x.total_steps for x in (options.config, run_folder.read(folder)["config"])
     )

@@ -100,11 +100,14 @@ def parse(
     if began is not None:
         described = run_folder.read(began)
         fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
-        # One that is None by default may be newer than the run.
-        missing = {f.name for f in fields if f.default is not None} - set(described)
-        if missing:
+        # One that is None or False by default may be newer than the run.
+        newer = {
+            f.name: f.default for f in fields if f.default is None or f.default is False
+        }
+        if {f.name for f in fields} - set(newer) - set(described):
             raise InputError(f"out is {began}, which another program has written")
-        values: dict[str, Any] = {f.name: described.get(f.name) for f in fields}
+        known = newer | described
+        values: dict[str, Any] = {f.name: known[f.name] for f in fields}
         before = kind(**values)
         options = command_line.parse(kind, arguments, program, before)
         changed = run_folder.differences(vars(before), vars(options))

@@ -142,8 +142,8 @@ def _main(arguments: Sequence[str] | None) -> None:
     elif given.shard is not None:
         _train_shard(arguments, shards.parse(given.shard), given.out)
     else:
-        options = run.parse(Options, arguments, _PROGRAM, run.begun_run(arguments))
-        _train_whole(options)
+        began = run.begun_run(arguments)
+        _train_whole(run.parse(Options, arguments, _PROGRAM, began), began)
 
 
 def _placement(
@@ -190,15 +190,27 @@ def prepare(options: PointOptions, programs: Sequence[Program]) -> Any:
     return env
 
 
-def _plan_here(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
+def check_points(points: Sequence[Point], began: pathlib.Path | None) -> None:
+    """Raise `InputError` if a sweep that has begun in a folder has other points."""
+    if began is not None and list(run_folder.read(began)["points"]) != list(points):
+        raise InputError(
+            f"out is {began}, where a sweep of other points has begun: go on with the "
+            "same ones, or name another folder"
+        )
+
+
+def _plan_here(
+    options: Options, began: pathlib.Path | None
+) -> tuple[list[dict[str, Any]], list[Program]]:
     points, programs = plan(options)
+    check_points(points, began)
     if options.shards is not None:
         raise InputError(f"shards is {options.shards}: it is of --launcher")
     return points, programs
 
 
-def _train_whole(options: Options) -> None:
-    points, programs = _plan_here(options)
+def _train_whole(options: Options, began: pathlib.Path | None) -> None:
+    points, programs = _plan_here(options, began)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
     run.check_out(options)
@@ -223,7 +235,7 @@ def _train_shard(
     began = place if run_folder.is_described(place) else None
     options = run.parse(Options, arguments, _PROGRAM, began)
     options = dataclasses.replace(options, out=place, resume=True)
-    points, programs = _plan_here(options)
+    points, programs = _plan_here(options, began)
     programs = shards.share(programs, shard)
     trained = sweep_tables.Trained(place, programs)
     if not trained.unfinished():

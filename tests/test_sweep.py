@@ -166,6 +166,33 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
 
 
+def test_a_sweep_goes_on_with_its_own_points_wherever_they_are_listed(tmp_path, capsys):
+    first, copy, other = (tmp_path / f"{name}.json" for name in ("a", "b", "c"))
+    points = [{"alpha": 0.1}, {"alpha": 1.0, "discriminator_updates": 2}]
+    for path, listed in ((first, points), (copy, points), (other, points[:1])):
+        path.write_text(json.dumps(listed))
+    out = tmp_path / "sweep"
+    out.mkdir()
+    begun = [*SMALL, "--out", str(out), "--points-file", str(first)]
+    options = command_line.parse(sweep.Options, begun, "x")
+    run.write_config(options, out, points=points)
+
+    arguments = [*SMALL, "--out", str(out), "--resume", "--points-file"]
+    assert sweep.main([*arguments, str(other)]) == 2
+    assert "a sweep of other points has begun" in capsys.readouterr().err
+    assert sweep.main([*arguments, str(copy), "--seeds", "3"]) == 2
+    assert "seeds was 1, is 3: only" in capsys.readouterr().err
+    options = run.parse(sweep.Options, [*arguments, str(copy)], "x", out)
+    assert sweep.plan(options)[0] == points
+    sweep.check_points(points, out)
+
+    # A folder of before an option that is off by default can still go on.
+    content = json.loads((out / "config.json").read_text())
+    del content["share_counts"]
+    (out / "config.json").write_text(json.dumps(content))
+    assert not run.parse(sweep.Options, arguments[:-1], "x", out).share_counts
+
+
 def test_an_interrupted_sweep_goes_on(tmp_path):
     long = (*SMALL, "--total-steps", str(200 * 256), "--seeds", "2")
     grid = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
