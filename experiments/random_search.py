@@ -130,9 +130,9 @@ def space(env: str, agent: str) -> Mapping[str, tuple[Any, ...]]:
     return _OTHER_SPACES.get((env, agent), SPACES[agent])
 
 
-def panel(env: str, reward_delay: int) -> str:
-    """The name of a task."""
-    return env if reward_delay == 1 else f"{env}-delayed"
+def panel(name: str, reward_delay: int) -> str:
+    """The name of a panel about a task, or about something else on it."""
+    return name if reward_delay == 1 else f"{name}-delayed"
 
 
 def search(env: str, agent: str, reward_delay: int) -> Trial:
