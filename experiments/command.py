@@ -22,7 +22,7 @@ class Options:
       seeds: of each trial; default the experiment's.
       total_steps: of each seed; default the experiment's.
       part: I/N: train only the I-th of N parts of each trial, to share it between
-        processes; once all are there, run without it to put them together.
+        processes; once all are there, --report puts them together.
       report: train nothing, write tables and figure of what is there.
       list: print the trials and whether they are complete, and do nothing else.
       physics: of locomotion: mjx or mujoco.

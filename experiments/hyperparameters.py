@@ -17,13 +17,19 @@ VALUES = {
     "discriminator_updates": (1, 5, 10, 20),
 }
 
+_PANELS = {
+    random_search.panel(name, delay): [str(value) for value in values]
+    for delay in (1, random_search.DELAY)
+    for name, values in VALUES.items()
+}
+
 FIGURE = Figure(
     name="hyperparameters",
     title="Effect of GASIL's hyperparameters (paper, figure 8)",
     claim="The agent performs poorly when the buffer is too small (500 steps) or too "
     "large (5000 steps), and with too few or too many discriminator updates.",
     favourite=None,
-    conclude=report.optimum,
+    conclude=lambda shown: report.optimum(shown, _PANELS),
 )
 
 

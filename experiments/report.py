@@ -23,8 +23,8 @@ class Figure:
       claim: what the paper says.
       favourite: the curve that the claim is about; compared with each other curve of
         its panel. None where the claim is about the order of all.
-      conclude: from panel -> curve -> results to what they say of the claim; default
-        `tally` of the favourite.
+      conclude: from panel -> curve -> results, those with all their seeds, to what
+        they say of the claim; default `tally` of the favourite.
       more: what else the page says: what was tried where the claim does not hold.
     """
 
@@ -36,7 +36,11 @@ class Figure:
     more: str = ""
 
     def conclusions(self, shown: Mapping[str, Mapping[str, Results]]) -> str:
-        """What the results say of the claim, Markdown."""
+        """What the results that have all their seeds say of the claim, Markdown."""
+        shown = {
+            panel: {name: known for name, known in curves.items() if known.complete}
+            for panel, curves in shown.items()
+        }
         if self.conclude is not None:
             return self.conclude(shown)
         return tally(shown, self.favourite) if self.favourite else ""
@@ -63,23 +67,21 @@ def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 def together(
     pairs: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> tuple[float, float, float]:
-    """Mean over tasks of a difference as a share of the other's, and 95% interval.
+    """By what share ours is more, over several tasks alike, and the 95% interval.
 
-    Interquartile means; the bootstrap draws the seeds of each task and side anew.
+    The geometric mean over tasks of the ratio of interquartile means, less one; the
+    bootstrap draws the seeds of each task and side anew.
 
     Args:
-      pairs: scores (seeds,) of ours and of the other, for each task; the other's
-        interquartile means are above 0.
+      pairs: scores (seeds,) of ours and of the other, for each task, all above 0.
     """
     rng = np.random.default_rng(0)
     mean = statistics.interquartile_mean
-    shares, drawn = [], []
-    for ours, other in pairs:
-        base = mean(other)
-        shares.append((mean(ours) - base) / base)
-        drawn.append((_resampled(ours, rng) - _resampled(other, rng)) / base)
+    found = [np.log(mean(ours) / mean(other)) for ours, other in pairs]
+    drawn = [np.log(_resampled(x, rng) / _resampled(y, rng)) for x, y in pairs]
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
-    return float(np.mean(shares)), float(low), float(high)
+    middle, low, high = np.expm1([np.mean(found), low, high])
+    return float(middle), float(low), float(high)
 
 
 def verdict(low: float, high: float) -> str:
@@ -106,10 +108,13 @@ def _number(value: float) -> str:
 
 
 def interval(scores: np.ndarray) -> str:
-    """Interquartile mean and interval of (seeds,), without seeds that never ended."""
-    middle = float(statistics.interquartile_mean(scores))
+    """Interquartile mean and interval of (seeds,); NaN if a seed ended no episode."""
     low, high = statistics.bootstrap_interval(scores)
-    return f"{_number(middle)} [{_number(float(low))}, {_number(float(high))}]"
+    return _said(float(statistics.interquartile_mean(scores)), float(low), float(high))
+
+
+def _said(middle: float, low: float, high: float) -> str:
+    return f"{_number(middle)} [{_number(low)}, {_number(high)}]"
 
 
 def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> str:
@@ -122,15 +127,17 @@ def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> 
     for panel, curves in shown.items():
         for curve, known in curves.items():
             scores = known.final[0]
-            cells = [panel, curve, str(len(scores)), interval(scores)]
+            seeds = str(len(scores))
+            if not known.complete:
+                seeds += f" of {known.trial.seeds}"
+            cells = [panel, curve, seeds, interval(scores)]
             if favourite:
                 cells += ["", ""]
-                if curve != favourite and favourite in curves:
-                    middle, low, high = difference(curves[favourite].final[0], scores)
-                    cells[-2:] = [
-                        f"{_number(middle)} [{_number(low)}, {_number(high)}]",
-                        verdict(low, high),
-                    ]
+                ours = curves.get(favourite)
+                whole = known.complete and ours is not None and ours.complete
+                if curve != favourite and ours is not None and whole:
+                    gap = difference(ours.final[0], scores)
+                    cells[-2:] = [_said(*gap), verdict(*gap[1:])]
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -156,9 +163,7 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
         if not said:
             continue
         line = f"- {favourite} better than {other}: {counts} of {len(said)}"
-        if len(pairs) > 1 and all(
-            statistics.interquartile_mean(scores) > 0 for _, scores in pairs
-        ):
+        if len(pairs) > 1 and all((scores > 0).all() for x in pairs for scores in x):
             middle, low, high = together(pairs)
             line += (
                 f"; over all of them {100 * middle:+.0f}% [{100 * low:.0f}, "
@@ -168,59 +173,61 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
     return "\n".join(lines)
 
 
-def gaps(shown: Mapping[str, Mapping[str, Results]], favourite: str, other: str) -> str:
-    """How far the favourite is ahead in each panel, and whether by more than in the
-    first, where every difference is one of interquartile means.
+def gaps(
+    shown: Mapping[str, Mapping[str, Results]], first: str, favourite: str, other: str
+) -> str:
+    """How far the favourite is ahead in each panel, and whether by more than in one.
+
+    Args:
+      shown: panel -> curve -> results.
+      first: the panel that the others are compared with.
+      favourite: a curve.
+      other: the one that it is compared with, by interquartile means.
     """
     both = {
         panel: (curves[favourite].final[0], curves[other].final[0])
         for panel, curves in shown.items()
         if favourite in curves and other in curves
     }
-    if not both:
-        return ""
-    mean = statistics.interquartile_mean
     rng = np.random.default_rng(0)
-    middle = {name: float(mean(x) - mean(y)) for name, (x, y) in both.items()}
     drawn = {
         name: _resampled(x, rng) - _resampled(y, rng) for name, (x, y) in both.items()
     }
-    first = next(iter(both))
-    within = lambda draws: np.percentile(draws, [2.5, 97.5])
-    said = lambda value, low, high: (
-        f"{_number(value)} [{_number(low)}, {_number(high)}]"
-    )
-    lines = [
-        f"- {first}: {favourite} ahead of {other} by "
-        f"{said(middle[first], *within(drawn[first]))}."
-    ]
-    for panel in list(both)[1:]:
-        growth = within(drawn[panel] - drawn[first])
-        lines.append(
-            f"- {panel}: by {said(middle[panel], *within(drawn[panel]))}; more than at "
-            f"{first} by {said(middle[panel] - middle[first], *growth)}: "
-            f"{verdict(*growth)}."
-        )
+    lines = []
+    for panel, pair in both.items():
+        gap = difference(*pair)
+        line = f"- {panel}: {favourite} ahead of {other} by {_said(*gap)}"
+        if panel != first and first in both:
+            more = gap[0] - difference(*both[first])[0]
+            low, high = np.percentile(drawn[panel] - drawn[first], [2.5, 97.5])
+            line += f"; by {_said(more, low, high)} more than at {first}: "
+            line += verdict(low, high)
+        lines.append(f"{line}.")
     return "\n".join(lines)
 
 
-def optimum(shown: Mapping[str, Mapping[str, Results]]) -> str:
-    """Of panels whose curves are values in order: the best, against both ends."""
+def optimum(
+    shown: Mapping[str, Mapping[str, Results]], values: Mapping[str, Sequence[str]]
+) -> str:
+    """The best of values in order, against each other one.
+
+    Args:
+      shown: panel -> value -> results.
+      values: panel -> all its values, in order; nothing is said before all are there.
+    """
     lines = []
-    for panel, curves in shown.items():
-        names = list(curves)
-        score = lambda name: float(
-            statistics.interquartile_mean(curves[name].final[0])  # noqa: B023
+    for panel, names in values.items():
+        scores = {name: known.final[0] for name, known in shown.get(panel, {}).items()}
+        if set(names) - set(scores):
+            continue
+        best = max(names, key=lambda x: float(statistics.interquartile_mean(scores[x])))
+        against = ", ".join(
+            f"{name} {verdict(*difference(scores[best], scores[name])[1:])}"
+            for name in names
+            if name != best
         )
-        best = max(names, key=score)
-        against = [
-            f"better than {end}: "
-            + verdict(*difference(curves[best].final[0], curves[end].final[0])[1:])
-            for end in (names[0], names[-1])
-            if end != best
-        ]
         place = "at an end" if best in (names[0], names[-1]) else "in the middle"
-        lines.append(f"- {panel}: {best} is best, {place}; {', '.join(against)}.")
+        lines.append(f"- {panel}: {best} is best, {place}; better than {against}.")
     return "\n".join(lines)
 
 
@@ -235,7 +242,7 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
                 values.append(f"{known.trial.num_envs} environments")
             made = {
                 f"{made['physics']} physics, jax {made['versions'].get('jax', '?')}, "
-                f"commit {made['commit'] or 'unknown'}"
+                f"collected at commit {made['commit'] or 'unknown'}"
                 for made in known.made
             }
             made_by = "; ".join(sorted(made))
@@ -245,8 +252,15 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     return "\n".join(lines)
 
 
-def draw(shown: Mapping[str, Mapping[str, Results]], path: pathlib.Path) -> None:
-    """Learning curves, a panel each: interquartile mean and 95% interval over seeds."""
+def draw(
+    shown: Mapping[str, Mapping[str, Results]],
+    wanted: Sequence[Trial],
+    path: pathlib.Path,
+) -> None:
+    """Learning curves, a panel each: interquartile mean and 95% interval over seeds.
+
+    A curve has the colour that it has when all wanted trials are there.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
@@ -262,7 +276,8 @@ def draw(shown: Mapping[str, Mapping[str, Results]], path: pathlib.Path) -> None
         squeeze=False,
     )
     for axes, (panel, curves) in zip(grid.flat, shown.items()):
-        color_of = _colors(list(curves))
+        names = [trial.name for trial in wanted]
+        color_of = _colors([x.split("/")[1] for x in names if x.split("/")[0] == panel])
         for curve, known in curves.items():
             color = color_of[curve]
             some = np.isfinite(known.returns[0]).all(axis=0)
@@ -300,8 +315,8 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
         "Final return is the mean over the last tenth of training of the episodes "
         "that the acting policy ended. Intervals are percentile bootstraps over "
         'seeds; "better?" says "yes" where the 95% interval of the difference of '
-        'interquartile means is above 0. "Over all of them" is the mean over tasks of '
-        "that difference as a share of the other agent's.",
+        'interquartile means is above 0. "Over all of them" is the geometric mean over '
+        "tasks of the ratio of the interquartile means, less one.",
         table(shown, figure.favourite),
         figure.conclusions(shown),
         figure.more,
@@ -319,5 +334,5 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
     shown = panels(wanted, results / figure.name)
     if not shown:
         return
-    draw(shown, results / f"{figure.name}.png")
+    draw(shown, wanted, results / f"{figure.name}.png")
     (results / f"{figure.name}.md").write_text(page(figure, shown))

@@ -18,7 +18,7 @@ FIGURE = Figure(
     title="Walker2d with noisy observations (paper, figure 6)",
     claim="The gap between PPO and PPO+GASIL is larger when Gaussian noise, of "
     "standard deviation 0.05, 0.1 and 0.5, is added to the observations.",
-    conclude=lambda shown: report.gaps(shown, "ppo+gasil", "ppo"),
+    conclude=lambda shown: report.gaps(shown, "noise 0", "ppo+gasil", "ppo"),
 )
 
 

@@ -38,10 +38,16 @@ def table() -> str:
         folder = trials.RESULTS / figure.name
         for task, curves in report.panels(comparison.make(delay), folder).items():
             name = task if delay == 1 else f"{task}, delayed"
-            known = [curves.get(agent) for agent in trials.AGENTS]
-            cells = ["" if x is None else report.interval(x.final[0]) for x in known]
+            cells = [_cell(curves.get(agent)) for agent in trials.AGENTS]
             lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
+
+
+def _cell(known: trials.Results | None) -> str:
+    if known is None:
+        return ""
+    partly = "" if known.complete else f" ({len(known.seeds)} seeds)"
+    return report.interval(known.final[0]) + partly
 
 
 def page() -> str:
@@ -57,11 +63,13 @@ def page() -> str:
     for figure, make in FIGURES:
         wanted = make()
         shown = report.panels(wanted, trials.RESULTS / figure.name)
-        missing = [
-            trial.name
-            for trial in wanted
-            if trial.name.split("/")[1] not in shown.get(trial.name.split("/")[0], {})
-        ]
+        complete = {
+            known.trial.name
+            for curves in shown.values()
+            for known in curves.values()
+            if known.complete
+        }
+        missing = [trial.name for trial in wanted if trial.name not in complete]
         parts += [f"## {figure.title}", f"**Claim.** {figure.claim}"]
         if shown:
             parts += [
@@ -70,7 +78,7 @@ def page() -> str:
                 figure.more,
             ]
         if missing:
-            parts.append(f"Not run yet: {', '.join(missing)}.")
+            parts.append(f"Not run yet, or not wholly: {', '.join(missing)}.")
     return "\n\n".join(part for part in parts if part) + "\n"
 
 

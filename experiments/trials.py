@@ -8,6 +8,7 @@ machines can share an experiment.
 
 import csv
 import dataclasses
+import io
 import json
 import os
 import pathlib
@@ -17,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import logging, run_folder, shards, sweep, sweep_tables
+from gasil_jax import run_folder, shards, sweep, sweep_tables
 from gasil_jax.command_line import InputError
 
 #: The paper's agents, as figures 5 and 7 compare them.
@@ -28,7 +29,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 #: Environments that a seed steps at once, together 2,048 steps an iteration.
 NUM_ENVS = 32
 #: More where physics is slow, for a GPU is fast only with thousands.
-NUM_ENVS_OF = {"ant": 128, "humanoid": 128}
+NUM_ENVS_OF = {"ant": 64, "humanoid": 64}
 # The appendix's values, which a trial's points stand on; no tuned preset.
 _FLAGS = ("--preset", "paper")
 
@@ -102,8 +103,10 @@ def train(
     listed = place.with_name(f"{place.name}.json")
     points = json.dumps([dict(point) for point in trial.points])
     place.parent.mkdir(parents=True, exist_ok=True)
+    _check_runs(trial, place)
     if not listed.exists():
         _write_whole(listed, points)
+        _write_whole(_claim(place), json.dumps(_identity(trial)))
     elif json.loads(listed.read_text()) != json.loads(points):
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
@@ -123,21 +126,45 @@ def train(
     )
 
 
+def _claim(place: pathlib.Path) -> pathlib.Path:
+    """Where it is written what the runs of a trial are."""
+    return place.with_name(f"{place.name}.settings.json")
+
+
+def _identity(trial: Trial) -> dict[str, Any]:
+    return trial.settings() | {"seeds": trial.seeds, "first_seed": trial.first_seed}
+
+
+def _check_runs(trial: Trial, place: pathlib.Path) -> None:
+    """Raise `InputError` if the runs are of other settings or seeds."""
+    if not _claim(place).exists():
+        return
+    before = json.loads(_claim(place).read_text())
+    now = json.loads(json.dumps(_identity(trial)))
+    for name in sorted(set(before) | set(now)):
+        was, is_ = before.get(name), now.get(name)
+        if was != is_:
+            # Points are too many for a line.
+            values = "" if name == "points" else f" ({was}, not {is_})"
+            raise InputError(f"{place} has other {name}{values}: move {place}* away")
+
+
 def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
     """Put what has been trained of a trial into its results.
 
     Rows that are there already, of another machine, stay.
 
     Raises:
-      InputError: the results are of other settings.
+      InputError: the results or the runs are of other settings.
     """
+    _check_runs(trial, runs / trial.name)
     target = results / f"{trial.name}.csv"
     described = target.with_suffix(".json")
     rows: dict[tuple[str, str], list[dict[str, Any]]] = {}
     for row in _read(target):
         rows.setdefault((row["point"], row["seed"]), []).append(row)
     made = []
-    if described.exists():
+    if target.exists():
         check(trial, results)
         made = json.loads(described.read_text())["made"]
     found = len(rows)
@@ -152,12 +179,15 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         rows = new | rows
     if len(rows) > found:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with target.open("w", newline="") as file:
-            writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-            writer.writeheader()
-            for key in sorted(rows, key=lambda key: tuple(map(int, key))):
-                writer.writerows(rows[key])
-        logging.write_json(described, {"settings": trial.settings(), "made": made})
+        file = io.StringIO()
+        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for key in sorted(rows, key=lambda key: tuple(map(int, key))):
+            writer.writerows(rows[key])
+        content = {"settings": trial.settings(), "made": made}
+        # The CSV file last: where it is, its settings are.
+        _write_whole(described, json.dumps(content, indent=2) + "\n")
+        _write_whole(target, file.getvalue())
 
 
 def _write_whole(path: pathlib.Path, text: str) -> None:
@@ -194,7 +224,6 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
         seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
         if known is not None and known.seeds.tolist() == list(seeds):
             target.parent.mkdir(parents=True, exist_ok=True)
-            # The CSV file last: where it is, its settings are.
             for suffix in (".json", ".csv"):
                 text = described.with_suffix(suffix).read_text()
                 _write_whole(target.with_suffix(suffix), text)

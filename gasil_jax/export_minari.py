@@ -69,12 +69,15 @@ class Episode(NamedTuple):
     return_: float
 
 
-def episodes(buffer: GoodTrajectories, max_episode_steps: int) -> list[Episode]:
+def episodes(
+    buffer: GoodTrajectories, max_episode_steps: int, max_steps: float | None = None
+) -> list[Episode]:
     """The buffer's whole episodes, best first.
 
     Args:
       buffer: of one run.
       max_episode_steps: one of so many steps is whole, wherever it is.
+      max_steps: what `good_trajectories.insert` was limited to.
     """
     size = int(buffer.size)
     bounds = [*np.flatnonzero(np.asarray(buffer.time[:size]) == 0), size]
@@ -83,7 +86,8 @@ def episodes(buffer: GoodTrajectories, max_episode_steps: int) -> list[Episode]:
         Episode(observation[start:end], action[start:end], float(buffer.return_[start]))
         for start, end in itertools.pairwise(bounds)
     ]
-    if size == buffer.capacity and len(found[-1].action) < max_episode_steps:
+    most = buffer.capacity if max_steps is None else min(buffer.capacity, max_steps)
+    if size >= int(most) and len(found[-1].action) < max_episode_steps:
         found.pop()
     return found
 
@@ -168,12 +172,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f"seed is {options.seed}: the run has {seeds[0]} to {seeds[-1]}"
             )
         limit = train.max_episode_steps(env, config)
-        buffers = jax.device_get(states.good_trajectories)
-        found = [
-            episode
+        most = states.hyperparameters.max_buffer_steps
+        members = [
+            batch.member(jax.device_get((states.good_trajectories, most)), index)
             for index, seed in enumerate(seeds)
             if options.seed in (None, seed)
-            for episode in episodes(batch.member(buffers, index), limit)
+        ]
+        found = [
+            episode
+            for buffer, max_steps in members
+            for episode in episodes(buffer, limit, max_steps)
         ]
         if not found:
             raise InputError(f"run is {options.run}: no whole episode is in its buffer")

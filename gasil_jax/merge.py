@@ -41,7 +41,9 @@ def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: x for name, x in described.items() if name != "shard"}
+    # share_counts is missing where a shard is older than that option.
+    content = {"share_counts": False, **described}
+    return {name: x for name, x in content.items() if name != "shard"}
 
 
 def _refuse_different(

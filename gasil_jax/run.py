@@ -104,7 +104,9 @@ def parse(
         newer = {
             f.name: f.default for f in fields if f.default is None or f.default is False
         }
-        if {f.name for f in fields} - set(newer) - set(described):
+        names = {f.name for f in fields}
+        missing = names - set(newer) - set(described)
+        if missing or set(described) - names - {"out", "points"}:
             raise InputError(f"out is {began}, which another program has written")
         known = newer | described
         values: dict[str, Any] = {f.name: known[f.name] for f in fields}

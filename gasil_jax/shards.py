@@ -85,13 +85,18 @@ def programs(
     ]
 
 
+def _least(config: Config, limit: str, number: int) -> float:
+    given = getattr(config.hyperparameters, limit)
+    return number if given is None else min(given, number)
+
+
 def _limited(configs: Sequence[Config]) -> list[Config]:
     """The largest counts for all, each limited to its own where they differ."""
     for count, limit in _LIMITS.items():
         own = [getattr(config, count) for config in configs]
         if len(set(own)) > 1:
             configs = [
-                config.updated({count: max(own), limit: number})
+                config.updated({count: max(own), limit: _least(config, limit, number)})
                 for config, number in zip(configs, own, strict=True)
             ]
     return list(configs)

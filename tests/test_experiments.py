@@ -198,7 +198,8 @@ def test_a_difference_and_its_interval():
 def test_a_difference_over_several_tasks():
     """Tasks weigh alike whatever their scale, and are clearer than each alone."""
     rng = np.random.default_rng(4)
-    pairs = [(rng.normal(1.5, 0.6, 10), rng.normal(1.0, 0.6, 10)) for _ in range(4)]
+    draw = lambda mean: mean * np.exp(rng.normal(0.0, 0.5, 10))
+    pairs = [(draw(1.5), draw(1.0)) for _ in range(4)]
     middle, low, high = report.together(pairs)
     assert low < middle < high
     larger = [(1000.0 * ours, 1000.0 * other) for ours, other in pairs[:2]] + pairs[2:]
@@ -279,10 +280,36 @@ def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
     assert known.part(0.99, 1.0).item() == 9.0
 
 
-def results(mean):
+def test_runs_of_other_settings_are_neither_gone_on_with_nor_taken(tmp_path):
+    trial = trials.Trial("x/y", "hopper", "ppo", total_steps=100)
+    (tmp_path / "x/y").mkdir(parents=True)
+    claim = tmp_path / "x/y.settings.json"
+    claim.write_text(json.dumps(trial.settings() | {"seeds": 10, "first_seed": 0}))
+    trials.collect(trial, tmp_path, tmp_path / "results")
+    for name, value in (("total_steps", 200), ("seeds", 3), ("obs_noise", 0.1)):
+        other = dataclasses.replace(trial, **{name: value})
+        for action in (
+            lambda: trials.train(other, tmp_path, 1, 1),  # noqa: B023
+            lambda: trials.collect(other, tmp_path, tmp_path / "results"),  # noqa: B023
+        ):
+            with pytest.raises(trials.InputError, match=f"has other {name}"):
+                action()
+
+
+def results(mean, seeds=4):
     returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
-    trial = trials.Trial("x/y", "hopper", "ppo")
+    trial = trials.Trial("x/y", "hopper", "ppo", seeds=seeds)
     return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
+
+
+def test_nothing_is_concluded_from_some_of_the_seeds():
+    figure = report.Figure("x", "title", "claim", favourite="ours")
+    shown = {"task": {"ours": results(2.0), "other": results(1.0, seeds=5)}}
+    assert figure.conclusions(shown) == ""
+    table = report.table(shown, "ours")
+    assert "| task | other | 4 of 5 | 1.0 [1.0, 1.0] |  |  |" in table
+    shown["task"]["other"] = results(1.0)
+    assert "ours better than other: yes on 1 of 1" in figure.conclusions(shown)
 
 
 def test_a_gap_is_compared_with_that_of_the_first_panel():
@@ -292,21 +319,25 @@ def test_a_gap_is_compared_with_that_of_the_first_panel():
         "windy": {"ours": results(6.0), "other": results(1.0)},
         "stormy": {"ours": results(1.0), "other": results(0.0)},
     }
-    first, *others = report.gaps(shown, "ours", "other").splitlines()
-    assert first.startswith("- calm: ours ahead of other by 2.0 [")
-    assert [line.split(": ")[0] for line in others] == ["- windy", "- stormy"]
-    assert "by 5.0 [" in others[0] and "calm by 3.0 [" in others[0]
-    assert others[0].endswith(": yes.")
-    assert "calm by -1.0 [" in others[1] and others[1].endswith("it is lower.")
-    assert report.gaps({"alone": shown["alone"]}, "ours", "other") == ""
+    said = report.gaps(shown, "calm", "ours", "other")
+    calm, windy, stormy = said.splitlines()
+    assert calm.startswith("- calm: ours ahead of other by 2.0 [")
+    assert "more" not in calm
+    assert windy.startswith("- windy: ours ahead of other by 5.0 [")
+    assert "; by 3.0 [" in windy and windy.endswith("] more than at calm: yes.")
+    assert "; by -1.0 [" in stormy and stormy.endswith("calm: no, it is lower.")
+    del shown["calm"]
+    assert "more" not in report.gaps(shown, "calm", "ours", "other")
 
 
 def test_an_optimum_is_named_by_where_it_is():
     shown = {"a": {"1": results(1.0), "2": results(9.0), "3": results(8.0)}}
-    said = report.optimum(shown)
-    assert "2 is best, in the middle; better than 1: yes, better than 3: yes" in said
+    said = report.optimum(shown, {"a": ("1", "2", "3"), "b": ("1", "2")})
+    assert said == "- a: 2 is best, in the middle; better than 1 yes, 3 yes."
     shown = {"a": {"1": results(1.0), "2": results(0.9)}}
-    assert "1 is best, at an end; better than 2: yes" in report.optimum(shown)
+    said = report.optimum(shown, {"a": ("1", "2")})
+    assert said == "- a: 1 is best, at an end; better than 2 yes."
+    assert report.optimum(shown, {"a": ("1", "2", "3")}) == ""
 
 
 @pytest.mark.parametrize("number", [0, 1])

@@ -66,13 +66,16 @@ def test_whole_episodes_come_back(filled, capsys):
 
 
 def test_a_buffer_s_last_episode_is_kept_if_it_is_whole():
-    lengths = lambda kept, limit: [
-        len(episode.action) for episode in export_minari.episodes(kept, limit)
+    lengths = lambda kept, *limits: [
+        len(episode.action) for episode in export_minari.episodes(kept, *limits)
     ]
     full = buffer((30, 20, 50), (3.0, 2.0, 1.0), 100, 4, 2)
     assert lengths(full, 1000) == [30, 20]
     assert lengths(full, 50) == [30, 20, 50]
-    assert lengths(buffer((30, 20), (3.0, 2.0), 100, 4, 2), 1000) == [30, 20]
+    partly = buffer((30, 20), (3.0, 2.0), 100, 4, 2)
+    assert lengths(partly, 1000) == [30, 20]
+    assert lengths(partly, 1000, 50.0) == [30]
+    assert lengths(partly, 1000, 51.0) == [30, 20]
     assert lengths(good_trajectories.init(100, 4, 2), 1000) == []
 
 

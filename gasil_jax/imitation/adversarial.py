@@ -165,8 +165,9 @@ def _train_discriminator(
         lambda a, b: jnp.where(condition, a, b), new, old
     )
     num_updates = config.discriminator_updates
-    most = hyperparameters.max_discriminator_updates
-    counts = jnp.arange(num_updates) < (num_updates if most is None else most)
+    counts = jnp.ones(num_updates, bool)
+    if (most := hyperparameters.max_discriminator_updates) is not None:
+        counts &= jnp.arange(num_updates) < jnp.asarray(most, jnp.int32)
     trained, metrics = jax.lax.scan(
         step, state, (jax.random.split(key, num_updates), counts)
     )
