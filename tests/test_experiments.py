@@ -238,7 +238,7 @@ PUBLISHED = (
 def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypatch):
     """A page made anew from the committed CSV files is the committed page."""
     wanted = []
-    monkeypatch.setattr(report, "draw", lambda shown, path: None)
+    monkeypatch.setattr(report, "draw", lambda shown, wanted, path: None)
 
     def remember(figure, make, quick, arguments, write=report.write):
         wanted.extend(make())
