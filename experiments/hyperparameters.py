@@ -29,6 +29,9 @@ FIGURE = Figure(
     claim="The agent performs poorly when the buffer is too small (500 steps) or too "
     "large (5000 steps), and with too few or too many discriminator updates.",
     favourite=None,
+    more="""**What it says.** With the dense reward the search chose an alpha with
+which the discriminator's reward has no weight ([figure 5](mujoco.md)): there the curves
+show how far ten seeds differ by chance.""",
     conclude=lambda shown: report.optimum(shown, _PANELS),
 )
 

@@ -9,9 +9,11 @@ seeds each: any two hyperparameters have every pair of their values equally ofte
 the best four points get four seeds more, for the best of many points on few seeds is
 partly the luckiest (PPO's points have eight from the start); the command lists and
 trains them once the first stage is complete. The seeds are other than those of the
-figures, which use the point with the best mean return. On the point mass both agents
-have the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else
-what its preset has (alpha 1, 20 updates at 3e-4).
+figures, which use the point with the best mean return. Ant and humanoid, whose runs
+cost several times as much, have half as many in the first stage, 16 for each agent, and
+PPO two learning rates. On the point mass both agents have the learning rates 1e-3,
+3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else what its preset has (alpha 1,
+20 updates at 3e-4).
 
 Nothing uses what is in `results/first_search/`: a first search that drew PPO+GASIL's
 points otherwise, each value equally often but not each pair (no point had 20
@@ -38,6 +40,8 @@ from gasil_jax.points import Point
 DELAY = 20
 _FIRST_SEED = 1000
 _RUNS = 32
+# Where a run costs several times as much.
+_RUNS_OF = {"ant": 16, "humanoid": 16}
 _SECOND_POINTS, _SECOND_SEEDS, _SECOND_FIRST_SEED = 4, 4, 2000
 _ENOUGH_SEEDS = 8
 _SECOND = "-best"
@@ -69,6 +73,8 @@ SPACES: Mapping[str, Mapping[str, tuple[Any, ...]]] = {
 }
 
 _OTHER_SPACES: Mapping[tuple[str, str], Mapping[str, tuple[Any, ...]]] = {
+    ("ant", "ppo"): {"learning_rate": _HIGHER},
+    ("humanoid", "ppo"): {"learning_rate": _HIGHER},
     ("point_mass", "ppo"): {"learning_rate": _POINT_MASS_LEARNING_RATES},
     ("point_mass", "ppo+gasil"): {
         "learning_rate": _POINT_MASS_LEARNING_RATES,
@@ -145,7 +151,7 @@ def search(env: str, agent: str, reward_delay: int) -> Trial:
         agent=agent,
         points=points,
         reward_delay=reward_delay,
-        seeds=_RUNS // len(points),
+        seeds=_RUNS_OF.get(env, _RUNS) // len(points),
         first_seed=_FIRST_SEED,
         total_steps=STEPS.get(env, 1_000_000),
         rows=10,
