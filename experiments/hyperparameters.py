@@ -31,7 +31,7 @@ FIGURE = Figure(
     favourite=None,
     more="""**What it says.** With the dense reward the search chose an alpha with
 which the discriminator's reward has no weight ([figure 5](mujoco.md)): there the curves
-show how far ten seeds differ by chance.""",
+show how far ten seeds differ by chance, and that one "yes" in many is little.""",
     conclude=lambda shown: report.optimum(shown, _PANELS),
 )
 
