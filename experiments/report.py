@@ -134,8 +134,8 @@ def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> 
             if favourite:
                 cells += ["", ""]
                 ours = curves.get(favourite)
-                whole = known.complete and ours is not None and ours.complete
-                if curve != favourite and ours is not None and whole:
+                both = ours is not None and ours.complete and known.complete
+                if curve != favourite and ours is not None and both:
                     gap = difference(ours.final[0], scores)
                     cells[-2:] = [_said(*gap), verdict(*gap[1:])]
             lines.append("| " + " | ".join(cells) + " |")
@@ -193,12 +193,12 @@ def gaps(
     drawn = {
         name: _resampled(x, rng) - _resampled(y, rng) for name, (x, y) in both.items()
     }
+    found = {panel: difference(*pair) for panel, pair in both.items()}
     lines = []
-    for panel, pair in both.items():
-        gap = difference(*pair)
+    for panel, gap in found.items():
         line = f"- {panel}: {favourite} ahead of {other} by {_said(*gap)}"
         if panel != first and first in both:
-            more = gap[0] - difference(*both[first])[0]
+            more = gap[0] - found[first][0]
             low, high = np.percentile(drawn[panel] - drawn[first], [2.5, 97.5])
             line += f"; by {_said(more, low, high)} more than at {first}: "
             line += verdict(low, high)
@@ -275,9 +275,9 @@ def draw(
         layout="constrained",
         squeeze=False,
     )
+    names = [trial.name.split("/") for trial in wanted]
     for axes, (panel, curves) in zip(grid.flat, shown.items()):
-        names = [trial.name for trial in wanted]
-        color_of = _colors([x.split("/")[1] for x in names if x.split("/")[0] == panel])
+        color_of = _colors([curve for of, curve in names if of == panel])
         for curve, known in curves.items():
             color = color_of[curve]
             some = np.isfinite(known.returns[0]).all(axis=0)

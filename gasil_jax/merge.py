@@ -41,9 +41,7 @@ def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
 
 
 def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
-    # share_counts is missing where a shard is older than that option.
-    content = {"share_counts": False, **described}
-    return {name: x for name, x in content.items() if name != "shard"}
+    return {name: x for name, x in described.items() if name != "shard"}
 
 
 def _refuse_different(

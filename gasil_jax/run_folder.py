@@ -149,6 +149,8 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         described = _tuples_in(content)
         described["config"] = Config(**fields)
         described["settings"] = Settings(**content["settings"])
+        if "points" in described:  # Of a sweep, which may be older than the option.
+            described.setdefault("share_counts", False)
         for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
             if type(described[name]) is not kind:
                 raise TypeError(f"{name} is {described[name]!r}")

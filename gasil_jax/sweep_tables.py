@@ -76,9 +76,8 @@ class Trained:
         """What a folder trains, by its config.json as `run_folder.read` reads it."""
         first = content["first_seed"]
         seeds = range(first, first + content["seeds"])
-        share_counts = content.get("share_counts", False)  # Not in older folders.
         programs = shards.programs(
-            content["config"], content["points"], seeds, share_counts
+            content["config"], content["points"], seeds, content["share_counts"]
         )
         if content["shard"] is not None:
             programs = shards.share(programs, shards.parse(content["shard"]))

@@ -39,13 +39,14 @@ def by_seed(content):
 
 
 def test_a_seeds_result_is_its_own(tmp_path):
-    # The same command twice gives the same bytes: test_resume.py.
-    one, two, alone = results(
+    one, again, two, alone = results(
         tmp_path,
+        ("--devices", "1"),
         ("--devices", "1"),
         ("--devices", "2"),
         ("--devices", "1", "--first-seed", "7", "--seeds", "1"),
     )
+    assert one == again
     expected = by_seed(one)
     assert set(expected) == {"5", "6", "7", "8"} and set(by_seed(alone)) == {"7"}
     for other in (two, alone):

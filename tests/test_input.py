@@ -138,7 +138,7 @@ def test_a_refused_configuration_names_its_field(config):
 
 
 @settings(
-    max_examples=2,
+    max_examples=3,
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],

@@ -260,8 +260,10 @@ def test_a_folder_in_use_is_refused_until_its_process_dies(tmp_path, capsys):
         pass
 
 
-# The other agents' states are made of these agents'.
-@pytest.mark.parametrize("agent", ["ppo", "ppo+sil", "ppo+gasil"])
+AGENTS = [name for name in gasil_jax.agents() if name != "gail"]
+
+
+@pytest.mark.parametrize("agent", AGENTS)
 def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
     """Three members on two devices: one is padding."""
     env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)

@@ -51,7 +51,13 @@ def test_vmap_over_every_hyperparameter_equals_single_runs():
     _, swept = jax.jit(jax.vmap(train, in_axes=(None, 0)))(key, stacked)
     for i, hyperparameters in enumerate(both):
         _, single = trainer()(key, hyperparameters)
-        for name in ("bonus", "policy_loss", "value_loss", "good_steps"):
+        for name in (
+            "bonus",
+            "policy_loss",
+            "value_loss",
+            "learning_rate",
+            "good_steps",
+        ):
             np.testing.assert_allclose(
                 swept[name][i], single[name], rtol=1e-3, atol=1e-5, err_msg=name
             )
