@@ -76,13 +76,18 @@ def _network(config: Config) -> Any:
     return Discriminator(config.discriminator_hidden_sizes)
 
 
+def _optimizer() -> optax.GradientTransformation:
+    # As one vector: see `ppo.optimizer`.
+    return optax.flatten(optax.scale_by_adam())
+
+
 def _init(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> AdversarialState:
     params = _network(config).init(
         key, jnp.zeros(observation_size), jnp.zeros(action_size)
     )
-    return AdversarialState(params, optax.scale_by_adam().init(params))
+    return AdversarialState(params, _optimizer().init(params))
 
 
 class Source(NamedTuple):
@@ -127,7 +132,7 @@ def _train_discriminator(
     """
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters
-    network, transform = _network(config), optax.scale_by_adam()
+    network, transform = _network(config), _optimizer()
     rollout = context.rollout
     observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
     action = rollout.action.reshape(-1, rollout.action.shape[-1])
