@@ -163,10 +163,15 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
         if not said:
             continue
         line = f"- {favourite} better than {other}: {counts} of {len(said)}"
-        if len(pairs) > 1 and all((scores > 0).all() for x in pairs for scores in x):
-            middle, low, high = together(pairs)
+        # A ratio has no meaning where a seed learned nothing or lost.
+        positive = [x for x in pairs if all((scores > 0).all() for scores in x)]
+        if len(positive) > 1:
+            middle, low, high = together(positive)
+            which = "all of them"
+            if len(positive) < len(pairs):
+                which = f"the {len(positive)} where every seed's return is above 0"
             line += (
-                f"; over all of them {100 * middle:+.0f}% [{100 * low:.0f}, "
+                f"; over {which} {100 * middle:+.0f}% [{100 * low:.0f}, "
                 f"{100 * high:.0f}], {verdict(low, high)}"
             )
         lines.append(f"{line}.")

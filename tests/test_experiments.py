@@ -302,6 +302,16 @@ def results(mean, seeds=4):
     return trials.Results(trial, np.arange(4), np.arange(1, 11), returns, ())
 
 
+def test_a_task_without_a_ratio_is_left_out_of_them():
+    task = lambda ours, other: {"ours": results(ours), "other": results(other)}
+    shown = {"a": task(2.0, 1.0), "b": task(3.0, 4.0)}
+    said = report.tally(shown, "ours")
+    assert "; over all of them " in said
+    with_loss = report.tally(shown | {"c": task(1.0, -0.5)}, "ours")
+    assert "of 3; over the 2 where every seed's return is above 0 " in with_loss
+    assert with_loss.split("above 0 ")[1] == said.split("of them ")[1]
+
+
 def test_nothing_is_concluded_from_some_of_the_seeds():
     figure = report.Figure("x", "title", "claim", favourite="ours")
     shown = {"task": {"ours": results(2.0), "other": results(1.0, seeds=5)}}
