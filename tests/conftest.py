@@ -19,6 +19,29 @@ from gasil_envs.physics import native
 native.reserve_threads(2)
 
 
+# Of commands, files and processes: what they train is small, and compiling it is most
+# of their time. What compares numbers is compiled as it is for users.
+_OF_COMMANDS = {
+    *("test_experiments", "test_halving", "test_input", "test_plot", "test_readme"),
+    *("test_render", "test_resume", "test_run", "test_sweep", "test_trackers"),
+}
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    """Set how much what a test compiles, and the programs it starts, is optimized."""
+    import jax
+
+    plainly = item.module.__name__ in _OF_COMMANDS
+    before = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
+    os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(plainly))
+    if before != str(int(plainly)):
+        jax.config.update("jax_disable_most_optimizations", plainly)
+        # What is compiled, single operations too, is kept for the process whatever
+        # the setting, and rounds otherwise.
+        jax.clear_caches()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
     """One worker for the tests that share a module's fixture: it is made once."""
@@ -51,3 +74,25 @@ def untrained_hopper(tmp_path_factory):
     states = jax.jit(init)(np.arange(1, dtype=np.uint32))
     checkpoint.write(out / "checkpoints", 0, states, {"score": None})
     return out
+
+
+@pytest.fixture(scope="session")
+def trained_point_mass():
+    """The environment, configuration and states (3,) after a little training."""
+    import jax
+    import numpy as np
+
+    import gasil_jax
+
+    env = gasil_jax.make_env("point_mass", reward_delay=7)
+    config = gasil_jax.Config(
+        agent="ppo+gasil",
+        total_steps=1024,
+        num_envs=4,
+        batch_steps=512,
+        hidden_sizes=(16, 8),
+        num_epochs=1,
+    )
+    train = gasil_jax.make_train(env, config)
+    keys = jax.vmap(jax.random.key)(np.arange(3))
+    return env, config, jax.jit(jax.vmap(train))(keys)[0]

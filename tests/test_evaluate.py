@@ -8,26 +8,12 @@ import pytest
 import gasil_jax
 from gasil_jax import checkpoint, evaluate, numpy_policy, policy
 
-CONFIG = gasil_jax.Config(
-    agent="ppo+gasil",
-    total_steps=1024,
-    num_envs=4,
-    batch_steps=512,
-    hidden_sizes=(16, 8),
-    num_epochs=1,
-)
+# With the other tests that use it, so that it is trained once.
+pytestmark = pytest.mark.xdist_group("trained_point_mass")
 
 
-@pytest.fixture(scope="module")
-def trained():
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    train = gasil_jax.make_train(env, CONFIG)
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    return env, jax.jit(jax.vmap(train))(keys)[0]
-
-
-def test_a_saved_state_is_loaded_bit_by_bit(trained, tmp_path):
-    _, states = trained
+def test_a_saved_state_is_loaded_bit_by_bit(trained_point_mass, tmp_path):
+    _, _, states = trained_point_mass
     checkpoint.save(tmp_path / "state", states)
     like = jax.eval_shape(lambda: states)
     loaded = checkpoint.restore(tmp_path / "state", like)
@@ -40,8 +26,8 @@ def test_a_saved_state_is_loaded_bit_by_bit(trained, tmp_path):
     )
 
 
-def test_a_state_of_another_shape_is_refused(trained, tmp_path):
-    _, states = trained
+def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
+    _, _, states = trained_point_mass
     checkpoint.save(tmp_path / "state", states)
     other = jax.eval_shape(lambda: jax.tree.map(lambda x: x[:1], states))
     with pytest.raises(ValueError, match="holds another state"):
@@ -50,11 +36,11 @@ def test_a_state_of_another_shape_is_refused(trained, tmp_path):
         checkpoint.restore(tmp_path / "state", other.replace(imitation=()))
 
 
-def test_scores_are_those_of_a_plain_loop(trained):
-    env, states = trained
+def test_scores_are_those_of_a_plain_loop(trained_point_mass):
+    env, config, states = trained_point_mass
     state = gasil_jax.member(states, 1)
     key = jax.random.key(3)
-    scores = jax.jit(lambda s: evaluate.evaluate(env, CONFIG, s, key, num_episodes=3))(
+    scores = jax.jit(lambda s: evaluate.evaluate(env, config, s, key, num_episodes=3))(
         state
     )
     act = numpy_policy.make(policy.weights(state, env))
@@ -69,11 +55,11 @@ def test_scores_are_those_of_a_plain_loop(trained):
         assert int(scores["episode_length"][i]) == length == 50
 
 
-def test_stochastic_scores_vary_more(trained):
-    env, states = trained
+def test_stochastic_scores_vary_more(trained_point_mass):
+    env, config, states = trained_point_mass
     score = lambda deterministic: evaluate.evaluate(
         env,
-        CONFIG,
+        config,
         gasil_jax.member(states, 0),
         jax.random.key(0),
         num_episodes=50,

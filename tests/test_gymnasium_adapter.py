@@ -31,7 +31,7 @@ def test_an_episode_is_that_of_our_environment():
     theirs = gymnasium.make("gasil_envs/point_mass", reward_delay=7)
     observation, _ = theirs.reset(seed=3)
     key = gymnasium_adapter._key(np.random.Generator(np.random.PCG64(3)))
-    state = ours.reset(key)
+    state = jax.jit(ours.reset)(key)
     np.testing.assert_array_equal(observation, state.obs)
     step = jax.jit(ours.step)
     for count in range(50):

@@ -12,28 +12,25 @@ import gasil_jax
 from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.networks import Policy
 
-CONFIG = gasil_jax.Config(
-    total_steps=256, num_envs=4, batch_steps=128, hidden_sizes=(16, 8), num_epochs=1
-)
+# With the other tests that use it, so that it is trained once.
+pytestmark = pytest.mark.xdist_group("trained_point_mass")
 
 
-@pytest.fixture(scope="module")
-def saved(tmp_path_factory):
-    env = gasil_jax.make_env("point_mass")
-    train = gasil_jax.make_train(env, CONFIG)
-    states, _ = jax.jit(jax.vmap(train))(jax.vmap(jax.random.key)(jnp.arange(3)))
+@pytest.fixture
+def saved(trained_point_mass, tmp_path_factory):
+    env, config, states = trained_point_mass
     folder = tmp_path_factory.mktemp("run")
     policy.save(folder / "policy.npz", states, env, [5, 6, 7], np.array([1, 3, np.nan]))
-    return env, states, folder
+    return env, config, states, folder
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7, None])
 def test_it_is_the_networks_gaussian(saved, seed):
-    env, states, folder = saved
+    env, config, states, folder = saved
     state = gasil_jax.member(states, 1 if seed is None else seed - 5)
     observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
     normalized = normalization.normalize(state.normalizer, observation)
-    network = Policy(CONFIG.hidden_sizes, env.action_size)
+    network = Policy(config.hidden_sizes, env.action_size)
     mean, log_std = network.apply(state.params["policy"], normalized)
 
     act = gasil_jax.load_policy(folder, seed)
@@ -51,7 +48,7 @@ def test_it_is_the_networks_gaussian(saved, seed):
 
 
 def test_draws_in_numpy_have_the_policys_spread(saved):
-    env, _, folder = saved
+    env, _, _, folder = saved
     weights = numpy_policy.read(folder, 5)
     weights["low"], weights["high"] = -100 * np.ones(2), 100 * np.ones(2)
     observation = np.zeros((20_000, env.observation_size), np.float32)
@@ -60,7 +57,7 @@ def test_draws_in_numpy_have_the_policys_spread(saved):
 
 
 def test_it_needs_no_jax(saved):
-    _, _, folder = saved
+    _, _, _, folder = saved
     code = (
         "import sys, numpy as np\n"
         "for name in ('jax', 'jaxlib', 'flax', 'optax', 'mujoco'):\n"
@@ -76,7 +73,7 @@ def test_it_needs_no_jax(saved):
 
 
 def test_bad_files_and_seeds_are_refused(saved, tmp_path):
-    _, _, folder = saved
+    _, _, _, folder = saved
     with pytest.raises(ValueError, match=r"seed is 9: .* has 5, 6, 7"):
         gasil_jax.load_policy(folder, 9)
     with pytest.raises(ValueError, match="is not a saved policy"):
