@@ -31,7 +31,10 @@ FIGURE = Figure(
     favourite=None,
     more="""**What it says.** With the dense reward the search chose an alpha with
 which the discriminator's reward has no weight ([figure 5](mujoco.md)): there the curves
-show how far ten seeds differ by chance, and that one "yes" in many is little.""",
+show how far ten seeds differ by chance, and that one "yes" in many is little. With the
+delayed reward the number of updates has the paper's shape, most in the middle and
+least at 20, but ten seeds are too few to say so; in the buffer's size there is no
+order.""",
     conclude=lambda shown: report.optimum(shown, _PANELS),
 )
 
