@@ -5,11 +5,12 @@ import pathlib
 import sys
 from collections.abc import Callable, Sequence
 
-from experiments import report, trials
+from experiments import processes, report, trials
 from experiments.report import Figure
 from experiments.trials import Trial
 from gasil_jax import command_line, shards
 from gasil_jax.command_line import InputError
+from gasil_jax.interruption import Interrupted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,7 +23,9 @@ class Options:
       seeds: of each trial; default the experiment's.
       total_steps: of each seed; default the experiment's.
       part: I/N: train only the I-th of N parts of each trial, to share it between
-        processes; once all are there, --report puts them together.
+        machines; once all are there, --report puts them together.
+      processes: so many runs at a time, on the CPU, each a process on cores of its own
+        that trains one seed of one point: best with physics mujoco on many cores.
       report: train nothing, write tables and figure of what is there.
       list: print the trials and whether they are complete, and do nothing else.
       physics: of locomotion: mjx or mujoco.
@@ -38,6 +41,7 @@ class Options:
     seeds: int | None = None
     total_steps: int | None = None
     part: str = "1/1"
+    processes: int | None = None
     report: bool = False
     list: bool = False
     physics: str = "mjx"
@@ -73,6 +77,12 @@ def main(
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    except ChildProcessError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except Interrupted as interrupted:
+        print(f"{interrupted}; go on with the same command", file=sys.stderr)
+        return 128 + interrupted.signal
 
 
 def _run(
@@ -97,6 +107,14 @@ def _run(
     for name, value in changes.items():
         if value < 1:
             raise InputError(f"{name} is {value}: it must be 1 or more")
+    if options.processes is not None:
+        if options.processes < 1:
+            raise InputError(f"processes is {options.processes}: it must be 1 or more")
+        if part.count > 1 or options.devices is not None:
+            raise InputError(
+                f"processes is {options.processes}: --part and --devices don't go "
+                "with it"
+            )
     wanted = [dataclasses.replace(trial, **changes) for trial in wanted]
     chosen = _choose(wanted, options.only)
     folder = results / figure.name
@@ -115,18 +133,30 @@ def _run(
         trials.check(trial, folder)
     for trial in chosen:
         trials.adopt(trial, folder)
-        known = trials.read(trial, folder)
-        if not options.report and not (known is not None and known.complete):
+    todo = [trial for trial in chosen if not _complete(trial, folder)]
+    if options.report:
+        for trial in chosen:
+            trials.collect(trial, runs, folder)
+    elif options.processes is not None:
+        for trial in processes.train(todo, runs, options.processes, flags):
+            trials.collect(trial, runs, folder)
+    else:
+        for trial in todo:
             print(f"{figure.name}: {trial.name}", flush=True)
             if status := trials.train(trial, runs, part.number, part.count, flags):
                 return status
-        # Parts may run side by side; their results are put together by one process.
-        if part.count == 1:
-            trials.collect(trial, runs, folder)
+            # Parts may run side by side; one process puts their results together.
+            if part.count == 1:
+                trials.collect(trial, runs, folder)
     if part.count == 1:
         write(figure, wanted, results)
         print(f"in {results / figure.name}.md")
     return 0
+
+
+def _complete(trial: Trial, folder: pathlib.Path) -> bool:
+    known = trials.read(trial, folder)
+    return known is not None and known.complete
 
 
 def _choose(wanted: Sequence[Trial], only: Sequence[str]) -> list[Trial]:

@@ -20,6 +20,7 @@ from experiments import (
     point_mass,
     point_mass_layouts,
     point_mass_moments,
+    processes,
     random_search,
     report,
     stochastic_walker2d,
@@ -140,6 +141,32 @@ def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
     assert random_search.best("hopper", "ppo", 1) is None
 
 
+def test_runs_side_by_side_are_those_of_one_process(tmp_path):
+    trial = trials.Trial(
+        name="panel/ppo",
+        env="point_mass",
+        agent="ppo",
+        seeds=2,
+        total_steps=512,
+        rows=2,
+    )
+    flags = (*TOY, "--num-envs", "4")
+    unknown = dataclasses.replace(trial, name="panel/unknown", agent="pppo", seeds=1)
+    ended = []
+    with pytest.raises(ChildProcessError, match=r"1 of 3 runs failed, see .*unknown"):
+        for done in processes.train([unknown, trial], tmp_path, 2, flags):
+            ended.append(done)
+            trials.collect(done, tmp_path, tmp_path / "aside")
+    assert ended == [trial, trial]
+    said = (tmp_path / "panel" / "unknown.1-of-1.log").read_text()
+    assert "agent 'pppo' is unknown" in said
+    assert trials.train(trial, tmp_path / "one", 1, 1, (*flags, "--devices", "1")) == 0
+    trials.collect(trial, tmp_path / "one", tmp_path / "alone")
+    aside, alone = (trials.read(trial, tmp_path / x) for x in ("aside", "alone"))
+    assert aside.complete
+    np.testing.assert_allclose(aside.returns, alone.returns, rtol=1e-3)
+
+
 def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     """What looks best with few seeds is not taken if more seeds say otherwise."""
     monkeypatch.setattr(trials, "RESULTS", tmp_path)
@@ -217,6 +244,8 @@ def test_a_difference_over_several_tasks():
         (("--only", "hoper"), "only is 'hoper'"),
         (("--part", "3/2"), "part is '3/2'"),
         (("--seeds", "0"), "seeds is 0"),
+        (("--processes", "0"), "processes is 0"),
+        (("--processes", "2", "--part", "1/2"), "processes is 2"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):

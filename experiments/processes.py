@@ -1,0 +1,129 @@
+"""Trials on many processor cores: a process on cores of its own for each run.
+
+A program that trains all seeds of a trial has one step of all of them wait for the
+slowest core, and trials one after another leave most cores of a large machine idle.
+"""
+
+import multiprocessing
+import os
+import pathlib
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from multiprocessing import connection
+from typing import Any, NamedTuple
+
+import jax
+
+from experiments import trials
+from experiments.trials import Trial
+from gasil_jax.command_line import InputError
+from gasil_jax.interruption import Interrupted, Interruption
+
+_SECONDS_BETWEEN_LOOKS = 1.0
+# A new interpreter: what a fork shares with its parent JAX does not survive.
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+class _Run(NamedTuple):
+    """One seed of one point."""
+
+    trial: Trial
+    part: int
+    parts: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.trial.name} {self.part}/{self.parts}"
+
+    def log(self, runs: pathlib.Path) -> pathlib.Path:
+        """Where it goes what the process prints."""
+        return runs / f"{self.trial.name}.{self.part}-of-{self.parts}.log"
+
+
+def train(
+    todo: Sequence[Trial], runs: pathlib.Path, processes: int, flags: Sequence[str] = ()
+) -> Iterator[Trial]:
+    """Train trials on the CPU, so many runs at a time; runs that have ended stay so.
+
+    Args:
+      todo: in this order.
+      runs: folder of the experiment's runs; what a process prints goes there too, to
+        PANEL/CURVE.K-of-N.log.
+      processes: how many at once.
+      flags: more of them, for the sweep's command line.
+
+    Yields:
+      The trial of each run, when it has ended well.
+
+    Raises:
+      ChildProcessError: runs have failed; the others are done.
+      Interrupted: by a signal, which the running ones were sent too: they have saved.
+    """
+    waiting = [
+        _Run(trial, part, len(trial.points) * trial.seeds)
+        for trial in todo
+        for part in range(1, len(trial.points) * trial.seeds + 1)
+    ]
+    total, ended, failed = len(waiting), 0, []
+    free = list(range(processes))
+    running: dict[int, tuple[_Run, int, Any, float]] = {}
+    with Interruption() as interruption:
+        try:
+            while waiting or running:
+                if interruption.signal is not None:
+                    raise Interrupted(interruption.signal)
+                while free and waiting:
+                    run, slot = waiting.pop(0), free.pop(0)
+                    arguments = (run, runs, (slot, processes), tuple(flags))
+                    child = _CONTEXT.Process(target=_work, args=arguments)
+                    child.start()
+                    running[child.sentinel] = (run, slot, child, time.monotonic())
+                for sentinel in connection.wait(list(running), _SECONDS_BETWEEN_LOOKS):
+                    run, slot, child, began = running.pop(sentinel)
+                    child.join()
+                    free.append(slot)
+                    if child.exitcode != 0:
+                        failed.append(run)
+                        continue
+                    ended += 1
+                    seconds = time.monotonic() - began
+                    print(f"{run.name}: {seconds:.0f} s ({ended} of {total})")
+                    yield run.trial
+        finally:
+            for _, _, child, _ in running.values():
+                child.terminate()
+            for _, _, child, _ in running.values():
+                child.join()
+    if failed:
+        logs = ", ".join(str(run.log(runs)) for run in failed)
+        raise ChildProcessError(
+            f"{len(failed)} of {total} runs failed, see {logs}; the others are done, "
+            "and the same command goes on"
+        )
+
+
+def _work(
+    run: _Run, runs: pathlib.Path, slot: tuple[int, int], flags: Sequence[str]
+) -> None:
+    """What a process does; exits with the status of training."""
+    # In a session of its own Ctrl-C reaches it once, from the parent.
+    os.setsid()
+    if hasattr(os, "sched_setaffinity"):
+        number, processes = slot
+        cores = sorted(os.sched_getaffinity(0))
+        # Where there are fewer cores than processes, some share one.
+        own = cores[number::processes] or [cores[number % len(cores)]]
+        os.sched_setaffinity(0, own)
+    log = run.log(runs)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
+    jax.config.update("jax_platforms", "cpu")
+    try:
+        flags = (*flags, "--devices", "1")
+        sys.exit(trials.train(run.trial, runs, run.part, run.parts, flags))
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
