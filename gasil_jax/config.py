@@ -29,7 +29,8 @@ class Hyperparameters(struct.PyTreeNode):
       gae_lambda: the lambda of generalized advantage estimation.
       clip_epsilon: PPO's clip range of the probability ratio.
       entropy_coefficient: the paper's lambda, weight of the policy's entropy.
-      value_coefficient: weight of the squared error of the value.
+      value_coefficient: weight of the squared error of the value. The value has a
+        network, gradient clip and Adam of its own, so it hardly matters.
       max_grad_norm: gradients are scaled down to this global norm, the policy's
         and the value's each for itself.
       alpha: scale of the discriminator's reward (paper, section 4.3).

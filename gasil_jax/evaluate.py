@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from gasil_envs.precision import full_precision
 from gasil_jax import (
     batch,
     command_line,
@@ -26,6 +27,7 @@ from gasil_jax.networks import Policy
 from gasil_jax.progress import announced
 
 
+@full_precision
 def evaluate(
     env: Any,
     config: Config,
@@ -66,9 +68,12 @@ def evaluate(
         states, running, return_, length = carry
         states = jax.vmap(env.step)(states, act(states.obs, key))
         reward = states.info.get("true_reward", states.reward)
-        return_ = return_ + jnp.where(running, reward, 0.0)
+        sound = normalization.is_sound(states.obs).all(axis=-1)
+        sound &= normalization.is_sound(reward)
+        # As in training a step of failed physics ends the episode with reward 0.
+        return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running
-        running = running & ~(states.done > 0) & jnp.isfinite(reward)
+        running = running & ~(states.done > 0) & sound
         return (states, running, return_, length), None
 
     start = (

@@ -5,6 +5,14 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+# Of C MuJoCo (mjMAXVAL): what is larger it takes for a simulation that has failed.
+_LARGEST = 1e10
+
+
+def is_sound(x: jax.Array) -> jax.Array:
+    """Whether numbers are finite and of a size that physics gives, bool, x's shape."""
+    return jnp.abs(x) < _LARGEST  # NaN is not.
+
 
 class Normalizer(struct.PyTreeNode):
     """Mean and variance of all observations so far.
@@ -27,13 +35,13 @@ def init(observation_size: int) -> Normalizer:
 
 
 def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
-    """Take in a batch (..., obs); rows that are not finite are left out.
+    """Take in a batch (..., obs); rows with a number that is not sound are left out.
 
     Chan, Golub, LeVeque 1979: parallel update of mean and sum of squares.
     """
     chex.assert_equal(observation.shape[-1:], normalizer.mean.shape)
     rows = observation.reshape(-1, observation.shape[-1])
-    valid = jnp.all(jnp.isfinite(rows), axis=-1, keepdims=True)
+    valid = jnp.all(is_sound(rows), axis=-1, keepdims=True)
     rows = jnp.where(valid, rows, 0.0)
     count = jnp.sum(valid, dtype=jnp.float32)
     mean = jnp.sum(rows, axis=0) / jnp.maximum(count, 1.0)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_jax import normalization
 from gasil_jax.networks import gaussian_log_prob
 
 
@@ -23,9 +24,9 @@ class Rollout(struct.PyTreeNode):
       truncated: bool (time, env), it was cut off and its value is bootstrapped.
       episode_return: float32 (time, env), sum of the true rewards up to here.
       discounted_return: float32 (time, env), sum of gamma^t reward up to here;
-        NaN from the first number on that was not finite.
+        NaN from the first faulty step on.
       episode_length: int32 (time, env), steps up to here.
-      faulty: bool (time, env), the step gave a number that is not finite.
+      faulty: bool (time, env), the step gave a number that physics does not give.
     """
 
     observation: jax.Array
@@ -109,8 +110,10 @@ def collect(
       max_episode_steps: longer episodes are truncated.
       gamma: discount of the episodes' return.
 
-    Physics that diverges (an observation or reward that is not finite) terminates
-    the episode with reward 0 and is reported in ``faulty``.
+    Physics that diverges (an observation or reward that `normalization.is_sound`
+    refuses) terminates the episode with reward 0 and is reported in ``faulty``. An
+    episode that is truncated here gets the reward that the environment still holds
+    back, ``info["held_reward"]``.
     """
     num_envs = environments.episode_length.shape[0]
     low, high = getattr(env, "action_range", (-1.0, 1.0))
@@ -128,22 +131,26 @@ def collect(
         reset_keys = jax.random.split(reset_key, num_envs)
         stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
 
-        finite = jax.vmap(is_finite)((stepped.obs, stepped.reward))
+        sound = normalization.is_sound(stepped.obs).all(axis=-1)
+        sound &= normalization.is_sound(stepped.reward)
         length = carry.episode_length + 1
-        reward = jnp.where(finite, stepped.reward, 0.0)
         true_reward = jnp.where(
-            finite, stepped.info.get("true_reward", stepped.reward), 0.0
+            sound, stepped.info.get("true_reward", stepped.reward), 0.0
         )
-        cut_off = stepped.info.get("truncation", jnp.zeros(num_envs)) > 0
+        nothing = jnp.zeros(num_envs)
+        cut_off = stepped.info.get("truncation", nothing) > 0
         done = stepped.done > 0
-        terminated = (done & ~cut_off) | ~finite
+        terminated = (done & ~cut_off) | ~sound
         truncated = ~terminated & (cut_off | (length >= max_episode_steps))
         ended = terminated | truncated
+        held = stepped.info.get("held_reward", nothing)
+        reward = stepped.reward + jnp.where(truncated, held, 0.0)
+        reward = jnp.where(sound, reward, 0.0)
 
-        next_observation = jnp.where(finite[:, None], stepped.obs, 0.0)
+        next_observation = jnp.where(sound[:, None], stepped.obs, 0.0)
         episode_return = carry.episode_return + true_reward
         discounted_return = carry.discounted_return + carry.discount * jnp.where(
-            finite, reward, jnp.nan
+            sound, reward, jnp.nan
         )
         transition = Rollout(
             observation=observation,
@@ -156,7 +163,7 @@ def collect(
             episode_return=episode_return,
             discounted_return=discounted_return,
             episode_length=length,
-            faulty=~finite,
+            faulty=~sound,
         )
         select = lambda a, b: jnp.where(
             ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b

@@ -25,7 +25,8 @@ def at(
     config: Config, hyperparameters: Hyperparameters, iteration: jax.Array
 ) -> Hyperparameters:
     """What an iteration trains with: the learning rate annealed, schedules applied."""
-    env_steps = (iteration * config.batch_steps).astype(jnp.float32)
+    # In float32: as int32 it ends at 2^31 steps.
+    env_steps = iteration.astype(jnp.float32) * config.batch_steps
     left = 1.0 - hyperparameters.learning_rate_decay * (
         iteration / config.num_iterations
     )

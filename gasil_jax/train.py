@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_envs.precision import full_precision
 from gasil_jax import good_trajectories, normalization, ppo, rollout, schedules
 from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.imitation import AGENTS
@@ -57,6 +58,7 @@ def _networks(env: Any, config: Config) -> tuple[Any, Any]:
     return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
 
 
+@full_precision
 def init(
     env: Any,
     config: Config,
@@ -102,13 +104,14 @@ def init(
     )
 
 
+@full_precision
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """One iteration of Algorithm 1: a batch of experience and the updates from it.
 
     Returns the next state and a dict of float32 scalars. Means over the episodes
     that ended in the batch are NaN if none did.
     """
-    agent = AGENTS[config.agent]
+    imitate = AGENTS[config.agent]
     hp = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
@@ -128,7 +131,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Update the good trajectory buffer.
     history = good_trajectories.record(
-        state.history, batch.observation, batch.action, batch.reward, batch.ended
+        state.history,
+        batch.observation,
+        batch.action,
+        # No return of an episode with a faulty step is one.
+        jnp.where(batch.faulty, jnp.nan, batch.reward),
+        batch.ended,
     )
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length
@@ -137,7 +145,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         state.good_trajectories, history, episodes, hp.max_buffer_steps
     )
 
-    # Update the discriminator, and shape the reward with it.
+    # Sample good trajectories, update the discriminator by equation 8, and shape the
+    # reward with it (section 4.3): what the agent imitates with does so.
     context = Context(
         rollout=batch,
         history=history,
@@ -148,7 +157,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         policy=policy,
         value=value,
     )
-    imitation, reward, imitation_metrics = agent.update_and_reward(
+    imitation, reward, imitation_metrics = imitate.update_and_reward(
         state.imitation, context, imitate_key
     )
     # Update the policy.
@@ -165,6 +174,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         gae_lambda=hp.gae_lambda,
     )
     return_ = advantage + values
+    normalized_advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     params, optimizer_state, ppo_metrics = ppo.update(
         state.params,
@@ -173,7 +183,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
             observation=flat(observation),
             action=flat(batch.action),
             log_prob=flat(batch.log_prob),
-            advantage=flat((advantage - advantage.mean()) / (advantage.std() + 1e-8)),
+            advantage=flat(normalized_advantage),
             return_=flat(return_),
         ),
         ppo_key,
@@ -183,7 +193,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         config=config,
         hyperparameters=hp,
     )
-    imitation, params, optimizer_state, policy_metrics = agent.update_policy(
+    imitation, params, optimizer_state, policy_metrics = imitate.update_policy(
         imitation, params, optimizer_state, hp.learning_rate, context, policy_key
     )
 
@@ -212,7 +222,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         jnp.sum(jnp.where(batch.ended, x, 0)) / jnp.sum(batch.ended)
     )
     metrics = {
-        "env_steps": (state.iteration * config.batch_steps).astype(jnp.float32),
+        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
         "episode_return": mean_of_ended(batch.episode_return),
         "episode_length": mean_of_ended(batch.episode_length),
         "episodes": jnp.sum(batch.ended),

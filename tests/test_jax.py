@@ -78,6 +78,33 @@ def test_a_compiled_iteration_equals_an_eager_one():
     assert_close(compiled, eager)
 
 
+def products(jaxpr):
+    """The precision of every matrix product, in inner functions too."""
+    for equation in jaxpr.eqns:
+        if equation.primitive.name == "dot_general":
+            yield equation.params["precision"]
+        # Of a scan, a jit, and so on, closed over constants or not.
+        for inner in jax.tree.leaves(equation.params):
+            inner = getattr(inner, "jaxpr", inner)
+            if hasattr(inner, "eqns"):
+                yield from products(inner)
+
+
+def test_matrices_are_multiplied_in_full_precision():
+    """A GPU takes TF32 unless it is told otherwise."""
+    highest = jax.lax.Precision.HIGHEST
+    env = gasil_jax.make_env("point_mass")
+    state = jax.eval_shape(lambda: gasil_jax.init(env, CONFIG, jax.random.key(0)))
+    jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
+    found = list(products(jaxpr.jaxpr))
+    assert len(found) > 10
+    assert set(found) == {(highest, highest)}
+    # What the program asks for itself it gets.
+    with jax.default_matmul_precision("default"):
+        jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
+    assert (highest, highest) not in set(products(jaxpr.jaxpr))
+
+
 def test_a_compiled_insertion_equals_an_eager_one():
     key = jax.random.key(0)
     history = good_trajectories.init_history(3, 8, 8, 2, 1)

@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from gasil_jax import normalization
 
@@ -20,8 +21,9 @@ def test_batches_give_the_statistics_of_all_rows():
     np.testing.assert_allclose(normalized, expected, atol=1e-3)
 
 
-def test_rows_that_are_not_finite_are_left_out():
-    rows = jnp.array([[1.0, 2.0], [jnp.nan, 0.0], [0.0, jnp.inf], [3.0, 6.0]])
+@pytest.mark.parametrize("number", [np.nan, np.inf, -1e20, 1e11])
+def test_rows_that_are_not_sound_are_left_out(number):
+    rows = jnp.array([[1.0, 2.0], [number, 0.0], [0.0, number], [3.0, 6.0]])
     normalizer = normalization.update(normalization.init(2), rows)
     assert float(normalizer.count) == 2
     np.testing.assert_allclose(normalizer.mean, [2.0, 4.0])

@@ -21,6 +21,12 @@ def test_the_papers_rule_for_humanoid(steps, expected):
     np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
+def test_steps_beyond_a_32_bit_integer():
+    config = gasil_jax.Config(batch_steps=2**21, alpha_schedule=HUMANOID)
+    at = schedules.at(config, config.hyperparameters, jnp.int32(1024))
+    np.testing.assert_allclose(at.alpha, config.hyperparameters.alpha)
+
+
 def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
     config = gasil_jax.Config(total_steps=4 * 2048)
     hp = config.hyperparameters

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
+from gasil_jax import rollout
 
 SMALL = gasil_jax.Config(
     total_steps=512,
@@ -95,6 +96,25 @@ def test_it_learns_on_the_point_mass(agent):
     assert np.all(returns[:, -3:].mean(1) > 18.0)
 
 
+@pytest.mark.parametrize("limit", [50, 30, 1])
+def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
+    env = gasil_jax.make_env("point_mass", reward_delay=20)
+    collect = lambda key: rollout.collect(
+        env,
+        lambda observation: (jnp.zeros((4, 2)), jnp.zeros(2)),
+        rollout.init(env, key, 4),
+        key,
+        num_steps=limit,
+        max_episode_steps=limit,
+        gamma=1.0,
+    )[1]
+    batch = jax.jit(collect)(jax.random.key(0))
+    assert batch.truncated[-1].all() and not batch.ended[:-1].any()
+    earned = batch.episode_return[-1]
+    np.testing.assert_allclose(batch.discounted_return[-1], earned, rtol=1e-5)
+    np.testing.assert_allclose(batch.reward.sum(axis=0), earned, rtol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -102,6 +122,7 @@ def test_it_learns_on_the_point_mass(agent):
         ({"num_envs": 0}, "num_envs is 0"),
         ({"minibatch_size": 60}, "nearest that does is"),
         ({"num_envs": 3}, "num_envs is 3"),
+        ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' imitates none"),
         ({"hyperparameters": gasil_jax.Hyperparameters(alpha=-1.0)}, "alpha is -1.0"),
         ({"hyperparameters": gasil_jax.Hyperparameters(gamma=1.5)}, "gamma is 1.5"),
     ],

@@ -46,7 +46,7 @@ def loss(
     good_logit: jax.Array,
     entropy_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, Metrics]:
-    """What the discriminator descends: minus the paper's objective (equation 7).
+    """What the discriminator descends: minus the paper's objective (equation 10).
 
     Args:
       policy_logit: (minibatch,), logits of D on the policy's pairs.

@@ -38,6 +38,21 @@ class Context(struct.PyTreeNode):
     value: Callable[..., jax.Array] = struct.field(pytree_node=False)
 
 
+def check_without_expert(
+    config: Config, observation_size: int, action_size: int
+) -> None:
+    """Refuse an expert, which the agent would not look at: a `check`.
+
+    Raises:
+      ValueError: the configuration names one.
+    """
+    if config.expert is not None:
+        raise ValueError(
+            f"expert is {config.expert!r}: agent {config.agent!r} imitates none, "
+            "agent 'gail' does"
+        )
+
+
 class Imitation(NamedTuple):
     """Pure functions; their state is a pytree that the loop carries.
 
@@ -49,7 +64,8 @@ class Imitation(NamedTuple):
         -> state, params, optimizer state, metrics. Gradient steps of its own on
         the policy and value after PPO's.
       check: (config, observation size, action size), raises `ValueError` for what
-        the agent can't run with, before anything compiles.
+        the agent can't run with, before anything compiles; default
+        `check_without_expert`.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -60,7 +76,7 @@ class Imitation(NamedTuple):
         [Any, Any, Any, jax.Array | float, Context, jax.Array],
         tuple[Any, Any, Any, Metrics],
     ]
-    check: Callable[[Config, int, int], None] = lambda config, observation, action: None
+    check: Callable[[Config, int, int], None] = check_without_expert
 
 
 def leave_policy(

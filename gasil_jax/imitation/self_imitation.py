@@ -14,7 +14,7 @@ The first term's advantage is in that unit too; the second's in the return's own
 is that of PPO's value loss here.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import chex
 import jax
@@ -35,6 +35,14 @@ _LEAST_SCALE = 1e-8
 _LEAST_SAMPLES = 64
 
 
+class Steps(NamedTuple):
+    """Rows of a `Replay`, (samples, ...) each."""
+
+    observation: jax.Array
+    action: jax.Array
+    return_: jax.Array
+
+
 class Replay(struct.PyTreeNode):
     """The last `capacity` steps of ended episodes, a ring.
 
@@ -51,6 +59,10 @@ class Replay(struct.PyTreeNode):
     return_: jax.Array
     priority: jax.Array
     cursor: jax.Array
+
+    def at(self, place: jax.Array) -> Steps:
+        """The steps at these places, int32 (samples,)."""
+        return Steps(self.observation[place], self.action[place], self.return_[place])
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
@@ -99,8 +111,9 @@ def returns_to_go(
 
 
 def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Replay:
-    """Add the steps of the episodes that ended in the last batch, oldest first.
+    """Add the steps of the episodes that ended in the last batch.
 
+    One environment's after the other's, each oldest first.
     They get the highest priority there is, so that each is drawn soon.
     """
     return_, wanted = returns_to_go(history, num_steps, gamma)
@@ -208,7 +221,7 @@ def _update_policy(
     normalize = lambda x: normalization.normalize(context.normalizer, x)
     scale = return_scale(replay)
 
-    def objective(params: Any, rows: Replay, weight: jax.Array) -> Any:
+    def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
         observation = normalize(rows.observation)
         log_prob = gaussian_log_prob(
             *context.policy(params["policy"], observation), rows.action
@@ -229,7 +242,7 @@ def _update_policy(
         place, weight = sample(
             key, replay.replace(priority=priority), config.sil_minibatch_size
         )
-        rows = jax.tree.map(lambda x: x[place], replay.replace(cursor=replay.priority))
+        rows = replay.at(place)
         gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
             params, rows, weight
         )

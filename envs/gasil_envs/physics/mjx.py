@@ -11,6 +11,7 @@ from mujoco import mjx
 
 from gasil_envs.physics import dynamics
 from gasil_envs.physics.interface import Fields, PhysicsState
+from gasil_envs.precision import full_precision
 
 _LOGGER = logging.getLogger(__name__)
 
@@ -79,12 +80,14 @@ class MjxPhysics:
     def _pick(self, data: mjx.Data) -> Fields:
         return {name: _FIELDS[name](data) for name in self._fields}
 
+    @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
         """The fields at `state`; forces are 0."""
         data = mjx.kinematics(self._mjx_model, self._data(state))
         data = mjx.com_pos(self._mjx_model, data)
         return self._pick(mjx.com_vel(self._mjx_model, data))
 
+    @full_precision
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
