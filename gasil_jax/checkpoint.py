@@ -8,7 +8,8 @@ folder of checkpoints, each a folder named by its iteration:
 
 A checkpoint is written under another name and renamed when it is whole and on the
 disk, so a process that is killed at any moment leaves the ones before it as they were.
-One that was damaged later is told by its hashes.
+One that was damaged later is told by its hashes, and set aside as 00000490.damaged when
+training goes on from the one before.
 """
 
 import contextlib
@@ -26,6 +27,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 _STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
+_DAMAGED = ".damaged"
 
 
 def _is_key(leaf: Any) -> bool:
@@ -216,6 +218,21 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
             if score is not None:
                 found[folder] = score
     return found
+
+
+def set_aside(root: pathlib.Path, newer_than: int) -> None:
+    """Rename checkpoints after an iteration, so that they no longer count as one.
+
+    What is newer than the newest whole one is damaged: training that goes on from that
+    writes them again, and `prune` would keep them for the newest.
+    """
+    for folder in _folders(root):
+        if int(folder.name) > newer_than:
+            other, number = folder.with_name(f"{folder.name}{_DAMAGED}"), 1
+            while other.exists():
+                number += 1
+                other = folder.with_name(f"{folder.name}{_DAMAGED}.{number}")
+            folder.rename(other)
 
 
 def prune(root: pathlib.Path, keep: int) -> None:

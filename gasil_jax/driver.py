@@ -28,7 +28,7 @@ _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
 @dataclasses.dataclass(frozen=True)
-class Schedule:
+class CheckpointSchedule:
     """When checkpoints are written and how many are kept.
 
     Attributes:
@@ -62,7 +62,7 @@ def drive(
     folder: pathlib.Path,
     labels: Mapping[str, Sequence[Any]],
     *,
-    schedule: Schedule,
+    schedule: CheckpointSchedule,
     progress: Progress,
     interruption: Interruption,
     steps_before: int = 0,
@@ -95,6 +95,7 @@ def drive(
     for damage in damages:
         instead = "starting anew" if found is None else f"using {found.folder.name}"
         print(f"warning: {damage}; {instead}", file=sys.stderr)
+    checkpoint.set_aside(root, newer_than=-1 if found is None else found.iteration)
     first, states, size = 0, None, None
     if found is not None:
         with progress.aside(f"restoring {found.folder.name}"):

@@ -217,6 +217,19 @@ def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(whole, tmp_path)
     assert f"{last} is damaged" in err
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
+    assert (out / "checkpoints" / f"{last}.damaged").is_dir()
+
+
+def test_a_damaged_checkpoint_does_not_count_as_the_newest(tmp_path):
+    root = tmp_path / "checkpoints"
+    for iteration in (1, 5):
+        checkpoint.write(root, iteration, {"x": np.zeros(1000)}, {"score": None})
+    flip_a_bit(root / "00000005")
+    assert checkpoint.latest(root)[0].iteration == 1
+    checkpoint.set_aside(root, newer_than=1)
+    checkpoint.write(root, 2, {"x": np.zeros(1000)}, {"score": None})
+    checkpoint.prune(root, 1)
+    assert checkpoint.latest(root) == (checkpoint.read(root / "00000002"), [])
 
 
 def test_the_best_and_the_newest_are_kept(tmp_path):
