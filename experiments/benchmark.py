@@ -175,9 +175,9 @@ def training_row(
     seeds: int,
     devices: Sequence[jax.Device],
 ) -> Row:
-    """PPO+GASIL with the tuned preset, `options.iterations` in a repeat."""
+    """PPO+GASIL with the paper's preset, `options.iterations` in a repeat."""
     env = gasil_envs.make(env_name, **VARIANTS[name])
-    config = presets.preset(env_name, "ppo+gasil", "tuned")
+    config = presets.preset(env_name, "ppo+gasil", "paper")
     if options.training_envs:
         config = config.replace(num_envs=options.training_envs)
     # As many iterations in a call as the command line does at most.
@@ -247,7 +247,7 @@ def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
 def training_table(options: argparse.Namespace) -> Iterator[list[Row]]:
     """A list of rows for each task."""
     for env_name in options.envs:
-        config = presets.preset(env_name, "ppo+gasil", "tuned")
+        config = presets.preset(env_name, "ppo+gasil", "paper")
         num_envs = options.seeds * (options.training_envs or config.num_envs)
         rows = []
         if importlib.util.find_spec("stable_baselines3"):

@@ -1,7 +1,5 @@
 """The four agents on the six tasks, each with what the search found best for it."""
 
-from typing import Any
-
 from experiments import random_search
 from experiments.trials import AGENTS, TASKS, Trial
 from gasil_jax import presets
@@ -23,17 +21,14 @@ def make(reward_delay: int) -> list[Trial]:
             points=(random_search.best(env, agent, reward_delay) or {},),
             reward_delay=reward_delay,
             total_steps=_STEPS.get(env, 1_000_000),
-            alpha_schedule=_alpha_schedule(env, agent, reward_delay),
+            # The paper's; where rewards are delayed alpha is fixed.
+            alpha_schedule=presets.preset(
+                env, agent, "paper", reward_delay
+            ).alpha_schedule,
         )
         for env in TASKS
         for agent in AGENTS
     ]
-
-
-def _alpha_schedule(env: str, agent: str, reward_delay: int) -> Any:
-    """The paper's of the dense tasks; where rewards are delayed alpha is fixed."""
-    paper = presets.preset(env, agent, "paper").alpha_schedule
-    return paper if reward_delay == 1 else ()
 
 
 def quick(wanted: list[Trial]) -> list[Trial]:

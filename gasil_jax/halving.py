@@ -128,7 +128,8 @@ class Study:
             return
         point = self._points[index]
         choices = {
-            name: tuple({other[name]: None for other in self._points}) for name in point
+            name: tuple({x[name]: None for x in self._points if name in x})
+            for name in point
         }
         categorical = self._optuna.distributions.CategoricalDistribution
         self._study.add_trial(
@@ -220,7 +221,10 @@ def _claimed(folder: pathlib.Path) -> Iterator[bool]:
 
 
 def _score(metrics: dict[str, np.ndarray]) -> float:
-    """Mean return of the last tenth, over seeds; NaN where one diverged."""
+    """`run.final_returns`, the mean over seeds.
+
+    NaN where one diverged or has not ended an episode.
+    """
     if (metrics["skipped_updates"] > 0).any():
         return math.nan
     return float(run.final_returns(metrics["episode_return"]).mean())
@@ -316,7 +320,7 @@ def _train(
             runs,
             place,
             {"seed": seeds},
-            schedule=driver.Schedule(
+            schedule=driver.CheckpointSchedule(
                 options.checkpoint_every, options.keep_checkpoints
             ),
             progress=progress,
@@ -347,7 +351,7 @@ def write(
     from gasil_jax import logging
 
     names = sorted({name for point in points for name in point})
-    results = []
+    results: list[dict[str, Any]] = []
     scores = study.scores()
     for index, point in enumerate(points):
         reached = max(scores[index])
@@ -359,7 +363,7 @@ def write(
         results.append(
             {
                 "point": index,
-                **{name: point[name] for name in names},
+                **{name: point.get(name) for name in names},
                 "env_steps": reached,
                 "mean_return": score if math.isfinite(score) else None,
                 "state": state,
@@ -397,7 +401,9 @@ def _main(arguments: Sequence[str] | None) -> None:
     _optuna()
     points, programs = sweep.plan(options)
     seeds = sweep.seeds_of(options)
-    env = sweep.prepare(options, _of_a_point(programs, seeds))
+    # What is there already when it goes on is not to be written again.
+    saved = programs if began is None else []
+    env = sweep.prepare(options, _of_a_point(programs, seeds), saved)
     folder = run_folder.create(out, out.name)
     with run_folder.wait_for_lock(folder):
         if not run_folder.is_described(folder):

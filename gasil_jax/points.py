@@ -37,7 +37,7 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     """From NAME=VALUE,VALUE,... to values by name.
 
     Raises:
-      InputError: no such name, or not a number.
+      InputError: no such name, or one twice, or not a number.
     """
     kinds = {**_HYPERPARAMETERS, **_CONFIG}
     values = {}
@@ -46,8 +46,11 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
         name = name.replace("-", "_")
         if name not in kinds:
             raise InputError(f"grid: {_unknown_name(name)}")
+        if name in values:
+            raise InputError(f"grid has {name} twice: all its values must be in one")
         try:
-            values[name] = tuple(kinds[name](value) for value in listed.split(","))
+            found = [kinds[name](value) for value in listed.split(",")]
+            values[name] = tuple(dict.fromkeys(found))
         except ValueError:
             kind = "numbers" if kinds[name] is float else "whole numbers"
             raise InputError(
@@ -87,9 +90,13 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
                 raise InputError(
                     f"points_file is {path}: {name} is {value!r}, not {kind}"
                 )
-    return [
+    read = [
         {name: kinds[name](value) for name, value in point.items()} for point in points
     ]
+    for index, point in enumerate(read):
+        if point in read[:index]:
+            raise InputError(f"points_file is {path}: it has {point} twice")
+    return read
 
 
 def _unknown_name(name: str) -> str:
@@ -133,6 +140,10 @@ def make_points(
         raise InputError(f"random is {random}: it must be 1 or more")
     values = values or PAPER_RANGES
     every = list(itertools.product(*values.values()))
-    count = min(random, len(every))
-    chosen = np.random.default_rng(seed).choice(len(every), count, replace=False)
+    if random > len(every):
+        raise InputError(
+            f"random is {random}: it must be at most {len(every)}, which is how many "
+            "points there are"
+        )
+    chosen = np.random.default_rng(seed).choice(len(every), random, replace=False)
     return [dict(zip(values, every[i], strict=True)) for i in chosen]

@@ -67,23 +67,16 @@ def available(devices: Sequence[jax.Device]) -> int | None:
     return min(free, default=None)
 
 
-def check(
-    env: Any,
-    config: Config,
-    num_members: int,
-    devices: Sequence[jax.Device],
-    folder: pathlib.Path,
-    num_checkpoints: int,
+def check_memory(
+    env: Any, config: Config, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
-    """Refuse what can't fit.
+    """Refuse what does not fit the devices.
 
     Args:
       env: one environment.
       config: of the runs.
       num_members: trained at once.
       devices: that they are sharded over.
-      folder: that checkpoints are written to; need not exist.
-      num_checkpoints: on the disk at once.
 
     Raises:
       ValueError: the numbers.
@@ -97,14 +90,37 @@ def check(
             f"num_envs {config.num_envs} and batch_steps {config.batch_steps}, and "
             f"{_in_words(free)} are free: at most {free // one.memory} fit"
         )
+
+
+def check_disk(
+    env: Any,
+    runs: Sequence[tuple[Config, int]],
+    folder: pathlib.Path,
+    num_checkpoints: int,
+) -> None:
+    """Refuse what does not fit the disk.
+
+    Args:
+      env: one environment.
+      runs: each configuration, and how many members have it.
+      folder: that checkpoints are written to; need not exist.
+      num_checkpoints: of each that are kept.
+
+    Raises:
+      ValueError: the numbers.
+    """
     while not folder.exists():
         folder = folder.parent
-    wanted, free = num_checkpoints * num_members * one.state, _free_disk(folder)
+    sizes = [need(env, config).state * num_members for config, num_members in runs]
+    # One more of those that train is being written.
+    wanted = num_checkpoints * sum(sizes) + max(sizes, default=0)
+    free = _free_disk(folder)
     if free is not None and wanted > free:
+        members = sum(num_members for _, num_members in runs)
         raise ValueError(
             f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
-            f"{num_checkpoints} checkpoints of {num_members} seeds need "
-            f"{_in_words(wanted)}"
+            f"{num_checkpoints} checkpoints of {members} seeds (over all points), and "
+            f"one that is being written, need {_in_words(wanted)}"
         )
 
 

@@ -24,7 +24,7 @@ import tyro
 from gasil_jax import command_line, environments, presets, run_folder, trackers
 from gasil_jax import train as training
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, unknown, validate
+from gasil_jax.config import Config, validate
 from gasil_jax.environments import Settings
 from gasil_jax.imitation import AGENTS
 from gasil_jax.interruption import Interrupted, Interruption
@@ -120,9 +120,12 @@ def parse(
             )
         return options
     given = command_line.parse(kind, arguments, program)
-    if given.preset not in presets.names():
-        raise InputError(unknown("preset", given.preset, presets.names()))
-    config = presets.preset(given.env, given.config.agent, given.preset)
+    try:
+        config = presets.preset(
+            given.env, given.config.agent, given.preset, given.settings.reward_delay
+        )
+    except ValueError as error:
+        raise InputError(str(error)) from None
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)
 
@@ -194,9 +197,18 @@ def check_out(options: Options) -> None:
 
 
 def check_resources(
-    options: Options, env: Any, config: Config, num_members: int
+    options: Options,
+    env: Any,
+    at_once: Sequence[tuple[Config, int]],
+    saved: Sequence[tuple[Config, int]],
 ) -> None:
     """Refuse what does not fit the devices or the disk.
+
+    Args:
+      options: say where to, and how many checkpoints are kept.
+      env: one environment.
+      at_once: a configuration and how many members train with it at once, for each.
+      saved: the same of all whose checkpoints are still to be written.
 
     Raises:
       InputError: the numbers.
@@ -206,15 +218,11 @@ def check_resources(
     with announced(options.env, "starting the devices"):
         devices = jax.devices()
     try:
-        resources.check(
-            env,
-            config,
-            num_members,
-            devices,
-            options.out or pathlib.Path("runs"),
-            # The best one, and one that is being written.
-            options.keep_checkpoints + 2,
-        )
+        for config, num_members in at_once:
+            resources.check_memory(env, config, num_members, devices)
+        folder = options.out or pathlib.Path("runs")
+        # The best one too.
+        resources.check_disk(env, saved, folder, options.keep_checkpoints + 1)
     except ValueError as error:
         raise InputError(str(error)) from None
 
@@ -252,7 +260,7 @@ def use_devices(options: Options, num_members: int) -> None:
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", count)
     _keep_compiled_programs()
-    # TF32 has ruined PPO runs on Ampere and later GPUs.
+    # Everywhere, not only where `full_precision` says so.
     jax.config.update("jax_default_matmul_precision", "highest")
 
 
@@ -325,7 +333,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
             runs,
             folder,
             {"seed": seeds},
-            schedule=driver.Schedule(
+            schedule=driver.CheckpointSchedule(
                 options.checkpoint_every, options.keep_checkpoints
             ),
             progress=progress,
@@ -389,12 +397,17 @@ def _write_results(
 def final_returns(returns: np.ndarray) -> np.ndarray:
     """Each seed's mean return over the last tenth of iterations, (seeds,).
 
-    NaN where no episode ended in that time.
+    Where no episode ended in that time, of the last iteration in which one did, for in
+    some tasks all last as long; NaN where none has.
     """
     last = returns[:, -max(1, returns.shape[1] // 10) :]
     count = np.isfinite(last).sum(axis=1)
-    total = np.nansum(last, axis=1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    mean = np.nansum(last, axis=1) / np.maximum(count, 1)
+    ended = np.isfinite(returns)
+    place = returns.shape[1] - 1 - ended[:, ::-1].argmax(axis=1)
+    newest = np.take_along_axis(returns, place[:, None], axis=1)[:, 0]
+    newest = np.where(ended.any(axis=1), newest, np.nan)
+    return np.where(count > 0, mean, newest)
 
 
 def exit_status(work: Callable[[], None]) -> int:
@@ -426,7 +439,8 @@ def _main(arguments: Sequence[str] | None) -> None:
     check_out(options)
     use_devices(options, options.seeds)
     env = make_env(options)
-    check_resources(options, env, options.config, options.seeds)
+    members = [(options.config, options.seeds)]
+    check_resources(options, env, members, members)
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, folder)
     mean = summary["final_return_mean"]

@@ -172,7 +172,7 @@ def _as_tuples(value: Any) -> Any:
 
 #: What may differ between a run and its continuation.
 _FREE = (
-    *("out", "resume", "checkpoint_every", "keep_checkpoints", "devices", "preset"),
+    *("out", "resume", "checkpoint_every", "keep_checkpoints", "devices"),
     # What a file lists is compared itself.
     *("log", "points_file"),
 )

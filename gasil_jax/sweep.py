@@ -90,7 +90,9 @@ def train(
         * program.config.batch_steps
         * len(program.members)
     )
-    schedule = driver.Schedule(options.checkpoint_every, options.keep_checkpoints)
+    schedule = driver.CheckpointSchedule(
+        options.checkpoint_every, options.keep_checkpoints
+    )
     steps_before = 0
     title = f"{options.env} {options.config.agent} sweep"
     with (
@@ -181,13 +183,32 @@ def seeds_of(options: PointOptions) -> range:
     return range(options.first_seed, options.first_seed + options.seeds)
 
 
-def prepare(options: PointOptions, programs: Sequence[Program]) -> Any:
-    """What must be done before anything compiles; returns the environment."""
+def prepare(
+    options: PointOptions, programs: Sequence[Program], saved: Sequence[Program]
+) -> Any:
+    """What must be done before anything compiles; returns the environment.
+
+    Args:
+      options: of the sweep.
+      programs: with the members that are trained at once.
+      saved: those whose checkpoints are still to be written.
+
+    Raises:
+      InputError: they don't fit the devices or the disk.
+    """
     run.use_devices(options, sum(len(program.members) for program in programs))
     env = run.make_env(options)
-    for program in programs:
-        run.check_resources(options, env, program.config, len(program.members))
+    members = lambda programs: [(x.config, len(x.members)) for x in programs]
+    run.check_resources(options, env, members(programs), members(saved))
     return env
+
+
+def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
+    """The programs that are not trained to their end in the folder that is named."""
+    if options.out is None:
+        return list(programs)
+    left = sweep_tables.Trained(options.out, programs).unfinished()
+    return [program for program in programs if program.number in left]
 
 
 def check_points(points: Sequence[Point], began: pathlib.Path | None) -> None:
@@ -214,7 +235,7 @@ def _train_whole(options: Options, began: pathlib.Path | None) -> None:
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
     run.check_out(options)
-    env = prepare(options, programs)
+    env = prepare(options, programs, _untrained(options, programs))
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
         trained = sweep_tables.Trained(folder, programs)
@@ -242,7 +263,7 @@ def _train_shard(
         print(f"shard {shard} is done, in {place}")
         return
     run.check_out(options)
-    env = prepare(options, programs)
+    env = prepare(options, programs, _untrained(options, programs))
     with run.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
     speed = sweep_tables.speed(trained.trainings())

@@ -125,6 +125,8 @@ def write(
 ) -> dict[str, Any]:
     """Write results.csv, curves.npz, summary.json and sweep.png; returns the summary.
 
+    A cell of results.csv is empty where the point leaves the sweep's own value.
+
     Args:
       folder: where to.
       points: all of them.
@@ -151,8 +153,8 @@ def write(
         for index, point in enumerate(points):
             for seed, value, bad in zip(seeds, final[index], diverged[index]):
                 cell = "" if math.isnan(value) else f"{value:.7g}"
-                row = [index, seed, *(point[name] for name in names), cell, int(bad)]
-                writer.writerow(row)
+                own = (point.get(name, "") for name in names)
+                writer.writerow([index, seed, *own, cell, int(bad)])
     np.savez_compressed(folder / "curves.npz", **curves)
     trainings = [training for part in parts for training in part.trainings()]
     fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))

@@ -63,8 +63,18 @@ def test_few_points_or_none_that_is_finite():
     assert [max(scores[i]) for i in range(2)] == [10, 10]
 
 
+def test_the_score_of_a_task_whose_episodes_end_together():
+    returns = np.full((2, 31), np.nan)
+    returns[:, [7, 15, 23]] = [[1.0, 2.0, 3.0], [2.0, 3.0, 5.0]]
+    metrics = {"episode_return": returns, "skipped_updates": np.zeros((2, 31))}
+    assert halving._score(metrics) == 4.0
+    returns[1] = np.nan
+    assert math.isnan(halving._score(metrics))
+
+
 def test_processes_share_a_study(tmp_path):
     points = [{"alpha": 0.1 * i, "buffer_steps": 10 + i % 2} for i in range(3)]
+    del points[1]["buffer_steps"]
     one, two = (halving.Study(tmp_path, points) for _ in range(2))
     for index, (study, score) in enumerate([(one, 5.0), (two, 3.0), (one, math.nan)]):
         study.begin(index)
@@ -79,6 +89,7 @@ def test_processes_share_a_study(tmp_path):
     rows = list(csv.DictReader((tmp_path / "results.csv").open()))
     assert [row["state"] for row in rows] == ["finished", "paused", "diverged"]
     assert [row["mean_return"] for row in rows] == ["7.0", "3.0", ""]
+    assert [row["buffer_steps"] for row in rows] == ["10", "", "10"]
     import optuna
 
     journal = optuna.storages.journal.JournalFileBackend(

@@ -1,9 +1,10 @@
-"""Presets: valid, used by default, and overridden by flags."""
+"""Presets: valid, what the search found, used by default, and overridden by flags."""
 
 import pytest
 
 import gasil_envs
 import gasil_jax
+from experiments import random_search, trials
 from gasil_jax import presets, run
 from gasil_jax.config import Config, validate
 
@@ -13,19 +14,33 @@ def parse(*arguments):
 
 
 @pytest.mark.parametrize("name", presets.names())
-def test_every_row_is_valid_and_of_something_that_exists(name):
-    for (env, agent), overrides in presets.PRESETS[name].items():
+@pytest.mark.parametrize("reward_delay", [1, 20])
+def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
+    rows = presets.PRESETS[name][reward_delay > 1]
+    for (env, agent), overrides in rows.items():
         assert env in gasil_envs.names() and agent in gasil_jax.agents()
-        config = gasil_jax.preset(env, agent, name)
+        config = gasil_jax.preset(env, agent, name, reward_delay)
         validate(config, gasil_jax.agents())
         assert overrides and config != Config(agent=agent)
+
+
+@pytest.mark.parametrize("reward_delay", [1, random_search.DELAY])
+@pytest.mark.parametrize("env", ["hopper", "walker2d", "halfcheetah", "swimmer"])
+@pytest.mark.parametrize("agent", trials.AGENTS)
+def test_the_tuned_rows_are_what_the_search_found(env, agent, reward_delay):
+    found = random_search.best(env, agent, reward_delay)
+    expected = Config(agent=agent, num_envs=trials.NUM_ENVS).updated(found)
+    assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
 
 
 def test_the_command_line_starts_from_the_preset():
     assert parse("point_mass", "--agent", "gasil") == gasil_jax.preset(
         "point_mass", "gasil"
     )
-    assert parse("walker2d", "--agent", "ppo") == Config(agent="ppo")
+    assert parse("humanoid", "--agent", "ppo") == Config(agent="ppo")
+    delayed = parse("walker2d", "--reward-delay", "20")
+    assert delayed == gasil_jax.preset("walker2d", "ppo+gasil", reward_delay=20)
+    assert delayed != parse("walker2d")
 
 
 def test_flags_override_the_preset():
@@ -40,6 +55,10 @@ def test_the_papers_rule_for_humanoid():
     assert config.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
 
 
-def test_an_unknown_preset_is_refused(capsys):
+def test_what_is_unknown_is_refused(capsys):
     assert run.main(["--env", "hopper", "--preset", "papre"]) == 2
     assert "did you mean 'paper'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="did you mean 'tuned'"):
+        gasil_jax.preset("hopper", "ppo", "tunde")
+    with pytest.raises(ValueError, match=r"did you mean 'ppo\+gasil'"):
+        gasil_jax.preset("hopper", "ppo+gasill")

@@ -39,8 +39,17 @@ def test_what_cannot_fit_is_refused_with_the_numbers(monkeypatch, tmp_path, caps
     monkeypatch.setattr(resources, "available", lambda devices: None)
     monkeypatch.setattr(resources, "_free_disk", lambda folder: 10_000)
     assert run.main(arguments) == 2
-    assert "4 checkpoints of 3 seeds need" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "3 checkpoints of 3 seeds (over all points), and one that is" in error
     assert not (tmp_path / "out").exists()
+
+    # Those of all points stay on the disk.
+    state = resources.need(gasil_jax.make_env("point_mass"), gasil_jax.Config()).state
+    monkeypatch.setattr(resources, "_free_disk", lambda folder: 9 * state)
+    env, members = gasil_jax.make_env("point_mass"), (gasil_jax.Config(), 2)
+    resources.check_disk(env, [members], tmp_path, 3)
+    with pytest.raises(ValueError, match="3 checkpoints of 4 seeds"):
+        resources.check_disk(env, [members, members], tmp_path, 3)
 
 
 def test_available_memory_is_read():

@@ -5,13 +5,14 @@ import json
 import signal
 import subprocess
 import sys
+import types
 
 import jax
 import numpy as np
 import pytest
 from test_resume import finish, wait_for
 
-from gasil_jax import command_line, merge, run, shards, sweep
+from gasil_jax import command_line, merge, run, shards, sweep, sweep_tables
 from gasil_jax.config import Config
 from gasil_jax.points import PAPER_RANGES
 
@@ -52,6 +53,31 @@ def test_random_points_are_distinct_and_of_the_papers_ranges():
         assert all(value in PAPER_RANGES[name] for name, value in point.items())
 
 
+def test_points_that_vary_in_different_things_have_a_table(tmp_path):
+    def metrics(value):
+        returns = np.array([np.nan, value, np.nan])
+        return {
+            "episode_return": returns,
+            "env_steps": np.arange(3.0),
+            "skipped_updates": np.zeros(3),
+        }
+
+    training = {"env_steps": 9, "compile_seconds": 1.0, "train_seconds": 1.0}
+    training |= {"device": "cpu", "device_count": 1, "versions": {}}
+    trained = types.SimpleNamespace(
+        members=lambda: {(0, 5): metrics(1.0), (1, 5): metrics(2.0)},
+        trainings=lambda: [training],
+    )
+    points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    summary = sweep_tables.write(tmp_path, points, [5], [trained])
+    assert summary["best_by_mean"] == 1
+    header, *rows = (tmp_path / "results.csv").read_text().splitlines()
+    assert header == (
+        "point,seed,alpha,buffer_steps,learning_rate,final_return,diverged"
+    )
+    assert rows == ["0,5,1.0,500,,1,0", "1,5,,,0.0001,2,0"]
+
+
 def test_points_from_a_file(tmp_path):
     path = tmp_path / "points.json"
     path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
@@ -63,6 +89,7 @@ def test_points_from_a_file(tmp_path):
         ("[3]", "3 is not a point"),
         ('[{"alhpa": 1}]', "did you mean 'alpha'"),
         ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5, not a whole number"),
+        ('[{"alpha": 1}, {"alpha": 1.0}]', "it has {'alpha': 1.0} twice"),
     ):
         path.write_text(text)
         with pytest.raises(command_line.InputError, match=message):
@@ -78,6 +105,8 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=0.1,-1", "alpha is -1.0"),
         ("--grid minibatch_size=64,60", "minibatch_size is 60"),
         ("--random 0", "random is 0"),
+        ("--random 3 --grid alpha=0.1,0.2,0.1", "random is 3: it must be at most 2"),
+        ("--grid alpha=0.02,0.1 alpha=0.2", "grid has alpha twice"),
         ("", "grid is empty"),
         ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
         ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
