@@ -134,6 +134,8 @@ def _run(
     for trial in chosen:
         trials.adopt(trial, folder)
     todo = [trial for trial in chosen if not _complete(trial, folder)]
+    if done := len(chosen) - len(todo):
+        print(f"{done} of {len(chosen)} trials are in {folder} already")
     if options.report:
         for trial in chosen:
             trials.collect(trial, runs, folder)

@@ -7,6 +7,7 @@ which the paper's code was built.
 import dataclasses
 import difflib
 import math
+import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -186,6 +187,7 @@ _HYPERPARAMETER_RANGES = {
 
 
 _SCHEDULES = ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule")
+_SIZES = ("hidden_sizes", "discriminator_hidden_sizes")
 _NOT_A_COUNT = ("agent", "expert", "hyperparameters", *_SCHEDULES)
 
 
@@ -203,8 +205,13 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
         value = getattr(config, field.name)
         if field.name in _NOT_A_COUNT or value is None:
             continue
-        for number in value if isinstance(value, tuple) else (value,):
-            if isinstance(number, bool) or not isinstance(number, int) or number < 1:
+        sizes = field.name in _SIZES
+        if sizes and not isinstance(value, tuple):
+            raise ValueError(f"{field.name} is {value!r}: it must be a tuple of sizes")
+        for number in value if sizes else (value,):
+            # A bool is one too, and NumPy's are not int.
+            is_whole = isinstance(number, numbers.Integral) and number is not True
+            if not is_whole or int(number) < 1:
                 raise ValueError(
                     f"{field.name} is {value}: it must be a whole number, 1 or more"
                 )
@@ -221,6 +228,8 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
         points = getattr(config, name)
         if callable(points):
             continue
+        if not all(isinstance(point, tuple) and len(point) == 2 for point in points):
+            raise ValueError(f"{name} is {points}: it must be (steps, factor) points")
         steps = [point[0] for point in points]
         factors = [point[1] for point in points]
         if steps != sorted(set(steps)) or any(
@@ -232,10 +241,13 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
             )
     for name, (low, high, closed) in _HYPERPARAMETER_RANGES.items():
         value = getattr(config.hyperparameters, name)
-        if not isinstance(value, int | float):
+        if isinstance(value, str):
+            raise ValueError(f"{name} is {value!r}: it must be a number")
+        if not isinstance(value, numbers.Real):
             continue
-        above = value >= low if closed else value > low
-        if not (above and value <= high and math.isfinite(value)):
+        number = float(value)
+        above = number >= low if closed else number > low
+        if not (above and number <= high and math.isfinite(number)):
             least = f"{low:g} or more" if closed else f"more than {low:g}"
             most = "finite" if math.isinf(high) else f"at most {high:g}"
             raise ValueError(f"{name} is {value}: it must be {least} and {most}")

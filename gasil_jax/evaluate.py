@@ -162,6 +162,7 @@ def load(
     from gasil_jax import checkpoint
 
     described = run_folder.read(folder)
+    run_folder.refuse_sweep(folder, described)
     root = folder / "checkpoints"
     found, damages = checkpoint.latest(root)
     for damage in damages:

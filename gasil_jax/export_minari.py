@@ -189,6 +189,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     described = run_folder.read(options.run)
+    run_folder.refuse_sweep(options.run, described)
     settings = dataclasses.asdict(described["settings"])
     description = _DESCRIPTION.format(
         run=options.run.resolve().name,

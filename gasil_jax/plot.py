@@ -59,6 +59,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
       InputError: it is not a run's folder, or no episode has ended in it.
     """
     described = run_folder.read(folder)
+    run_folder.refuse_sweep(folder, described)
     path = folder / "metrics.csv"
     try:
         metrics = logging.read_metrics(path, ("seed",), described["seeds"])

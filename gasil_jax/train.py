@@ -234,14 +234,23 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         - jnp.var(return_ - values) / (jnp.var(return_) + 1e-8),
         "learning_rate": hp.learning_rate,
         **ppo_metrics,
-        **imitation_metrics,
-        **policy_metrics,
     }
-    return state, jax.tree.map(lambda x: x.astype(jnp.float32), metrics)
+    for own in (imitation_metrics, policy_metrics):
+        if taken := metrics.keys() & own.keys():
+            raise ValueError(
+                f"metrics of agent {config.agent!r} have names that others have: "
+                f"{', '.join(sorted(taken))}"
+            )
+        metrics |= own
+    return state, {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
 
 
 def check(env: Any, config: Config) -> None:
     """Raise `ValueError` for what can't run, before anything compiles."""
+    if not hasattr(env, "reset"):
+        raise ValueError(
+            f"env is {env!r}: it must be an environment, as gasil_jax.make_env gives"
+        )
     validate(config, tuple(AGENTS))
     AGENTS[config.agent].check(config, env.observation_size, env.action_size)
 

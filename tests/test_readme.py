@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 
+import brax.envs
 import jax
 import numpy as np
 import pytest
@@ -233,20 +234,49 @@ def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
 
 
-def test_the_documented_agent_trains(monkeypatch):
+def test_the_documented_agent_and_task_train(monkeypatch):
+    from gasil_envs import registry
     from gasil_jax.imitation import AGENTS
 
     text = (README.parent / "docs" / "extending.md").read_text()
-    (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    agent, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    monkeypatch.setitem(AGENTS, "halved", None)  # and away again
     names = {}
-    exec(block, names)
-    monkeypatch.setitem(AGENTS, "halved", names["HALVED"])
+    exec(agent, names)
+    exec(task, names)
     config = gasil_jax.Config(
-        agent="halved", total_steps=128, batch_steps=128, num_envs=4, num_epochs=1
+        agent="halved", total_steps=256, batch_steps=128, num_envs=4, num_epochs=1
     )
-    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), config)
-    _, metrics = jax.jit(train)(jax.random.key(0))
+    _, metrics = jax.jit(gasil_jax.make_train(names["Line"](), config))(
+        jax.random.key(0)
+    )
     assert np.isfinite(metrics["policy_loss"]).all()
+    assert (metrics["halved_reward"] < 0).all()
+    # At most 20 steps of at most 0.1.
+    assert (metrics["episode_length"] <= 20).all()
+
+    class Known(names["Line"], brax.envs.Env):
+        backend = "none"
+
+    before = registry._constructors()
+    line = {"line": lambda settings: Known()}
+    monkeypatch.setattr(registry, "_constructors", lambda: before | line)
+    env = gasil_jax.make_env("line", reward_delay=7)
+    assert env.episode_length == 20
+
+
+def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
+    from gasil_jax.imitation import AGENTS, none
+
+    def reward(state, context, key):
+        return state, context.rollout.reward, {"episode_return": 0.5}
+
+    monkeypatch.setitem(AGENTS, "bad", none.PPO._replace(update_and_reward=reward))
+    train = gasil_jax.make_train(
+        gasil_jax.make_env("point_mass"), gasil_jax.Config(agent="bad")
+    )
+    with pytest.raises(ValueError, match=r"metrics of agent 'bad'.*episode_return"):
+        jax.eval_shape(train, jax.random.key(0))
 
 
 def test_the_documentation_builds(tmp_path):

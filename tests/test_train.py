@@ -120,14 +120,27 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
     [
         ({"agent": "ppo+gasill"}, r"'ppo\+gasil'"),
         ({"num_envs": 0}, "num_envs is 0"),
+        ({"num_envs": True}, "num_envs is True"),
+        ({"hidden_sizes": [64, 64]}, "hidden_sizes is .* must be a tuple"),
+        ({"alpha_schedule": (2e6, 0.0)}, "alpha_schedule is .*points"),
         ({"minibatch_size": 60}, "nearest that does is"),
         ({"num_envs": 3}, "num_envs is 3"),
         ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' imitates none"),
         ({"hyperparameters": gasil_jax.Hyperparameters(alpha=-1.0)}, "alpha is -1.0"),
         ({"hyperparameters": gasil_jax.Hyperparameters(gamma=1.5)}, "gamma is 1.5"),
+        (
+            {"hyperparameters": gasil_jax.Hyperparameters(alpha=np.float32(-1))},
+            "alpha is -1.0",
+        ),
+        ({"hyperparameters": gasil_jax.Hyperparameters(alpha="x")}, "alpha is 'x'"),
     ],
 )
 def test_a_bad_configuration_is_refused(change, message):
     env = gasil_jax.make_env("point_mass")
     with pytest.raises(ValueError, match=message):
         gasil_jax.make_train(env, SMALL.replace(**change))
+
+
+def test_a_name_is_not_an_environment():
+    with pytest.raises(ValueError, match=r"env is 'hopper': .*make_env"):
+        gasil_jax.make_train("hopper", SMALL)

@@ -91,8 +91,8 @@ def check(name: str, settings: Settings) -> None:
             f"physics is {settings.physics!r}"
         )
     delay, noise = settings.reward_delay, settings.obs_noise
-    if delay < 1:
-        raise ValueError(f"reward_delay is {delay}: it must be 1 or more")
+    if not isinstance(delay, int) or delay < 1:
+        raise ValueError(f"reward_delay is {delay}: it must be a whole number, from 1")
     if not 0.0 <= noise < math.inf:
         raise ValueError(f"obs_noise is {noise}: it must be finite and 0 or more")
 
