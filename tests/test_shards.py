@@ -106,7 +106,7 @@ def train(folder, shard=None, *arguments):
         writer.write(
             {
                 "env_steps": zero + steps,
-                "episode_return": np.where(value == 312.0, np.nan, value),
+                "episode_return": np.where(value % 100 == 12, np.nan, value),
                 "skipped_updates": np.where(value == 220.0, 1.0, 0.0),
             }
         )
