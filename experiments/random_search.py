@@ -221,6 +221,14 @@ def best(env: str, agent: str, reward_delay: int) -> Point | None:
     return _best(known, second)[0]
 
 
+def is_whole(env: str, agent: str, reward_delay: int) -> bool:
+    """Whether both stages of a search are complete, so that `best` is final."""
+    if _complete(search(env, agent, reward_delay)) is None:
+        return False
+    second = confirmation(env, agent, reward_delay)
+    return second is None or _complete(second) is not None
+
+
 def _final(known: trials.Results) -> np.ndarray:
     """Mean return over the last fifth of training, (points, seeds)."""
     return known.part(0.8, 1.0)

@@ -29,9 +29,6 @@ class _Found(NamedTuple):
     buffer_steps: int
 
 
-_NUM_ENVS = {"num_envs": 32}
-
-
 def _rows(found: Mapping[str, _Found]) -> Rows:
     rows: dict[tuple[str, str], Overrides] = {}
     for env, chosen in found.items():
@@ -42,7 +39,8 @@ def _rows(found: Mapping[str, _Found]) -> Rows:
             ("ppo+sil", ("sil_coefficient",)),
             ("ppo+gasil", _Found._fields[2:]),
         ):
-            rows[env, agent] = {name: value[name] for name in names} | _NUM_ENVS
+            num_envs = {"num_envs": 64 if env == "ant" else 32}
+            rows[env, agent] = {name: value[name] for name in names} | num_envs
     return rows
 
 
@@ -57,6 +55,7 @@ _DELAYED = {
     "walker2d": _Found(1.0, 1.0, 1.0, 10, 1e-5, 10_000),
     "halfcheetah": _Found(0.01, 0.1, 1.0, 10, 1e-5, 10_000),
     "swimmer": _Found(0.3, 0.3, 0.2, 20, 1e-5, 1_000),
+    "ant": _Found(0.01, 1.0, 0.1, 10, 1e-4, 10_000),
 }
 
 _STRONG_DISCRIMINATOR = {
