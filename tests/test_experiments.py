@@ -5,7 +5,12 @@ import csv
 import dataclasses
 import itertools
 import json
+import multiprocessing
+import os
 import pathlib
+import signal
+import threading
+import time
 
 import jax
 import numpy as np
@@ -27,6 +32,7 @@ from experiments import (
     summary,
     trials,
 )
+from gasil_jax.interruption import Interrupted
 
 TOY = (
     *("--batch-steps", "256", "--hidden-sizes", "8"),
@@ -165,6 +171,25 @@ def test_runs_side_by_side_are_those_of_one_process(tmp_path):
     aside, alone = (trials.read(trial, tmp_path / x) for x in ("aside", "alone"))
     assert aside.complete
     np.testing.assert_allclose(aside.returns, alone.returns, rtol=1e-3)
+
+
+def test_a_signal_ends_all_runs_and_they_have_saved(tmp_path):
+    trial = trials.Trial(
+        name="panel/ppo", env="point_mass", agent="ppo", seeds=3, total_steps=10**9
+    )
+    flags = (*TOY, "--num-envs", "4")
+    of_runs = lambda name: list(tmp_path.glob(f"panel/ppo/shards/*/programs/0/{name}"))
+
+    def interrupt():
+        while len(of_runs("metrics.csv")) < 2:
+            time.sleep(0.2)
+        os.kill(os.getpid(), signal.SIGTERM)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(Interrupted):
+        next(processes.train([trial], tmp_path, 2, flags))
+    assert not multiprocessing.active_children()
+    assert len(of_runs("checkpoints/0*/manifest.json")) == 2
 
 
 def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
