@@ -316,6 +316,19 @@ def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypa
             assert settings == json.loads(json.dumps(trial.settings()))
 
 
+def test_what_is_said_of_swimmer_is_in_the_csv_file():
+    groups = collections.defaultdict(list)
+    with (trials.RESULTS / "swimmer_self_imitation.csv").open() as file:
+        for row in csv.DictReader(file):
+            final = float(row.pop("final_return"))
+            del row["seed"]
+            groups[tuple(row.values())].append(final)
+    assert [len(finals) for finals in groups.values()] == [5] * 5
+    for finals in groups.values():
+        error = np.std(finals, ddof=1) / np.sqrt(5)
+        assert f"{np.mean(finals):.0f} ± {error:.0f}" in mujoco.FIGURE.more
+
+
 def test_the_summary_is_that_of_the_csv_files():
     path = trials.RESULTS / "README.md"
     assert path.read_text() == summary.page()
