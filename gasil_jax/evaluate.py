@@ -127,10 +127,11 @@ def evaluate_in_gymnasium(
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Score the policies of a run.
+    """Score the policies of a run, or of a point of a sweep.
 
     Attributes:
       run: the run's folder.
+      point: of a sweep, its number in results.csv; default the best by mean.
       checkpoint: which policies: last, or best by mean return in training.
       episodes: how many for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
@@ -140,6 +141,7 @@ class Options:
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
+    point: int | None = None
     checkpoint: Literal["last", "best"] = "last"
     episodes: int = 20
     stochastic: bool = False
@@ -148,39 +150,42 @@ class Options:
 
 
 def load(
-    folder: pathlib.Path, which: str = "last"
+    folder: pathlib.Path, which: str = "last", point: int | None = None
 ) -> tuple[Any, Config, list[int], Any]:
-    """Environment, config, seed numbers and states (seed, ...) of a run.
+    """Environment, config, seed numbers and states (seed, ...) of a run or point.
 
     Args:
-      folder: of the run, finished or not.
+      folder: of the run or sweep, finished or not.
       which: of its checkpoints, "last" or "best" (the highest mean return).
+      point: of a sweep; default the best by mean.
 
     Raises:
       ValueError: it is not the folder of a run, or has no whole checkpoint.
     """
-    from gasil_jax import checkpoint
+    from gasil_jax import checkpoint, saved_states
 
     described = run_folder.read(folder)
-    run_folder.refuse_sweep(folder, described)
-    root = folder / "checkpoints"
-    found, damages = checkpoint.latest(root)
+    saved = saved_states.find(folder, described, point)
+    found, damages = checkpoint.latest(saved.root)
     for damage in damages:
         print(f"warning: {damage}", file=sys.stderr)
     if which == "best":
-        found = checkpoint.best(root)
+        found = checkpoint.best(saved.root)
     if found is None:
         raise ValueError(f"run is {folder}: it has no whole checkpoint")
-    config = described["config"]
     settings = dataclasses.asdict(described["settings"])
     env = environments.make_env(described["env"], **settings)
-    first, count = described["first_seed"], described["seeds"]
-    seeds = list(range(first, first + count))
-    like = jax.eval_shape(
-        jax.vmap(lambda seed: train.init(env, config, jax.random.key(seed))),
-        jnp.arange(count, dtype=jnp.uint32),
+    init = lambda seed: train.init(
+        env, saved.config, jax.random.key(seed), saved.hyperparameters
     )
-    return env, config, seeds, found.restore(like)
+    like = jax.eval_shape(
+        jax.vmap(init), jnp.arange(saved.num_members, dtype=jnp.uint32)
+    )
+    states = found.restore(like)
+    if len(saved.places) < saved.num_members:
+        places = np.array(saved.places)
+        states = jax.tree.map(lambda x: x[places], states)
+    return env, saved.config, list(saved.seeds), states
 
 
 def _score(
@@ -223,7 +228,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
         if options.episodes < 1:
             raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
-        env, config, seeds, states = load(options.run, options.checkpoint)
+        env, config, seeds, states = load(
+            options.run, options.checkpoint, options.point
+        )
         locomotion = hasattr(env.unwrapped, "task")
         if options.gymnasium and not (locomotion and not options.stochastic):
             raise ValueError(

@@ -46,12 +46,14 @@ class Options:
       run: the run's folder, of a finished run or not.
       name: of the data set, NAMESPACE/DATASET-vVERSION; there must be none yet.
       seed: whose; default every seed's, in their order.
+      point: of a sweep, its number in results.csv; default the best by mean.
       checkpoint: as it was then: last, or best by mean return in training.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
     name: str
     seed: int | None = None
+    point: int | None = None
     checkpoint: Literal["last", "best"] = "last"
 
 
@@ -166,7 +168,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
         check_name(options.name)
-        env, config, seeds, states = evaluate.load(options.run, options.checkpoint)
+        env, config, seeds, states = evaluate.load(
+            options.run, options.checkpoint, options.point
+        )
         if options.seed is not None and options.seed not in seeds:
             raise InputError(
                 f"seed is {options.seed}: the run has {seeds[0]} to {seeds[-1]}"
@@ -189,7 +193,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     described = run_folder.read(options.run)
-    run_folder.refuse_sweep(options.run, described)
     settings = dataclasses.asdict(described["settings"])
     description = _DESCRIPTION.format(
         run=options.run.resolve().name,

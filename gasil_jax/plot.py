@@ -59,7 +59,11 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
       InputError: it is not a run's folder, or no episode has ended in it.
     """
     described = run_folder.read(folder)
-    run_folder.refuse_sweep(folder, described)
+    if "points" in described:
+        raise InputError(
+            f"run is {folder}, a sweep: its plot is sweep.png, and its curves are in "
+            "curves.npz"
+        )
     path = folder / "metrics.csv"
     try:
         metrics = logging.read_metrics(path, ("seed",), described["seeds"])

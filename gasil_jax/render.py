@@ -39,6 +39,7 @@ class Options:
       out: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a strip of
         moments; or, of locomotion, .html, to turn and zoom in a browser.
       seed: whose policy; default the run's first.
+      point: of a sweep, its number in results.csv; default the best by mean.
       checkpoint: which policies: last, or best by mean return in training.
       steps: at most.
       width: of a frame, pixels; a page fills its window.
@@ -50,6 +51,7 @@ class Options:
     run: Annotated[pathlib.Path, tyro.conf.Positional]
     out: pathlib.Path = pathlib.Path("episode.mp4")
     seed: int | None = None
+    point: int | None = None
     checkpoint: Literal["last", "best"] = "last"
     steps: int = 1000
     width: int = 480
@@ -241,7 +243,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 raise InputError(f"{name} is {value}: it must be 1 or more")
         # A film's encoder takes no odd number of pixels.
         size = (options.width + options.width % 2, options.height + options.height % 2)
-        env, _, seeds, states = evaluate.load(options.run, options.checkpoint)
+        env, _, seeds, states = evaluate.load(
+            options.run, options.checkpoint, options.point
+        )
         seed = seeds[0] if options.seed is None else options.seed
         if seed not in seeds:
             raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")

@@ -161,15 +161,6 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     return described
 
 
-def refuse_sweep(folder: pathlib.Path, described: Mapping[str, Any]) -> None:
-    """Raise `InputError` if what `read` gave is a sweep's, where a run is asked for."""
-    if "points" in described:
-        raise InputError(
-            f"run is {folder}, a sweep, which has tables and curves (results.csv, "
-            "curves.npz) but keeps no policies: train its best point with gasil_jax.run"
-        )
-
-
 def _tuples_in(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {name: _as_tuples(value) for name, value in fields.items()}
 

@@ -12,7 +12,7 @@ import pytest
 from test_resume import finish, wait_for
 from test_sweep import SMALL
 
-from gasil_jax import command_line, halving
+from gasil_jax import command_line, evaluate, halving
 
 pytest.importorskip("optuna")
 
@@ -143,6 +143,12 @@ def test_points_climb_and_go_on_in_another_process(tmp_path):
         steps = np.arange(1, row["env_steps"] // 256 + 1) * 256.0
         for seed in (0, 1):
             np.testing.assert_array_equal(metrics[metrics[:, 0] == seed, 1], steps)
+    _, _, seeds, states = evaluate.load(out)
+    assert seeds == [0, 1]
+    np.testing.assert_array_equal(states.iteration, [240, 240])
+    np.testing.assert_allclose(
+        states.hyperparameters.learning_rate, (3e-4, 1e-3)[summary["best"]]
+    )
     rungs = {60 * 256, 120 * 256, 240 * 256}
     assert {row["env_steps"] for row in summary["points"]} <= rungs
     assert summary["points"][2]["env_steps"] == 60 * 256

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from test_resume import finish, wait_for
 
-from gasil_jax import command_line, merge, run, shards, sweep, sweep_tables
+from gasil_jax import command_line, evaluate, merge, run, shards, sweep, sweep_tables
 from gasil_jax.config import Config
 from gasil_jax.points import PAPER_RANGES
 
@@ -151,6 +151,18 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
         row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
     }
     assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    _, config, seeds, states = evaluate.load(out, point=1)
+    assert config.discriminator_updates == 3 and seeds == [0, 1]
+    _, _, _, by_itself = evaluate.load(alone)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
+        states.params,
+        by_itself.params,
+    )
+    best = evaluate.load(out)[1]
+    assert best.discriminator_updates == (1, 3)[summary["best_by_mean"]]
+    assert evaluate.main([str(out), "--point", "4"]) == 2
+    assert "has points 0 to 3" in capsys.readouterr().err
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
     assert all(curves[name].shape == (4, 2, 2) for name in curves)
