@@ -140,7 +140,8 @@ def _run(
         for trial in chosen:
             trials.collect(trial, runs, folder)
     elif options.processes is not None:
-        for trial in processes.train(todo, runs, options.processes, flags):
+        each = [(trial, trials.known(trial, folder)) for trial in todo]
+        for trial in processes.train(each, runs, options.processes, flags):
             trials.collect(trial, runs, folder)
     else:
         for trial in todo:

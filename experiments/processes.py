@@ -9,7 +9,7 @@ import os
 import pathlib
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from multiprocessing import connection
 from typing import Any, NamedTuple
 
@@ -17,7 +17,9 @@ import jax
 
 from experiments import trials
 from experiments.trials import Trial
+from gasil_jax import shards
 from gasil_jax.command_line import InputError
+from gasil_jax.config import Config
 from gasil_jax.interruption import Interrupted, Interruption
 
 _SECONDS_BETWEEN_LOOKS = 1.0
@@ -41,13 +43,28 @@ class _Run(NamedTuple):
         return runs / f"{self.trial.name}.{self.part}-of-{self.parts}.log"
 
 
+def _runs(trial: Trial, done: Collection[tuple[int, int]]) -> list[_Run]:
+    """One for each member, in the order in which a sweep is cut, but for those done."""
+    seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
+    programs = shards.programs(Config(agent=trial.agent), trial.points, seeds)
+    members = [member for program in programs for member in program.members]
+    return [
+        _Run(trial, part, len(members))
+        for part, member in enumerate(members, start=1)
+        if member not in done
+    ]
+
+
 def train(
-    todo: Sequence[Trial], runs: pathlib.Path, processes: int, flags: Sequence[str] = ()
+    todo: Sequence[tuple[Trial, Collection[tuple[int, int]]]],
+    runs: pathlib.Path,
+    processes: int,
+    flags: Sequence[str] = (),
 ) -> Iterator[Trial]:
     """Train trials on the CPU, so many runs at a time; runs that have ended stay so.
 
     Args:
-      todo: in this order.
+      todo: in this order; of each the (point, seed) that are known already.
       runs: folder of the experiment's runs; what a process prints goes there too, to
         PANEL/CURVE.K-of-N.log.
       processes: how many at once.
@@ -60,11 +77,7 @@ def train(
       ChildProcessError: runs have failed; the others are done.
       Interrupted: by a signal, which the running ones were sent too: they have saved.
     """
-    waiting = [
-        _Run(trial, part, len(trial.points) * trial.seeds)
-        for trial in todo
-        for part in range(1, len(trial.points) * trial.seeds + 1)
-    ]
+    waiting = [run for trial, done in todo for run in _runs(trial, done)]
     total, ended, failed = len(waiting), 0, []
     free = list(range(processes))
     running: dict[int, tuple[_Run, int, Any, float]] = {}

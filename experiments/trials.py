@@ -209,6 +209,12 @@ def check(trial: Trial, results: pathlib.Path) -> None:
         raise InputError(f"{target} is of other settings: move it away")
 
 
+def known(trial: Trial, results: pathlib.Path) -> frozenset[tuple[int, int]]:
+    """(point, seed) of each run that the results have."""
+    rows = _read(results / f"{trial.name}.csv")
+    return frozenset((int(row["point"]), int(row["seed"])) for row in rows)
+
+
 def adopt(trial: Trial, results: pathlib.Path) -> None:
     """Take over what another figure beside `results` has of the very same runs."""
     target = results / f"{trial.name}.csv"

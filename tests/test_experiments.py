@@ -32,6 +32,8 @@ from experiments import (
     summary,
     trials,
 )
+from gasil_jax import shards
+from gasil_jax.config import Config
 from gasil_jax.interruption import Interrupted
 
 TOY = (
@@ -160,7 +162,7 @@ def test_runs_side_by_side_are_those_of_one_process(tmp_path):
     unknown = dataclasses.replace(trial, name="panel/unknown", agent="pppo", seeds=1)
     ended = []
     with pytest.raises(ChildProcessError, match=r"1 of 3 runs failed, see .*unknown"):
-        for done in processes.train([unknown, trial], tmp_path, 2, flags):
+        for done in processes.train([(unknown, ()), (trial, ())], tmp_path, 2, flags):
             ended.append(done)
             trials.collect(done, tmp_path, tmp_path / "aside")
     assert ended == [trial, trial]
@@ -171,6 +173,22 @@ def test_runs_side_by_side_are_those_of_one_process(tmp_path):
     aside, alone = (trials.read(trial, tmp_path / x) for x in ("aside", "alone"))
     assert aside.complete
     np.testing.assert_allclose(aside.returns, alone.returns, rtol=1e-3)
+    # Another machine trains what the results lack.
+    assert trials.known(trial, tmp_path / "aside") == {(0, 0), (0, 1)}
+    lacking = [(trial, {(0, 0)})]
+    assert list(processes.train(lacking, tmp_path / "two", 2, flags)) == [trial]
+    trials.collect(trial, tmp_path / "two", tmp_path / "other")
+    assert trials.known(trial, tmp_path / "other") == {(0, 1)}
+
+
+def test_the_order_of_runs_is_that_in_which_a_sweep_is_cut():
+    points = ({"buffer_steps": 500}, {"alpha": 1.0}, {"buffer_steps": 500, "alpha": 1})
+    trial = trials.Trial("a/b", "hopper", "ppo+gasil", points=points, seeds=2)
+    programs = shards.programs(Config(agent="ppo+gasil"), points, range(2))
+    runs = processes._runs(trial, {(1, 0)})
+    assert [run.part for run in runs] == [1, 2, 3, 4, 6]
+    cut = [shards.share(programs, shards.Shard(number, 6)) for number in range(1, 7)]
+    assert cut[4][0].members == ((1, 0),)
 
 
 def test_a_signal_ends_all_runs_and_they_have_saved(tmp_path):
@@ -187,7 +205,7 @@ def test_a_signal_ends_all_runs_and_they_have_saved(tmp_path):
 
     threading.Thread(target=interrupt, daemon=True).start()
     with pytest.raises(Interrupted):
-        next(processes.train([trial], tmp_path, 2, flags))
+        next(processes.train([(trial, ())], tmp_path, 2, flags))
     assert not multiprocessing.active_children()
     assert len(of_runs("checkpoints/0*/manifest.json")) == 2
 
