@@ -110,10 +110,10 @@ def _run(
     if options.processes is not None:
         if options.processes < 1:
             raise InputError(f"processes is {options.processes}: it must be 1 or more")
-        if part.count > 1 or options.devices is not None:
+        if part.count > 1 or options.devices is not None or options.share_counts:
             raise InputError(
-                f"processes is {options.processes}: --part and --devices don't go "
-                "with it"
+                f"processes is {options.processes}: --part, --devices and "
+                "--share-counts don't go with it"
             )
     wanted = [dataclasses.replace(trial, **changes) for trial in wanted]
     chosen = _choose(wanted, options.only)

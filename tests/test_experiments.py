@@ -289,6 +289,7 @@ def test_a_difference_over_several_tasks():
         (("--seeds", "0"), "seeds is 0"),
         (("--processes", "0"), "processes is 0"),
         (("--processes", "2", "--part", "1/2"), "processes is 2"),
+        (("--processes", "2", "--share-counts"), "processes is 2"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
