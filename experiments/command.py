@@ -2,15 +2,13 @@
 
 import dataclasses
 import pathlib
-import sys
 from collections.abc import Callable, Sequence
 
 from experiments import processes, report, trials
 from experiments.report import Figure
 from experiments.trials import Trial
-from gasil_jax import command_line, shards
+from gasil_jax import command_line, run, shards
 from gasil_jax.command_line import InputError
-from gasil_jax.interruption import Interrupted
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,18 +69,12 @@ def main(
       arguments: default what the program was started with.
       write: figure and page.
     """
-    try:
-        options = command_line.parse(Options, arguments, f"experiments.{figure.name}")
-        return _run(options, figure, make, quick, write)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    except ChildProcessError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    except Interrupted as interrupted:
-        print(f"{interrupted}; go on with the same command", file=sys.stderr)
-        return 128 + interrupted.signal
+    program = f"experiments.{figure.name}"
+    return run.exit_status(
+        lambda: _run(
+            command_line.parse(Options, arguments, program), figure, make, quick, write
+        )
+    )
 
 
 def _run(

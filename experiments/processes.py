@@ -85,7 +85,9 @@ def train(
         try:
             while waiting or running:
                 if interruption.signal is not None:
-                    raise Interrupted(interruption.signal)
+                    interrupted = Interrupted(interruption.signal)
+                    interrupted.add_note("go on with the same command")
+                    raise interrupted
                 while free and waiting:
                     run, slot = waiting.pop(0), free.pop(0)
                     arguments = (run, runs, (slot, processes), tuple(flags))

@@ -175,17 +175,17 @@ def load(
         raise ValueError(f"run is {folder}: it has no whole checkpoint")
     settings = dataclasses.asdict(described["settings"])
     env = environments.make_env(described["env"], **settings)
+    config, count = saved.program.config, len(saved.program.members)
+    # All members have leaves of the same names.
     init = lambda seed: train.init(
-        env, saved.config, jax.random.key(seed), saved.hyperparameters
+        env, config, jax.random.key(seed), saved.program.hyperparameters[0]
     )
-    like = jax.eval_shape(
-        jax.vmap(init), jnp.arange(saved.num_members, dtype=jnp.uint32)
-    )
+    like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
     states = found.restore(like)
-    if len(saved.places) < saved.num_members:
+    if len(saved.places) < count:
         places = np.array(saved.places)
         states = jax.tree.map(lambda x: x[places], states)
-    return env, saved.config, list(saved.seeds), states
+    return env, config, saved.seeds, states
 
 
 def _score(

@@ -410,22 +410,21 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
     return np.where(count > 0, mean, newest)
 
 
-def exit_status(work: Callable[[], None]) -> int:
+def exit_status(work: Callable[[], int | None]) -> int:
     """Do the work of a command line; its errors become lines on stderr.
 
     Returns:
-      0: done; 1: the folder can't be written any more; 2: bad input; 128 and the
-      signal's number: interrupted, and saved.
+      what the work says, or 0: done; 1: the folder can't be written any more; 2: bad
+      input; 128 and the signal's number: interrupted, and saved.
     """
     try:
-        work()
+        return work() or 0
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2 if isinstance(error, InputError) else 1
     except Interrupted as interrupted:
         print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
         return 128 + interrupted.signal
-    return 0
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

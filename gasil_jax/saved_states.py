@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 
 from gasil_jax import shards
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.points import Point
 from gasil_jax.shards import Program
 from gasil_jax.sweep_tables import Trained
@@ -18,19 +17,18 @@ class Saved(NamedTuple):
 
     Attributes:
       root: folder of the checkpoints that they are in.
-      config: theirs.
-      hyperparameters: of one of them: a state has leaves of the same names.
-      num_members: of a checkpoint.
-      places: of the members among those.
-      seeds: their numbers.
+      program: what was trained and is saved there together.
+      places: of the members in it.
     """
 
     root: pathlib.Path
-    config: Config
-    hyperparameters: Hyperparameters
-    num_members: int
+    program: Program
     places: Sequence[int]
-    seeds: Sequence[int]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The members' seed numbers."""
+        return [self.program.members[i][1] for i in self.places]
 
 
 def find(
@@ -53,14 +51,9 @@ def find(
         raise InputError(f"point is {point}: {folder} is of a run, which has none")
     config, first = described["config"], described["first_seed"]
     seeds = range(first, first + described["seeds"])
-    return Saved(
-        root=folder / "checkpoints",
-        config=config,
-        hyperparameters=config.hyperparameters,
-        num_members=len(seeds),
-        places=range(len(seeds)),
-        seeds=seeds,
-    )
+    # A run is a sweep of one point, in one program.
+    (program,) = shards.programs(config, [{}], seeds)
+    return Saved(folder / "checkpoints", program, range(len(seeds)))
 
 
 def _checked(
@@ -92,14 +85,9 @@ def _of_halving(
 ) -> Saved:
     """Each point is trained in a folder of its own."""
     program, places = _with_point(folder, {**described, "shard": None}, point)
-    return Saved(
-        root=folder / "points" / str(point) / "checkpoints",
-        config=program.config,
-        hyperparameters=program.hyperparameters[places[0]],
-        num_members=len(places),
-        places=range(len(places)),
-        seeds=[program.members[i][1] for i in places],
-    )
+    own = program.part(places[0], places[-1] + 1)
+    root = folder / "points" / str(point) / "checkpoints"
+    return Saved(root, own, range(len(places)))
 
 
 def _of_sweep(folder: pathlib.Path, described: Mapping[str, Any], point: int) -> Saved:
@@ -110,14 +98,7 @@ def _of_sweep(folder: pathlib.Path, described: Mapping[str, Any], point: int) ->
             f"{shards.root(folder)}"
         )
     program, places = _with_point(folder, described, point)
-    return Saved(
-        root=program.folder(folder) / "checkpoints",
-        config=program.config,
-        hyperparameters=program.hyperparameters[places[0]],
-        num_members=len(program.members),
-        places=places,
-        seeds=[program.members[i][1] for i in places],
-    )
+    return Saved(program.folder(folder) / "checkpoints", program, places)
 
 
 def _with_point(
