@@ -12,7 +12,8 @@ trains them once the first stage is complete. The seeds are other than those of 
 figures, which use the point with the best mean return. Ant and humanoid, whose runs
 cost several times as much, have half as many in either stage: 16 for each agent, PPO
 two learning rates, and two seeds more for the best four points (PPO+GASIL's best two on
-delayed ant were tried with two further ones, which are not used). On the point mass
+delayed ant were tried with two further ones, which are not used); humanoid's are a
+third as long as those of its figure. On the point mass
 both agents have the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and
 PPO+GASIL else what its preset has (alpha 1, 20 updates at 3e-4).
 
@@ -49,7 +50,7 @@ _ENOUGH_SEEDS = 8
 _SECOND = "-best"
 
 #: Lengths other than the trial's own; humanoid is tuned over a third of its figure's.
-STEPS = {"point_mass": 500_000}
+STEPS = {"point_mass": 500_000, "humanoid": 333_000}
 _LEARNING_RATES = (3e-4, 1e-4, 5e-5, 3e-5)
 _HIGHER = _LEARNING_RATES[:2]
 _POINT_MASS_LEARNING_RATES = (1e-3, 3e-4, 1e-4, 3e-5)

@@ -49,7 +49,6 @@ class Trial:
       first_seed: the number of the first.
       total_steps: of a seed.
       rows: of a seed in the results: so many equal parts of training.
-      alpha_schedule: (steps, factor) points.
     """
 
     name: str
@@ -62,7 +61,6 @@ class Trial:
     first_seed: int = 0
     total_steps: int = 1_000_000
     rows: int = 50
-    alpha_schedule: tuple[tuple[float, float], ...] = ()
 
     @property
     def num_envs(self) -> int:
@@ -74,8 +72,6 @@ class Trial:
         fields = dataclasses.asdict(self)
         for name in ("name", "seeds", "first_seed"):
             del fields[name]
-        if not self.alpha_schedule:
-            del fields["alpha_schedule"]
         if self.env in NUM_ENVS_OF:
             fields["num_envs"] = self.num_envs
         return fields | {"points": [dict(point) for point in self.points]}
@@ -111,7 +107,6 @@ def train(
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
         return 0
-    schedule = [str(number) for pair in trial.alpha_schedule for number in pair]
     return sweep.main(
         [
             *("--env", trial.env, "--agent", trial.agent, *_FLAGS),
@@ -121,7 +116,8 @@ def train(
             *("--total-steps", str(trial.total_steps), "--out", str(place)),
             *("--resume", "--points-file", str(listed)),
             *(("--shard", f"{part}/{parts}") if parts > 1 else ()),
-            *("--alpha-schedule", *schedule, *flags),
+            # None: the paper's, of humanoid, begins at 2M steps.
+            *("--alpha-schedule", *flags),
         ]
     )
 
