@@ -45,6 +45,31 @@ def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
+@_REGISTRY.primitive_rule
+def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    # Step counts are written as 1e6, too.
+    if info.type is not int:
+        return None
+
+    def from_words(words: list[str]) -> int:
+        (word,) = words
+        try:
+            return int(word)
+        except ValueError:
+            with contextlib.suppress(ValueError):
+                if (number := float(word)).is_integer():
+                    return int(number)
+            raise
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=from_words,
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda number: [str(number)],
+    )
+
+
 def parse(
     options: type[T],
     arguments: Sequence[str] | None,
@@ -87,8 +112,8 @@ def _in_one_line(refusal: str) -> str:
     message = " ".join(" ".join(rest).split())
     message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
     number = re.match(
-        r"Error parsing --([\w-]+): (?:invalid literal for (int)|could not convert)"
-        r".*: '(.*)'$",
+        r"Error parsing --([\w-]+): (?:.*invalid literal for (int)|could not convert"
+        r"|no type matching \{None\}\|FLOAT).*: '(.*)'$",
         message,
     )
     if number is None:

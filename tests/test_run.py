@@ -10,7 +10,7 @@ import pytest
 
 SMALL = (
     *("--env", "point_mass", "--seeds", "3", "--first-seed", "5"),
-    *("--total-steps", "1000", "--batch-steps", "256", "--num-envs", "4"),
+    *("--total-steps", "1e3", "--batch-steps", "256", "--num-envs", "4"),
     *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
     *("--num-epochs", "2", "--alpha", "0.5", "--buffer-steps", "300"),
     *("--alpha-schedule", "0", "0.5", "500", "1"),
@@ -99,9 +99,14 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
         ("--env hopper --seeds 0", "seeds is 0: it must be 1 or more"),
         ("--env hopper --seeds two", "seeds is 'two': it must be a whole number"),
+        ("--env hopper --devices 1.5", "devices is '1.5': it must be a whole number"),
         ("--env hopper --alpha big", "alpha is 'big': it must be a number"),
         ("--env hopper --num-envs -2", "num_envs is -2"),
         ("--env hopper --total-steps 0", "total_steps is 0"),
+        (
+            "--env hopper --total-steps 2.5",
+            "total_steps is '2.5': it must be a whole number",
+        ),
         ("--env hopper --minibatch-size 60", "nearest that does is 64"),
         ("--env hopper --alpha nan", "alpha is nan"),
         ("--env hopper --reward-delay 0", "reward_delay is 0"),
