@@ -335,17 +335,36 @@ def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypa
             assert settings == json.loads(json.dumps(trial.settings()))
 
 
-def test_what_is_said_of_swimmer_is_in_the_csv_file():
+def _means(name, **only):
+    """Of a CSV file of single runs: "mean ± standard error" and how many, by group."""
     groups = collections.defaultdict(list)
-    with (trials.RESULTS / "swimmer_self_imitation.csv").open() as file:
+    with (trials.RESULTS / name).open() as file:
         for row in csv.DictReader(file):
             final = float(row.pop("final_return"))
             del row["seed"]
-            groups[tuple(row.values())].append(final)
-    assert [len(finals) for finals in groups.values()] == [5] * 5
+            if only.items() <= row.items():
+                groups[tuple(row.values())].append(final)
     for finals in groups.values():
-        error = np.std(finals, ddof=1) / np.sqrt(5)
-        assert f"{np.mean(finals):.0f} ± {error:.0f}" in mujoco.FIGURE.more
+        error = np.std(finals, ddof=1) / np.sqrt(len(finals))
+        yield f"{np.mean(finals):z.0f} ± {error:.0f}", len(finals)
+
+
+def test_what_is_said_of_swimmer_is_in_the_csv_file():
+    means = list(_means("swimmer_self_imitation.csv"))
+    assert [seeds for _, seeds in means] == [5] * 5
+    assert all(mean in mujoco.FIGURE.more for mean, _ in means)
+
+
+@pytest.mark.parametrize(
+    ("env", "seeds"), [("hopper", 6), ("walker2d", 8), ("halfcheetah", 4)]
+)
+def test_what_is_said_of_agent_gasil_is_in_the_csv_file(env, seeds):
+    only = {"alpha": "1", "discriminator_updates": "20", "learning_rate": "0.0003"}
+    only |= {"discriminator_learning_rate": "0.0003", "agent": "gasil", "env": env}
+    ((mean, count),) = _means("delayed_agents.csv", **only)
+    assert count == seeds
+    readme = pathlib.Path(__file__).parent.parent / "README.md"
+    assert mean in delayed_mujoco.FIGURE.more and mean in readme.read_text()
 
 
 def test_the_summary_is_that_of_the_csv_files():
