@@ -40,7 +40,8 @@ class Options:
 
     Attributes:
       env: environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
-        humanoid, or brax: and the name of one of Brax's, brax:inverted_pendulum.
+        humanoid, brax: and the name of one of Brax's, brax:inverted_pendulum, or
+        MODULE:NAME of your own.
       seeds: how many seeds.
       first_seed: number of the first seed; a seed's result depends on its number
         alone.

@@ -8,7 +8,6 @@ import shlex
 import subprocess
 import sys
 
-import brax.envs
 import jax
 import numpy as np
 import pytest
@@ -234,8 +233,7 @@ def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
 
 
-def test_the_documented_agent_and_task_train(monkeypatch):
-    from gasil_envs import registry
+def test_the_documented_agent_and_task_train(tmp_path, monkeypatch, capsys):
     from gasil_jax.imitation import AGENTS
 
     text = (README.parent / "docs" / "extending.md").read_text()
@@ -255,14 +253,14 @@ def test_the_documented_agent_and_task_train(monkeypatch):
     # At most 20 steps of at most 0.1.
     assert (metrics["episode_length"] <= 20).all()
 
-    class Known(names["Line"], brax.envs.Env):
-        backend = "none"
-
-    before = registry._constructors()
-    line = {"line": lambda settings: Known()}
-    monkeypatch.setattr(registry, "_constructors", lambda: before | line)
-    env = gasil_jax.make_env("line", reward_delay=7)
-    assert env.episode_length == 20
+    (tmp_path / "my_tasks.py").write_text(task)
+    monkeypatch.syspath_prepend(tmp_path)
+    out = str(tmp_path / "out")
+    small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
+    arguments = ["--env", "my_tasks:Line", "--first-seed", "5", "--out", out]
+    assert run.main([*arguments, *small.split()]) == 0
+    assert evaluate.main([out, "--episodes", "2"]) == 0
+    assert re.search(r"5 +2 +-[0-9.]+ +[0-9.]+ +20.0", capsys.readouterr().out)
 
 
 def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from gasil_jax.run import main
+
 SMALL = (
     *("--env", "point_mass", "--seeds", "3", "--first-seed", "5"),
     *("--total-steps", "1e3", "--batch-steps", "256", "--num-envs", "4"),
@@ -116,12 +118,14 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env hopper --resume=3", "Unrecognized options: 3"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
         ("--env brax:ant --physics mujoco", "brax:ant has its own"),
+        ("--env nowhere:Line", "'nowhere:Line' can't be imported: No module"),
+        ("--env json:Line", "has no attribute 'Line'"),
+        ("--env sys:path", "it must build an environment"),
+        ("--env json:loads --physics mujoco", "json:loads has its own"),
         ("", "--env"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
-    from gasil_jax.run import main
-
     assert main(arguments.split()) == 2
     captured = capsys.readouterr()
     assert captured.out == ""

@@ -65,6 +65,23 @@ def test_the_limit_truncates_and_an_end_does_not():
     np.testing.assert_array_equal(ended.info["truncation"], [0, 0, 0, 0])
 
 
+class Truncating(Scripted):
+    """Says itself, and as an integer, that a limit ended its episode."""
+
+    def reset(self, rng):
+        return super().reset(rng).replace(info={"truncation": jnp.int32(0)})
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        info = {**state.info, "truncation": state.done.astype(jnp.int32)}
+        return state.replace(info=info)
+
+
+def test_an_environments_own_truncation_stays():
+    _, cut = roll(wrappers.EpisodeLimit(Truncating(4), 7), 4)
+    np.testing.assert_array_equal(cut.info["truncation"], [0, 0, 0, 1])
+
+
 def test_noise_is_fresh_gaussian_and_only_on_the_observation():
     _, plain = roll(Scripted(10_000), 4000)
     _, noisy = roll(wrappers.ObservationNoise(Scripted(10_000), 0.5), 4000)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import importlib
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -64,7 +65,7 @@ def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
 
 #: Before the name of an environment of ``brax.envs``.
 BRAX = "brax:"
-_BRAX_EPISODE_LENGTH = 1000
+_EPISODE_LENGTH = 1000
 
 
 def names() -> tuple[str, ...]:
@@ -72,16 +73,30 @@ def names() -> tuple[str, ...]:
     return tuple(_constructors())
 
 
+def _of_user(name: str) -> Callable[[], Env]:
+    """What MODULE:NAME names: a class, or a function that builds an environment."""
+    module, attribute = name.split(":", 1)
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"env {name!r} can't be imported: {error}") from None
+    if not callable(found):
+        raise ValueError(f"env {name!r} is {found!r}: it must build an environment")
+    return found
+
+
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
     if name.startswith(BRAX):
         _refuse_unknown("env", name, [BRAX + known for known in brax.envs._envs])
-        for field in ("physics", "solver", "integrator"):
-            value = getattr(settings, field)
-            if value != getattr(Settings, field):
-                raise ValueError(f"{field} is {value!r}: {name} has its own")
+    elif ":" in name:
+        _of_user(name)
     else:
         _refuse_unknown("env", name, names())
+    for field in ("physics", "solver", "integrator") if ":" in name else ():
+        value = getattr(settings, field)
+        if value != getattr(Settings, field):
+            raise ValueError(f"{field} is {value!r}: {name} has its own")
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
     _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
@@ -107,7 +122,8 @@ def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
-      name: one of `names()`, or "brax:" and a name of ``brax.envs``.
+      name: one of `names()`, "brax:" and a name of ``brax.envs``, or MODULE:NAME of
+        a class or function of yours that builds an environment of Brax's interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator.
 
@@ -118,10 +134,11 @@ def make(name: str, **settings: Any) -> Env:
     check(name, chosen)
     if name.startswith(BRAX):
         env = brax.envs.get_environment(name.removeprefix(BRAX))
-        env = wrappers.EpisodeLimit(env, _BRAX_EPISODE_LENGTH)
+    elif ":" in name:
+        env = _of_user(name)()
     else:
         env = _constructors()[name](chosen)
-        env = wrappers.EpisodeLimit(env, env.episode_length)
+    env = wrappers.EpisodeLimit(env, getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)
     if chosen.obs_noise > 0:

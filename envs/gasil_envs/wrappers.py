@@ -14,12 +14,17 @@ class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
     Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
-    limit and not the environment ended the episode).
+    limit and not the environment ended the episode, or where the environment says so).
     """
 
     def __init__(self, env: Env, episode_length: int):
         super().__init__(env)
         self.episode_length = episode_length
+
+    @property
+    def unwrapped(self) -> Env:
+        """The environment without wrappers, which need not be a subclass of Brax's."""
+        return getattr(self.env, "unwrapped", self.env)
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
@@ -30,13 +35,14 @@ class EpisodeLimit(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and set ``done`` and ``truncation`` at the limit."""
         steps = state.info["steps"] + 1
-        state = self.env.step(state, action)
+        # Where the environment says nothing of it, the last step's must not stay.
+        info = {**state.info, "truncation": jnp.float32(0)}
+        state = self.env.step(state.replace(info=info), action)
         at_limit = (steps >= self.episode_length).astype(jnp.float32)
-        info = {
-            **state.info,
-            "steps": steps,
-            "truncation": at_limit * (1.0 - state.done),
-        }
+        truncation = jnp.maximum(
+            state.info["truncation"], at_limit * (1.0 - state.done)
+        )
+        info = {**state.info, "steps": steps, "truncation": truncation}
         return state.replace(done=jnp.maximum(state.done, at_limit), info=info)
 
 
