@@ -39,7 +39,7 @@ def _rows(found: Mapping[str, _Found]) -> Rows:
             ("ppo+sil", ("sil_coefficient",)),
             ("ppo+gasil", _Found._fields[2:]),
         ):
-            num_envs = {"num_envs": 64 if env == "ant" else 32}
+            num_envs = {"num_envs": 64 if env in ("ant", "humanoid") else 32}
             rows[env, agent] = {name: value[name] for name in names} | num_envs
     return rows
 
@@ -49,6 +49,7 @@ _DENSE = {
     "walker2d": _Found(0.3, 1.0, 0.02, 5, 2e-5, 10_000),
     "halfcheetah": _Found(1.0, 0.1, 0.2, 5, 3e-4, 10_000),
     "swimmer": _Found(1.0, 1.0, 0.02, 5, 2e-5, 10_000),
+    "humanoid": _Found(0.01, 0.01, 0.1, 1, 2e-5, 1_000),
 }
 _DELAYED = {
     "hopper": _Found(1.0, 1.0, 0.2, 5, 3e-4, 10_000),
@@ -56,6 +57,7 @@ _DELAYED = {
     "halfcheetah": _Found(0.01, 0.1, 1.0, 10, 1e-5, 10_000),
     "swimmer": _Found(0.3, 0.3, 0.2, 20, 1e-5, 1_000),
     "ant": _Found(0.01, 1.0, 0.1, 10, 1e-4, 10_000),
+    "humanoid": _Found(0.1, 0.01, 0.1, 1, 2e-5, 1_000),
 }
 
 _STRONG_DISCRIMINATOR = {
