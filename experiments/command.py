@@ -31,7 +31,8 @@ class Options:
       share_counts: points that differ in buffer size or discriminator updates share a
         program, as in gasil_jax.sweep: best on a GPU.
       runs: where training writes.
-      results: where tables, figure and page go.
+      results: where tables, figure and page go; the hyperparameters stay those that
+        the search in the checkout has found.
     """
 
     only: tuple[str, ...] = ()
@@ -87,7 +88,11 @@ def _run(
     part = shards.parse(options.part, "part")
     wanted = list(make())
     runs, results = options.runs / figure.name, options.results
+    if options.report and part.count > 1:
+        raise InputError(f"part is {options.part}: --report is of all parts")
     if options.quick:
+        if results != trials.RESULTS:
+            raise InputError(f"results is {results}: --quick writes below --runs")
         wanted = [dataclasses.replace(trial, **_QUICK) for trial in quick(wanted)]
         runs = options.runs / "quick" / figure.name
         results = options.runs / "quick" / "results"

@@ -178,6 +178,7 @@ def animate(env: Any, moments: Moments, path: pathlib.Path) -> None:
         figure.suptitle(_draw_row(panels, env, moments, number))
         _titles(panels, moments)
 
+    path.parent.mkdir(parents=True, exist_ok=True)
     film = FuncAnimation(figure, frame, frames=frames)
     film.save(path, writer=PillowWriter(fps=2), dpi=80)
     plt.close(figure)

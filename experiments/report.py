@@ -286,6 +286,8 @@ def draw(
         for curve, known in curves.items():
             color = color_of[curve]
             some = np.isfinite(known.returns[0]).all(axis=0)
+            if not some.any():
+                continue
             returns = known.returns[0][:, some]
             steps = known.env_steps[some] / 1e6
             low, high = statistics.bootstrap_interval(returns, resamples=500)
@@ -293,7 +295,8 @@ def draw(
             middle = statistics.interquartile_mean(returns, axis=0)
             axes.plot(steps, middle, color=color, label=curve)
         axes.set(title=panel, xlabel="million steps")
-        axes.legend(frameon=False, fontsize=7)
+        if axes.get_lines():
+            axes.legend(frameon=False, fontsize=7)
     for axes in grid.flat[len(shown) :]:
         axes.set_visible(False)
     for row in grid:

@@ -132,7 +132,7 @@ class Options:
     Attributes:
       run: the run's folder.
       point: of a sweep, its number in results.csv; default the best by mean.
-      checkpoint: which policies: last, or best by mean return in training.
+      checkpoint: which policies: last, or, of a run, best by mean return in training.
       episodes: how many for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
       gymnasium: score in Gymnasium, on C MuJoCo, instead; for locomotion, with the
@@ -149,6 +149,12 @@ class Options:
     key: int = 0
 
 
+def check_key(key: int) -> None:
+    """Raise `ValueError` for a key that is none of JAX's and of Gymnasium's."""
+    if not 0 <= key < 2**32:
+        raise ValueError(f"key is {key}: it must be from 0 to {2**32 - 1}")
+
+
 def load(
     folder: pathlib.Path, which: str = "last", point: int | None = None
 ) -> tuple[Any, Config, list[int], Any]:
@@ -160,7 +166,8 @@ def load(
       point: of a sweep; default the best by mean.
 
     Raises:
-      ValueError: it is not the folder of a run, or has no whole checkpoint.
+      ValueError: it is not the folder of a run, or has no such checkpoint, or the best
+        is asked for of a point that shares its checkpoints with others.
     """
     from gasil_jax import checkpoint, saved_states
 
@@ -169,13 +176,19 @@ def load(
     found, damages = checkpoint.latest(saved.root)
     for damage in damages:
         print(f"warning: {damage}", file=sys.stderr)
+    config, count = saved.program.config, len(saved.program.members)
     if which == "best":
+        if len(saved.places) < count:
+            raise ValueError(
+                "checkpoint is 'best': this point was trained with others, and "
+                "checkpoints are scored over all of them: it must be 'last'"
+            )
         found = checkpoint.best(saved.root)
     if found is None:
-        raise ValueError(f"run is {folder}: it has no whole checkpoint")
+        scored = " in whose time an episode ended" if which == "best" else ""
+        raise ValueError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     env = environments.make_env(described["env"], **settings)
-    config, count = saved.program.config, len(saved.program.members)
     # All members have leaves of the same names.
     init = lambda seed: train.init(
         env, config, jax.random.key(seed), saved.program.hyperparameters[0]
@@ -228,6 +241,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
         if options.episodes < 1:
             raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
+        check_key(options.key)
         env, config, seeds, states = load(
             options.run, options.checkpoint, options.point
         )

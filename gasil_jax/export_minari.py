@@ -198,7 +198,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         run=options.run.resolve().name,
         agent=config.agent,
         env=f"{described['env']} {settings}",
-        gamma=config.hyperparameters.gamma,
+        # A sweep's points may differ in it.
+        gamma=float(states.hyperparameters.gamma[0]),
     )
     try:
         write(options.name, found, algorithm_name=config.agent, description=description)

@@ -29,7 +29,7 @@ import numpy as np
 from gasil_jax import run, run_folder, shards, sweep, trackers
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config
-from gasil_jax.interruption import Interrupted
+from gasil_jax.interruption import Interrupted, Interruption
 from gasil_jax.points import Point
 from gasil_jax.shards import Program
 
@@ -247,30 +247,40 @@ def climb(
     places = [folder / "points" / str(index) for index in range(len(points))]
     batch_of = _batches(options, env, points)
 
-    def advance(least: int) -> bool:
-        """Train one point to its next rung, if there is one."""
+    def advance(least: int) -> bool | None:
+        """Whether a point came to its next rung; None where others have those left."""
         now = study.scores()
+        others = False
         for index in candidates(now, steps, len(points), options.reduction, least):
             with _claimed(places[index]) as mine:
+                if not mine:
+                    others = True
+                    continue
                 reached = study.scores().get(index, {})
-                # Another process may have been there just now.
-                if mine and reached == now.get(index, {}):
+                # Another process may have been there just now: look again.
+                if reached == now.get(index, {}):
                     study.begin(index)
                     rung = steps[len(reached)]
-                    score = _train(options, index, batch_of(index), places[index], rung)
+                    runs, place = batch_of(index), places[index]
+                    score = _train(options, index, runs, place, rung, interruption)
                     study.report(index, rung, score)
-                    return True
-        return False
+                return True
+        return None if others else False
 
-    while True:
-        if advance(options.reduction):
-            continue
-        if not all(map(_is_free, places)):
-            return None
-        # Nobody is left to compare with: the best of few go on, one at least.
-        if not advance(1):
-            study.close(steps[-1])
-            return study
+    # One for all: a signal while a rung ends must not be forgotten by the next.
+    with Interruption() as interruption:
+        while True:
+            if advance(options.reduction):
+                continue
+            if not all(map(_is_free, places)):
+                return None
+            # Nobody is left to compare with: the best of few go on, one at least.
+            went_on = advance(1)
+            if went_on is None:
+                return None
+            if not went_on:
+                study.close(steps[-1])
+                return study
 
 
 def _is_free(place: pathlib.Path) -> bool:
@@ -304,18 +314,22 @@ def _batches(
 
 
 def _train(
-    options: Options, index: int, runs: Any, place: pathlib.Path, rung: int
+    options: Options,
+    index: int,
+    runs: Any,
+    place: pathlib.Path,
+    rung: int,
+    interruption: Interruption,
 ) -> float:
     """Train a point to a rung; returns its score there."""
     from gasil_jax import driver, logging
-    from gasil_jax.interruption import Interruption
     from gasil_jax.progress import Progress
 
     config, seeds = runs.config, sweep.seeds_of(options)
     title = f"{options.env} {config.agent} point {index}"
     until = math.ceil(rung / config.batch_steps)
     total = until * config.batch_steps * len(seeds)
-    with Interruption() as interruption, Progress(title, total) as progress:
+    with Progress(title, total) as progress:
         driver.drive(
             runs,
             place,

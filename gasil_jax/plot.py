@@ -11,6 +11,7 @@ import tyro
 
 from gasil_jax import command_line, logging, plotting, run_folder, statistics
 from gasil_jax.command_line import InputError
+from gasil_jax.run import final_returns
 
 #: Okabe and Ito's colours, which colour-blind readers tell apart.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -77,15 +78,12 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     some = [p for p in parts if np.isfinite(returns[:, p]).any(axis=1).all()]
     if not some:
         raise InputError(f"{path}: not every seed has ended an episode")
-    last = returns[:, -max(1, len(steps) // 10) :]
-    if not np.isfinite(last).any(axis=1).all():
-        raise InputError(f"{path}: not every seed has ended an episode at the end")
     default = f"{described['env']}, {described['config'].agent}"
     return Curves(
         label=label or default,
         env_steps=np.array([steps[p[-1]] for p in some]),
         returns=np.stack([mean(returns[:, p]) for p in some], axis=1),
-        final=mean(last),
+        final=final_returns(returns),
     )
 
 
@@ -148,7 +146,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    draw(runs, options.out)
+    try:
+        draw(runs, options.out)
+    except OSError as error:
+        print(f"error: out is {options.out}: {error.strerror}", file=sys.stderr)
+        return 1
     print("run                             seeds  interquartile mean  95% interval")
     for run in runs:
         low, high = statistics.bootstrap_interval(run.final)

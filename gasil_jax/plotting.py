@@ -38,7 +38,7 @@ def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
     """Write a figure as a PNG, its folder too where that is missing, and close it."""
     import matplotlib.pyplot as plt
 
-    path.parent.mkdir(exist_ok=True)
+    path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
 

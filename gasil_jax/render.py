@@ -40,7 +40,7 @@ class Options:
         moments; or, of locomotion, .html, to turn and zoom in a browser.
       seed: whose policy; default the run's first.
       point: of a sweep, its number in results.csv; default the best by mean.
-      checkpoint: which policies: last, or best by mean return in training.
+      checkpoint: which policies: last, or, of a run, best by mean return in training.
       steps: at most.
       width: of a frame, pixels; a page fills its window.
       height: of a frame, pixels.
@@ -212,7 +212,10 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
                 '"gasil_jax[render]"); a .gif or .png needs nothing'
             ) from None
         height, width = frames[0].shape[:2]
-        writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps)
+        # By default it stretches a picture to multiples of sixteen.
+        writer = imageio_ffmpeg.write_frames(
+            str(path), (width, height), fps=fps, macro_block_size=2
+        )
         writer.send(None)
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
@@ -241,6 +244,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if getattr(options, name) < 1:
                 value = getattr(options, name)
                 raise InputError(f"{name} is {value}: it must be 1 or more")
+        evaluate.check_key(options.key)
+        try:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"out is {options.out}: {error.strerror}") from None
         # A film's encoder takes no odd number of pixels.
         size = (options.width + options.width % 2, options.height + options.height % 2)
         env, _, seeds, states = evaluate.load(

@@ -299,11 +299,12 @@ def make_env(options: Options) -> Any:
     """The environment that the options ask for.
 
     Raises:
-      InputError: the agent can't run in it.
+      InputError: it can't be built, or the agent can't run in it.
     """
-    with announced(options.env, "building the environment"):
-        env = environments.make_env(options.env, **dataclasses.asdict(options.settings))
+    settings = dataclasses.asdict(options.settings)
     try:
+        with announced(options.env, "building the environment"):
+            env = environments.make_env(options.env, **settings)
         training.check(env, options.config)
     except ValueError as error:
         raise InputError(str(error)) from None

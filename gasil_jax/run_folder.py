@@ -17,6 +17,7 @@ from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.environments import Settings
 
 _LOCK = ".lock"
+_PROBE = ".writable-"
 _CONFIG = "config.json"
 
 
@@ -54,7 +55,7 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
     try:
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
-            probe = out / f".writable-{os.getpid()}"
+            probe = out / f"{_PROBE}{os.getpid()}"
             probe.touch()
             probe.unlink()
             return out
@@ -115,8 +116,12 @@ def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]
 
 
 def refuse_used(folder: pathlib.Path) -> None:
-    """Raise `InputError` if there is anything in the folder but a lock."""
-    if any(path.name != _LOCK for path in folder.iterdir()):
+    """Raise `InputError` if there is anything in the folder but what `create` leaves.
+
+    That is a lock, and for a moment what another process tries whether it can write.
+    """
+    names = (path.name for path in folder.iterdir())
+    if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
         raise InputError(
             f"out is {folder}, which is not empty: name a new or an empty folder, or "
             "go on with what is there with --resume"

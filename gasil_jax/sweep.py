@@ -35,7 +35,7 @@ class PointOptions(run.Options):
     Attributes:
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: draw so many points, from the grid's values or, without one, from the
-        ranges of the paper's appendix.
+        ranges of the paper's appendix; first_seed is the draw's seed, too.
       points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in
         place of grid and random.
       share_counts: points that differ in buffer_steps or discriminator_updates share

@@ -14,6 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from gasil_jax.command_line import InputError
+
 
 class Tracker(Protocol):
     """Where scalars go."""
@@ -46,15 +48,21 @@ class _WeightsAndBiases:
 
         # A run that goes on is the same run there, though it may get more steps;
         # WANDB_MODE=offline needs no account.
-        self._run = wandb.init(
-            project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
-            name=folder.name,
-            dir=str(folder),
-            id=_identifier(folder / "wandb-id"),
-            resume="allow",
-            config=dict(config),
-            allow_val_change=True,
-        )
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
+                name=folder.name,
+                dir=str(folder),
+                id=_identifier(folder / "wandb-id"),
+                resume="allow",
+                config=dict(config),
+                allow_val_change=True,
+            )
+        except wandb.errors.Error as error:
+            raise InputError(
+                f"log is 'wandb', which says: {' '.join(str(error).split())} (once it "
+                "is mended, or with WANDB_MODE=offline, go on with --resume)"
+            ) from None
 
     def log(self, step: int, scalars: Mapping[str, float]) -> None:
         self._run.log(dict(scalars), step=step)
@@ -106,6 +114,9 @@ def make(
       names: of `TRACKERS`.
       folder: of the run; its name is the run's.
       config: what to show of the run.
+
+    Raises:
+      InputError: one can't begin.
     """
     return [TRACKERS[name][1](folder, config) for name in names]
 

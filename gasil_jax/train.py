@@ -4,6 +4,7 @@ Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or
 any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
 """
 
+import math
 from typing import Any, Protocol
 
 import jax
@@ -252,6 +253,12 @@ def check(env: Any, config: Config) -> None:
             f"env is {env!r}: it must be an environment, as gasil_jax.make_env gives"
         )
     validate(config, tuple(AGENTS))
+    limit = getattr(env, "episode_length", math.inf)
+    if (config.max_episode_steps or 0) > limit:
+        raise ValueError(
+            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
+            f"limit is {limit}"
+        )
     AGENTS[config.agent].check(config, env.observation_size, env.action_size)
 
 

@@ -281,6 +281,15 @@ def test_a_difference_over_several_tasks():
     assert report.verdict(*report.together(same)[1:]) == "not clear"
 
 
+def test_a_curve_without_an_ended_episode_is_drawn_without(tmp_path):
+    trial = trials.Trial("hopper/ppo", "hopper", "ppo")
+    returns = np.full((1, 10, 2), np.nan)
+    known = trials.Results(trial, np.arange(10), np.array([1, 2]), returns, ())
+    path = tmp_path / "figure.png"
+    report.draw({"hopper": {"ppo": known}}, [trial], path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -290,6 +299,8 @@ def test_a_difference_over_several_tasks():
         (("--processes", "0"), "processes is 0"),
         (("--processes", "2", "--part", "1/2"), "processes is 2"),
         (("--processes", "2", "--share-counts"), "processes is 2"),
+        (("--report", "--part", "1/3"), "part is 1/3: --report is of all parts"),
+        (("--quick", "--results", "x"), "results is x: --quick writes below --runs"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):

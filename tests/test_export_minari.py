@@ -65,6 +65,25 @@ def test_whole_episodes_come_back(filled, capsys):
     assert "discounted return (gamma 0.99)" in metadata["description"]
 
 
+def test_the_discount_is_that_of_the_states(filled, monkeypatch):
+    out, _ = filled
+    told = {}
+    load = evaluate.load
+
+    def of_a_swept_point(folder, which, point):
+        env, config, seeds, states = load(folder)
+        floats = states.hyperparameters
+        floats = floats.replace(gamma=0.9 * jnp.ones_like(floats.gamma))
+        return env, config, seeds, states.replace(hyperparameters=floats)
+
+    monkeypatch.setattr(evaluate, "load", of_a_swept_point)
+    monkeypatch.setattr(
+        export_minari, "write", lambda *_, **settings: told.update(settings)
+    )
+    assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
+    assert "(gamma 0.9)" in told["description"]
+
+
 def test_a_buffer_s_last_episode_is_kept_if_it_is_whole():
     lengths = lambda kept, *limits: [
         len(episode.action) for episode in export_minari.episodes(kept, *limits)

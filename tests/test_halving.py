@@ -3,6 +3,7 @@
 import csv
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -12,7 +13,8 @@ import pytest
 from test_resume import finish, wait_for
 from test_sweep import SMALL
 
-from gasil_jax import command_line, evaluate, halving
+from gasil_jax import command_line, evaluate, halving, run, run_folder
+from gasil_jax.interruption import Interrupted
 
 pytest.importorskip("optuna")
 
@@ -103,6 +105,53 @@ def test_processes_share_a_study(tmp_path):
         "FAIL",
     ]
     assert study.best_params == points[0]
+
+
+@pytest.fixture
+def stubbed(tmp_path, monkeypatch):
+    """`climb` of two points whose training is a function of its interruption."""
+
+    def climb(trained):
+        arguments = [*SMALL, "--total-steps", "1024", "--grid", "alpha=0.1,1"]
+        arguments += ["--first-rung", "512", "--reduction", "2", "--out", str(tmp_path)]
+        options = run.parse(halving.Options, arguments, "x")
+        monkeypatch.setattr(halving, "_batches", lambda *_: lambda index: None)
+        monkeypatch.setattr(
+            halving, "_train", lambda _, index, *more: trained(index, more[-1])
+        )
+        return halving.climb(options, None, [{"alpha": 0.1}, {"alpha": 1.0}], tmp_path)
+
+    return climb
+
+
+def test_a_point_that_another_has_just_taken_keeps_the_study_open(
+    stubbed, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(halving, "_is_free", lambda place: True)
+    taken = tmp_path / "points" / "1"
+    taken.mkdir(parents=True)
+    order = []
+    score = lambda index, interruption: order.append(index) or float(index)
+    with run_folder.lock(taken):
+        assert stubbed(score) is None
+    study = stubbed(score)
+    assert order == [0, 0, 1, 1]
+    assert study.scores()[1] == {512: 1.0, 1024: 1.0}
+
+
+def test_a_signal_while_a_rung_ends_is_not_forgotten(stubbed):
+    seen = []
+
+    def train(index, interruption):
+        seen.append(interruption.signal)
+        if interruption.signal is not None:
+            raise Interrupted(interruption.signal)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return 0.0
+
+    with pytest.raises(Interrupted):
+        stubbed(train)
+    assert seen == [None, signal.SIGTERM]
 
 
 def test_points_climb_and_go_on_in_another_process(tmp_path):

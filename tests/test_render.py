@@ -117,6 +117,8 @@ def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
         (["--out", str(tmp_path / "there.gif")], "which exists"),
         (["--seed", "9"], "seed is 9: the run has 0 to 1"),
         (["--steps", "0"], "steps is 0"),
+        (["--key", "-1"], "key is -1: it must be from 0 to 4294967295"),
+        (["--out", "/proc/nowhere/film.gif"], "out is /proc/nowhere/film.gif"),
     ):
         assert render.main([str(point_mass), *arguments]) == 2
         error = capsys.readouterr().err

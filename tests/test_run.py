@@ -120,8 +120,11 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env brax:ant --physics mujoco", "brax:ant has its own"),
         ("--env nowhere:Line", "'nowhere:Line' can't be imported: No module"),
         ("--env json:Line", "has no attribute 'Line'"),
-        ("--env sys:path", "it must build an environment"),
-        ("--env json:loads --physics mujoco", "json:loads has its own"),
+        ("--env sys:path", "must build an environment without arguments"),
+        ("--env json:loads", "arguments: missing a required argument: 's'"),
+        ("--env os:getcwd", "'os:getcwd' is no environment: it has no reset"),
+        ("--env os:getcwd --physics mujoco", "os:getcwd has its own"),
+        ("--env point_mass --max-episode-steps 51", "environment's own limit is 50"),
         ("", "--env"),
     ],
 )

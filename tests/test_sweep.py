@@ -159,6 +159,8 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
         states.params,
         by_itself.params,
     )
+    with pytest.raises(ValueError, match="it must be 'last'"):
+        evaluate.load(out, "best", point=1)
     best = evaluate.load(out)[1]
     assert best.discriminator_updates == (1, 3)[summary["best_by_mean"]]
     assert evaluate.main([str(out), "--point", "4"]) == 2

@@ -98,6 +98,19 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
+def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
+    wandb = pytest.importorskip("wandb")
+
+    def refuse(**settings):
+        raise wandb.errors.UsageError("No API key\nconfigured.")
+
+    monkeypatch.setattr(wandb, "init", refuse)
+    out = ("--out", str(tmp_path / "out"))
+    assert run.main([*SMALL, "--log", "wandb", *out]) == 2
+    *_, told = capsys.readouterr().err.splitlines()
+    assert "error: log is 'wandb', which says: No API key configured." in told
+
+
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
     assert run.main([*SMALL, "--log", "tensorbord"]) == 2
     assert "log is 'tensorbord': it must be of tensorboard" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import dataclasses
 import difflib
 import importlib
+import inspect
 import math
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -80,8 +81,12 @@ def _of_user(name: str) -> Callable[[], Env]:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"env {name!r} can't be imported: {error}") from None
-    if not callable(found):
-        raise ValueError(f"env {name!r} is {found!r}: it must build an environment")
+    try:
+        inspect.signature(found).bind()
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"env {name!r} must build an environment without arguments: {error}"
+        ) from None
     return found
 
 
@@ -136,6 +141,9 @@ def make(name: str, **settings: Any) -> Env:
         env = brax.envs.get_environment(name.removeprefix(BRAX))
     elif ":" in name:
         env = _of_user(name)()
+        for needed in ("reset", "step", "observation_size", "action_size"):
+            if not hasattr(env, needed):
+                raise ValueError(f"env {name!r} is no environment: it has no {needed}")
     else:
         env = _constructors()[name](chosen)
     env = wrappers.EpisodeLimit(env, getattr(env, "episode_length", _EPISODE_LENGTH))
