@@ -43,6 +43,15 @@ def table() -> str:
     return "\n".join(lines)
 
 
+def tallies() -> tuple[str, ...]:
+    """What the comparisons of figures 5 and 7 come to: Markdown."""
+    return tuple(
+        figure.conclusions(report.panels(make(), trials.RESULTS / figure.name))
+        for figure, make in FIGURES
+        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE)
+    )
+
+
 def _cell(known: trials.Results | None) -> str:
     if known is None:
         return ""
