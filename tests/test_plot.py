@@ -1,5 +1,7 @@
 """Statistics against plain twins, and the figures."""
 
+import csv
+
 import numpy as np
 import pytest
 import scipy.stats
@@ -69,6 +71,19 @@ def test_runs_are_drawn(tmp_path, capsys):
     capsys.readouterr()
     curves = plot.read(tmp_path / "ppo")
     assert curves.returns.shape == (3, 8) and curves.env_steps[-1] == 2048
+
+    # Where none ended in the last tenth, the last that did count, as in the summary.
+    path = tmp_path / "ppo" / "metrics.csv"
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    with path.open("w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            late = {"episode_return": "nan"} if float(row["env_steps"]) == 2048 else {}
+            writer.writerow(row | late)
+    final = [float(x["episode_return"]) for x in rows if float(x["env_steps"]) == 1792]
+    np.testing.assert_allclose(plot.read(tmp_path / "ppo").final, final)
 
     for arguments, message in (
         ([*folders, "--out", str(out)], "which exists"),
