@@ -130,7 +130,7 @@ def _run(
         trials.check(trial, folder)
     for trial in chosen:
         trials.adopt(trial, folder)
-    todo = [trial for trial in chosen if not _complete(trial, folder)]
+    todo = [trial for trial in chosen if trials.read_whole(trial, folder) is None]
     if done := len(chosen) - len(todo):
         print(f"{done} of {len(chosen)} trials are in {folder} already")
     if options.report:
@@ -152,11 +152,6 @@ def _run(
         write(figure, wanted, results)
         print(f"in {results / figure.name}.md")
     return 0
-
-
-def _complete(trial: Trial, folder: pathlib.Path) -> bool:
-    known = trials.read(trial, folder)
-    return known is not None and known.complete
 
 
 def _choose(wanted: Sequence[Trial], only: Sequence[str]) -> list[Trial]:

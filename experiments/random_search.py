@@ -193,11 +193,7 @@ def confirmation(
 def _complete(trial: Trial | None) -> trials.Results | None:
     if trial is None:
         return None
-    return _whole(trials.read(trial, trials.RESULTS / FIGURE.name))
-
-
-def _whole(known: trials.Results | None) -> trials.Results | None:
-    return known if known is not None and known.complete else None
+    return trials.read_whole(trial, trials.RESULTS / FIGURE.name)
 
 
 def make() -> list[Trial]:
@@ -287,7 +283,9 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         for agent, known in curves.items():
             if agent.endswith(_SECOND):
                 continue
-            second = _whole(curves.get(agent + _SECOND))
+            second = curves.get(agent + _SECOND)
+            if second is not None and not second.complete:
+                second = None
             chosen, final = _best(known, second)
             said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
             cells = [name, agent, _size(known), _size(second), said]

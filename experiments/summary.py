@@ -23,6 +23,8 @@ FIGURES = (
     (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
     (hyperparameters.FIGURE, hyperparameters.make),
 )
+# Of all agents on the locomotion tasks, with the reward's delay.
+_COMPARISONS = ((mujoco.FIGURE, 1), (delayed_mujoco.FIGURE, random_search.DELAY))
 
 
 def table() -> str:
@@ -31,10 +33,7 @@ def table() -> str:
         f"| | {' | '.join(agent.upper() for agent in trials.AGENTS)} |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for figure, delay in (
-        (mujoco.FIGURE, 1),
-        (delayed_mujoco.FIGURE, random_search.DELAY),
-    ):
+    for figure, delay in _COMPARISONS:
         folder = trials.RESULTS / figure.name
         for task, curves in report.panels(comparison.make(delay), folder).items():
             name = task if delay == 1 else f"{task}, delayed"
@@ -46,9 +45,10 @@ def table() -> str:
 def tallies() -> tuple[str, ...]:
     """What the comparisons of figures 5 and 7 come to: Markdown."""
     return tuple(
-        figure.conclusions(report.panels(make(), trials.RESULTS / figure.name))
-        for figure, make in FIGURES
-        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE)
+        figure.conclusions(
+            report.panels(comparison.make(delay), trials.RESULTS / figure.name)
+        )
+        for figure, delay in _COMPARISONS
     )
 
 

@@ -30,8 +30,9 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 NUM_ENVS = 32
 #: More where physics is slow, for a GPU is fast only with thousands.
 NUM_ENVS_OF = {"ant": 64, "humanoid": 64}
-# The appendix's values, which a trial's points stand on; no tuned preset.
-_FLAGS = ("--preset", "paper")
+# The appendix's values, which a trial's points stand on; no tuned preset, and no
+# schedule of alpha: the paper's, of humanoid, begins at 2M steps.
+_FLAGS = ("--preset", "paper", "--alpha-schedule")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,8 +117,7 @@ def train(
             *("--total-steps", str(trial.total_steps), "--out", str(place)),
             *("--resume", "--points-file", str(listed)),
             *(("--shard", f"{part}/{parts}") if parts > 1 else ()),
-            # None: the paper's, of humanoid, begins at 2M steps.
-            *("--alpha-schedule", *flags),
+            *flags,
         ]
     )
 
@@ -333,6 +333,12 @@ class Results:
         rows = self.returns[..., chosen]
         count = np.isfinite(rows).sum(axis=-1)
         return np.where(count > 0, np.nansum(rows, -1) / np.maximum(count, 1), np.nan)
+
+
+def read_whole(trial: Trial, results: pathlib.Path) -> Results | None:
+    """`read`, where all seeds of the trial are complete; None elsewhere."""
+    known = read(trial, results)
+    return known if known is not None and known.complete else None
 
 
 def read(trial: Trial, results: pathlib.Path) -> Results | None:

@@ -149,7 +149,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         draw(runs, options.out)
     except OSError as error:
-        print(f"error: out is {options.out}: {error.strerror}", file=sys.stderr)
+        print(f"error: {run_folder.unwritable(options.out, error)}", file=sys.stderr)
         return 1
     print("run                             seeds  interquartile mean  95% interval")
     for run in runs:

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 import tyro
 
-from gasil_jax import batch, command_line, evaluate, policy
+from gasil_jax import batch, command_line, evaluate, policy, run_folder
 from gasil_jax.command_line import InputError
 from gasil_jax.progress import announced
 
@@ -245,10 +245,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 value = getattr(options, name)
                 raise InputError(f"{name} is {value}: it must be 1 or more")
         evaluate.check_key(options.key)
-        try:
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(f"out is {options.out}: {error.strerror}") from None
         # A film's encoder takes no odd number of pixels.
         size = (options.width + options.width % 2, options.height + options.height % 2)
         env, _, seeds, states = evaluate.load(
@@ -264,6 +260,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f"out is {options.out}, which is for locomotion: of the point mass it "
                 f"must end in {', '.join(_PICTURES)}"
             )
+        try:
+            options.out.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(run_folder.unwritable(options.out, error)) from None
     except ValueError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -39,10 +39,11 @@ def check(out: pathlib.Path, resume: bool) -> None:
         with tempfile.TemporaryDirectory(prefix=".writable-", dir=place):
             pass
     except OSError as error:
-        raise InputError(_unwritable(out, error)) from None
+        raise InputError(unwritable(out, error)) from None
 
 
-def _unwritable(folder: pathlib.Path, error: OSError) -> str:
+def unwritable(folder: pathlib.Path, error: OSError) -> str:
+    """What is said of a folder or file that can't be written."""
     return f"out is {folder}, which can't be written: {error.strerror}"
 
 
@@ -68,7 +69,7 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
             number += 1
     except OSError as error:
         where = folder if out is None else out
-        raise InputError(_unwritable(where, error)) from None
+        raise InputError(unwritable(where, error)) from None
 
 
 @contextlib.contextmanager

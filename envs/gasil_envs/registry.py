@@ -98,10 +98,11 @@ def check(name: str, settings: Settings) -> None:
         _of_user(name)
     else:
         _refuse_unknown("env", name, names())
-    for field in ("physics", "solver", "integrator") if ":" in name else ():
-        value = getattr(settings, field)
-        if value != getattr(Settings, field):
-            raise ValueError(f"{field} is {value!r}: {name} has its own")
+    if ":" in name:
+        for field in ("physics", "solver", "integrator"):
+            value = getattr(settings, field)
+            if value != getattr(Settings, field):
+                raise ValueError(f"{field} is {value!r}: {name} has its own")
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
     _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
