@@ -36,7 +36,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import command, report, trials
+from experiments import command, report, trials, two_stage
 from experiments.report import Figure
 from experiments.trials import AGENTS, TASKS, Trial
 from gasil_jax.points import Point
@@ -46,12 +46,8 @@ DELAY = 20
 NOISE = 0.1
 _FIRST_SEED = 1000
 _RUNS = 32
-_SECOND_POINTS, _SECOND_SEEDS, _SECOND_FIRST_SEED = 4, 4, 2000
 # Where a run costs several times as much.
 _RUNS_OF = {"ant": 16, "humanoid": 16}
-_SECOND_SEEDS_OF = {"ant": 2, "humanoid": 2}
-_ENOUGH_SEEDS = 8
-_SECOND = "-best"
 
 #: Lengths other than the trial's own; humanoid is tuned over a third of its figure's.
 STEPS = {"point_mass": 500_000, "humanoid": 333_000}
@@ -103,6 +99,12 @@ FIGURE = Figure(
 _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
 
 
+def every_point(values_of: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
+    """All points of a space."""
+    every = itertools.product(*values_of.values())
+    return tuple(dict(zip(values_of, values, strict=True)) for values in every)
+
+
 def draw(values_of: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
     """At most sixteen distinct points of a space of up to five hyperparameters.
 
@@ -114,9 +116,8 @@ def draw(values_of: Mapping[str, Sequence[Any]]) -> tuple[Point, ...]:
       ValueError: more than sixteen points of more than five hyperparameters, or of
         other than two or four values.
     """
-    every = list(itertools.product(*values_of.values()))
-    if len(every) <= 16:
-        return tuple(dict(zip(values_of, values, strict=True)) for values in every)
+    if len(every := every_point(values_of)) <= 16:
+        return every
     if len(values_of) > 5 or any(len(x) not in (2, 4) for x in values_of.values()):
         raise ValueError(
             f"{dict(values_of)}: at most five hyperparameters of two or four values"
@@ -172,28 +173,12 @@ def search(
 def confirmation(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> Trial | None:
-    """The trial that gives the best points of a search more seeds.
-
-    None before the search is complete, and where its points have enough.
-    """
-    trial = search(env, agent, reward_delay, obs_noise)
-    known = _complete(trial)
-    if known is None or trial.seeds >= _ENOUGH_SEEDS:
-        return None
-    best_first = np.argsort(-_score(_final(known)), kind="stable")
-    return dataclasses.replace(
-        trial,
-        name=trial.name + _SECOND,
-        points=tuple(trial.points[i] for i in best_first[:_SECOND_POINTS]),
-        seeds=_SECOND_SEEDS_OF.get(env, _SECOND_SEEDS),
-        first_seed=_SECOND_FIRST_SEED,
-    )
+    """The second stage of the search that tunes an agent on a task."""
+    return two_stage.second(search(env, agent, reward_delay, obs_noise), _folder())
 
 
-def _complete(trial: Trial | None) -> trials.Results | None:
-    if trial is None:
-        return None
-    return trials.read_whole(trial, trials.RESULTS / FIGURE.name)
+def _folder() -> pathlib.Path:
+    return trials.RESULTS / FIGURE.name
 
 
 def make() -> list[Trial]:
@@ -208,15 +193,6 @@ def make() -> list[Trial]:
     return [search(*each) for each in every] + [x for x in second if x is not None]
 
 
-def _score(final: np.ndarray) -> np.ndarray:
-    """What points are compared by: (points, seeds) -> (points,).
-
-    -inf where a seed ended no episode.
-    """
-    score = final.mean(axis=1)
-    return np.where(np.isfinite(score), score, -np.inf)
-
-
 def best(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> Point | None:
@@ -224,44 +200,14 @@ def best(
 
     While the second is not, the first's best.
     """
-    task = (env, agent, reward_delay, obs_noise)
-    known = _complete(search(*task))
-    if known is None:
-        return None
-    second = _complete(confirmation(*task))
-    return _best(known, second)[0]
+    return two_stage.best(search(env, agent, reward_delay, obs_noise), _folder())
 
 
 def is_whole(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> bool:
     """Whether both stages of a search are complete, so that `best` is final."""
-    task = (env, agent, reward_delay, obs_noise)
-    if _complete(search(*task)) is None:
-        return False
-    second = confirmation(*task)
-    return second is None or _complete(second) is not None
-
-
-def _final(known: trials.Results) -> np.ndarray:
-    """Mean return over the last fifth of training, (points, seeds)."""
-    return known.part(0.8, 1.0)
-
-
-def _best(
-    first: trials.Results, second: trials.Results | None
-) -> tuple[Point, np.ndarray]:
-    """The best point, and its final returns in both stages (seeds,).
-
-    Once there is a second stage, it is one of that stage's.
-    """
-    points, final = first.trial.points, _final(first)
-    if second is not None:
-        places = [points.index(point) for point in second.trial.points]
-        points = second.trial.points
-        final = np.concatenate([final[places], _final(second)], axis=1)
-    place = int(_score(final).argmax())
-    return points[place], final[place]
+    return two_stage.is_whole(search(env, agent, reward_delay, obs_noise), _folder())
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
@@ -281,15 +227,15 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
     ]
     for name, curves in report.panels(wanted, results / figure.name).items():
         for agent, known in curves.items():
-            if agent.endswith(_SECOND):
+            if agent.endswith(two_stage.SUFFIX):
                 continue
-            second = curves.get(agent + _SECOND)
+            second = curves.get(agent + two_stage.SUFFIX)
             if second is not None and not second.complete:
                 second = None
-            chosen, final = _best(known, second)
+            chosen, final = two_stage.best_point(known, second)
             said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
             cells = [name, agent, _size(known), _size(second), said]
-            score = _score(_final(known))
+            score = two_stage.scores(known)
             cells += [f"{final.mean():.0f}", str(len(final))]
             cells += [f"{x:.0f}" for x in (np.median(score), score.min())]
             lines.append(f"| {' | '.join(cells)} |")

@@ -26,6 +26,8 @@ class Figure:
       conclude: from panel -> curve -> results, those with all their seeds, to what
         they say of the claim; default `tally` of the favourite.
       more: what else the page says: what was tried where the claim does not hold.
+      gather: from trials and the folder of all results, to panel -> curve -> results
+        of what is shown; default the trials' own.
     """
 
     name: str
@@ -34,6 +36,17 @@ class Figure:
     favourite: str | None = "ppo+gasil"
     conclude: Callable[[Mapping[str, Mapping[str, Results]]], str] | None = None
     more: str = ""
+    gather: (
+        Callable[[Sequence[Trial], pathlib.Path], dict[str, dict[str, Results]]] | None
+    ) = None
+
+    def shown(
+        self, wanted: Sequence[Trial], results: pathlib.Path
+    ) -> dict[str, dict[str, Results]]:
+        """Panel -> curve -> results, of what is there of trials."""
+        if self.gather is not None:
+            return self.gather(wanted, results)
+        return panels(wanted, results / self.name)
 
     def conclusions(self, shown: Mapping[str, Mapping[str, Results]]) -> str:
         """What the results that have all their seeds say of the claim, Markdown."""
@@ -282,7 +295,8 @@ def draw(
     )
     names = [trial.name.split("/") for trial in wanted]
     for axes, (panel, curves) in zip(grid.flat, shown.items()):
-        color_of = _colors([curve for of, curve in names if of == panel])
+        listed = [curve for of, curve in names if of == panel]
+        color_of = _colors(list(dict.fromkeys([*listed, *curves])))
         for curve, known in curves.items():
             color = color_of[curve]
             some = np.isfinite(known.returns[0]).all(axis=0)
@@ -308,8 +322,9 @@ def _colors(curves: Sequence[str]) -> dict[str, Any]:
     """An agent's is the same in every figure; values in order go from dark to light."""
     import matplotlib
 
-    if set(curves) <= set(trials.AGENTS):
-        return dict(zip(trials.AGENTS, plot.COLORS, strict=False))
+    if set(curves) & set(trials.AGENTS):
+        every = dict.fromkeys([*trials.AGENTS, *curves])
+        return dict(zip(every, plot.COLORS, strict=False))
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
     return dict(zip(curves, shades, strict=True))
 
@@ -339,7 +354,7 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
     """Write the page and the figure of what there is."""
-    shown = panels(wanted, results / figure.name)
+    shown = figure.shown(wanted, results)
     if not shown:
         return
     draw(shown, wanted, results / f"{figure.name}.png")

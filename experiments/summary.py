@@ -34,8 +34,8 @@ def table() -> str:
         "| --- | --- | --- | --- | --- |",
     ]
     for figure, delay in _COMPARISONS:
-        folder = trials.RESULTS / figure.name
-        for task, curves in report.panels(comparison.make(delay), folder).items():
+        shown = figure.shown(comparison.make(delay), trials.RESULTS)
+        for task, curves in shown.items():
             name = task if delay == 1 else f"{task}, delayed"
             cells = [_cell(curves.get(agent)) for agent in trials.AGENTS]
             lines.append(f"| {name} | {' | '.join(cells)} |")
@@ -45,9 +45,7 @@ def table() -> str:
 def tallies() -> tuple[str, ...]:
     """What the comparisons of figures 5 and 7 come to: Markdown."""
     return tuple(
-        figure.conclusions(
-            report.panels(comparison.make(delay), trials.RESULTS / figure.name)
-        )
+        figure.conclusions(figure.shown(comparison.make(delay), trials.RESULTS))
         for figure, delay in _COMPARISONS
     )
 
@@ -71,14 +69,9 @@ def page() -> str:
     ]
     for figure, make in FIGURES:
         wanted = make()
-        shown = report.panels(wanted, trials.RESULTS / figure.name)
-        complete = {
-            known.trial.name
-            for curves in shown.values()
-            for known in curves.values()
-            if known.complete
-        }
-        missing = [trial.name for trial in wanted if trial.name not in complete]
+        shown = figure.shown(wanted, trials.RESULTS)
+        folder = trials.RESULTS / figure.name
+        missing = [x.name for x in wanted if trials.read_whole(x, folder) is None]
         parts += [f"## {figure.title}", f"**Claim.** {figure.claim}"]
         if shown:
             parts += [

@@ -3,6 +3,7 @@
 import collections
 import csv
 import dataclasses
+import functools
 import itertools
 import json
 import multiprocessing
@@ -31,6 +32,7 @@ from experiments import (
     stochastic_walker2d,
     summary,
     trials,
+    wider_search,
 )
 from gasil_jax import shards
 from gasil_jax.config import Config
@@ -57,6 +59,16 @@ def toy(monkeypatch):
 
         monkeypatch.setattr(module, "make", make)
 
+    def make_wider(make=wider_search.make):
+        return [
+            dataclasses.replace(
+                trial, env="point_mass", points=trial.points[:1], first_seed=0
+            )
+            for trial in make()
+        ]
+
+    monkeypatch.setattr(wider_search, "make", make_wider)
+
 
 @pytest.mark.parametrize(
     ("module", "only"),
@@ -65,6 +77,7 @@ def toy(monkeypatch):
         (delayed_mujoco, "ant/ppo+bc"),
         (stochastic_walker2d, "noise 0/ppo"),
         (hyperparameters, "discriminator_updates/1"),
+        (wider_search, "hopper-search/ppo+gasil"),
     ],
 )
 def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, capsys):
@@ -83,7 +96,7 @@ def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, c
         expected = "" if np.isnan(value) else f"{value:.6g}"
         assert row["episode_return"] == expected
     page = tmp_path / "results" / f"{name}.md"
-    assert only.split("/")[0] in page.read_text()
+    assert only.split("/")[0].removesuffix("-search") in page.read_text()
     # Nothing is trained twice, and other settings do not get in between.
     capsys.readouterr()
     assert module.main(arguments) == 0
@@ -210,6 +223,19 @@ def test_a_signal_ends_all_runs_and_they_have_saved(tmp_path):
     assert len(of_runs("checkpoints/0*/manifest.json")) == 2
 
 
+def write_results(folder, trial, scores):
+    """As if each point's seeds all had ended with its score."""
+    target = folder / f"{trial.name}.csv"
+    target.parent.mkdir(parents=True, exist_ok=True)
+    lines = ["point,seed,env_steps,episode_return"]
+    for point, score in enumerate(scores):
+        for seed in range(trial.first_seed, trial.first_seed + trial.seeds):
+            lines += [f"{point},{seed},80,0", f"{point},{seed},100,{score}"]
+    target.write_text("\n".join(lines) + "\n")
+    described = {"settings": trial.settings(), "made": []}
+    target.with_suffix(".json").write_text(json.dumps(described))
+
+
 def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     """What looks best with few seeds is not taken if more seeds say otherwise."""
     monkeypatch.setattr(trials, "RESULTS", tmp_path)
@@ -218,16 +244,7 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     monkeypatch.setattr(random_search, "_RUNS", 10)
     arguments = ("hopper", "ppo", 1)
 
-    def write(trial, scores):
-        target = tmp_path / "random_search" / f"{trial.name}.csv"
-        target.parent.mkdir(parents=True, exist_ok=True)
-        lines = ["point,seed,env_steps,episode_return"]
-        for point, score in enumerate(scores):
-            for seed in range(trial.first_seed, trial.first_seed + trial.seeds):
-                lines += [f"{point},{seed},80,0", f"{point},{seed},100,{score}"]
-        target.write_text("\n".join(lines) + "\n")
-        described = {"settings": trial.settings(), "made": []}
-        target.with_suffix(".json").write_text(json.dumps(described))
+    write = functools.partial(write_results, tmp_path / "random_search")
 
     assert random_search.confirmation(*arguments) is None
     write(random_search.search(*arguments), (1.0, 9.0, 3.0, 8.0, 7.0))
@@ -240,6 +257,45 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     # 2 seeds with 9 and 4 with 2; 8 and 7: 8 x 2 + 7 x 4 is more.
     write(second, (2.0, 7.0, 6.0, 3.0))
     assert random_search.best(*arguments) == {"learning_rate": 2e-4}
+
+
+def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch):
+    for name in ("random_search", "delayed_mujoco"):
+        (tmp_path / name).symlink_to(trials.RESULTS / name)
+    monkeypatch.setattr(trials, "RESULTS", tmp_path)
+    with (tmp_path / "random_search/hopper-delayed/ppo+gasil.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if int(row["env_steps"]) > 800_000]
+    first = random_search.search("hopper", "ppo+gasil", random_search.DELAY)
+    search = wider_search.search("hopper")
+    for name in ("learning_rate", "alpha"):
+        finals = collections.defaultdict(list)
+        for row in rows:
+            value = first.points[int(row["point"])][name]
+            finals[value].append(float(row["episode_return"]))
+        best = max(finals, key=lambda value: np.mean(finals[value]))
+        assert {point[name] for point in search.points} == {best}
+    assert len({tuple(point.items()) for point in search.points}) == 32
+    assert [trial.name for trial in wider_search.make() if trial.env == "hopper"] == [
+        "hopper-search/ppo+gasil"
+    ]
+    write_results(tmp_path / "wider_search", search, range(32))
+    second = wider_search.make()[1]
+    assert second.points == search.points[:-5:-1]
+    write_results(tmp_path / "wider_search", second, (0.0, 0.0, 99.0, 0.0))
+    final = wider_search.make()[2]
+    assert final.points == (second.points[2],) and final.name == "hopper/ppo+gasil"
+    figure7 = comparison.make(random_search.DELAY)[3]
+    assert final == dataclasses.replace(figure7, points=final.points)
+    write_results(tmp_path / "wider_search", final, (77.0,))
+    wanted = wider_search.make()
+    shown = wider_search.FIGURE.shown(wanted, tmp_path)["hopper"]
+    assert list(shown) == [*trials.AGENTS[:3], "ppo+gasil of figure 7", "ppo+gasil"]
+    assert shown["ppo+gasil"].final.tolist() == [[77.0] * 10]
+    wider_search.write(wider_search.FIGURE, wanted, tmp_path)
+    page = (tmp_path / "wider_search.md").read_text()
+    assert "ppo+gasil better than ppo+gasil of figure 7: no, it is lower on 1" in page
+    # The last point is of most updates at the least rate with the larger buffer.
+    assert "| 20 | 30, 31 | 28, 29 | 26, 27 | 24, 25 |" in page
 
 
 def test_every_pair_of_values_is_drawn_equally_often():
@@ -315,6 +371,7 @@ PUBLISHED = (
     delayed_mujoco,
     stochastic_walker2d,
     hyperparameters,
+    wider_search,
 )
 
 
@@ -335,7 +392,9 @@ def test_published_numbers_are_those_of_the_csv_files(module, tmp_path, monkeypa
         pytest.skip("not run yet")
     target = tmp_path / "results"
     target.mkdir()
-    (target / module.FIGURE.name).symlink_to(trials.RESULTS / module.FIGURE.name)
+    for folder in (module.FIGURE.name, "delayed_mujoco"):
+        if not (target / folder).exists():
+            (target / folder).symlink_to(trials.RESULTS / folder)
     write(module.FIGURE, wanted, target)
     assert (target / page.name).read_text() == page.read_text()
     # The files say themselves what they are of.

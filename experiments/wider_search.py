@@ -1,0 +1,176 @@
+"""PPO+GASIL on delayed tasks, searched further: ``python -m experiments.wider_search``.
+
+Figure 7's search gives every agent as many runs. PPO+BC and PPO+SIL have eight points,
+all of them tried; PPO+GASIL has 256, of which it tries sixteen. Here it gets another
+search. Learning rate and alpha are the values that did best in the first (by the mean
+of the points that have them: each met every value of the others equally often), and all
+32 points of the other three hyperparameters get two seeds, then the best four get four
+more. The best point of all has ten seeds, those of figure 7, with whose curves it is
+compared.
+"""
+
+import dataclasses
+import pathlib
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from experiments import (
+    command,
+    comparison,
+    delayed_mujoco,
+    random_search,
+    report,
+    trials,
+    two_stage,
+)
+from experiments.report import Figure
+from experiments.trials import Results, Trial
+
+AGENT = "ppo+gasil"
+# What a first search leaves open.
+_FREE = ("discriminator_updates", "discriminator_learning_rate", "buffer_steps")
+#: Ant and humanoid cost several times as much, and no agent has learned to walk there.
+TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer")
+_SEEDS = 2
+# The agent's curve in figure 7, beside the one of here.
+_FIRST = f"{AGENT} of figure 7"
+# What the name of a search's panel ends with.
+_SEARCH = "-search"
+
+
+def _gather(
+    wanted: Sequence[Trial], results: pathlib.Path
+) -> dict[str, dict[str, Results]]:
+    """What is there of the tuned agent on each task, beside figure 7's curves."""
+    figure7 = comparison.make(random_search.DELAY)
+    before = report.panels(figure7, results / delayed_mujoco.FIGURE.name)
+    shown: dict[str, dict[str, Results]] = {}
+    for panel, curves in report.panels(wanted, results / FIGURE.name).items():
+        env = panel.removesuffix(_SEARCH)
+        if env not in shown:
+            others = dict(before.get(env, {}))
+            if AGENT in others:
+                others[_FIRST] = others.pop(AGENT)
+            shown[env] = others
+        if panel == env:
+            shown[env] |= curves
+    return shown
+
+
+FIGURE = Figure(
+    name="wider_search",
+    title="PPO+GASIL on delayed tasks, searched further",
+    claim=delayed_mujoco.FIGURE.claim,
+    more="The other curves are [figure 7's](delayed_mujoco.md).",
+    gather=_gather,
+)
+
+
+def search(env: str) -> Trial | None:
+    """The search on a task; None before figure 7's own is complete."""
+    first = random_search.search(env, AGENT, random_search.DELAY)
+    known = trials.read_whole(first, trials.RESULTS / random_search.FIGURE.name)
+    if known is None:
+        return None
+    space = dict(random_search.space(env, AGENT))
+    for name in set(space) - set(_FREE):
+        space[name] = (_best_value(known, name),)
+    return dataclasses.replace(
+        first,
+        name=f"{env}{_SEARCH}/{AGENT}",
+        points=random_search.every_point(space),
+        seeds=_SEEDS,
+    )
+
+
+def _best_value(known: Results, name: str) -> Any:
+    """The value of a hyperparameter whose points do best, by their mean."""
+    scores_of: dict[Any, list[float]] = {}
+    for point, score in zip(known.trial.points, two_stage.scores(known), strict=True):
+        scores_of.setdefault(point[name], []).append(float(score))
+    return max(scores_of, key=lambda value: np.mean(scores_of[value]))
+
+
+def make() -> list[Trial]:
+    """On each task the search's stages, and ten seeds of its best point once whole."""
+    folder = trials.RESULTS / FIGURE.name
+    wanted = []
+    for env in TASKS:
+        if (first := search(env)) is None:
+            continue
+        second = two_stage.second(first, folder)
+        wanted += [first] if second is None else [first, second]
+        if two_stage.is_whole(first, folder):
+            wanted.append(
+                Trial(
+                    name=f"{env}/{AGENT}",
+                    env=env,
+                    agent=AGENT,
+                    points=(two_stage.best(first, folder) or {},),
+                    reward_delay=first.reward_delay,
+                )
+            )
+    return wanted
+
+
+def _grids(wanted: Sequence[Trial], results: pathlib.Path) -> str:
+    """What each search found, a table for each task: Markdown."""
+    parts = [
+        "## The searches",
+        "Mean return of the last fifth of training, two seeds; in a cell the smaller "
+        "buffer, then the larger.",
+    ]
+    for trial in wanted:
+        known = trials.read_whole(trial, results / FIGURE.name)
+        if known is not None and trial.name.endswith(f"{_SEARCH}/{AGENT}"):
+            parts += [_grid(known)]
+    return "\n\n".join(parts)
+
+
+def _grid(known: Results) -> str:
+    points = known.trial.points
+    score_of = {
+        tuple(point[name] for name in _FREE): score
+        for point, score in zip(points, two_stage.scores(known), strict=True)
+    }
+    updates, rates, sizes = (
+        sorted({point[name] for point in points}) for name in _FREE
+    )
+    task = known.trial.name.split(_SEARCH)[0]
+    head = [f"{task}, updates", *(f"at {rate:g}" for rate in rates)]
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for count in updates:
+        cells = [
+            ", ".join(f"{score_of[count, rate, size]:.0f}" for size in sizes)
+            for rate in rates
+        ]
+        lines.append(f"| {' | '.join([str(count), *cells])} |")
+    return "\n".join(lines)
+
+
+def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
+    """Write the page, with the searches, and the figure of what there is."""
+    more = [figure.more, _grids(wanted, results)]
+    more = "\n\n".join(part for part in more if part)
+    report.write(dataclasses.replace(figure, more=more), wanted, results)
+
+
+def quick(wanted: Sequence[Trial]) -> list[Trial]:
+    """Four points on hopper."""
+    return [
+        dataclasses.replace(trial, points=trial.points[:4])
+        for trial in wanted
+        if trial.name == f"hopper{_SEARCH}/{AGENT}"
+    ]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit status."""
+    return command.main(FIGURE, make, quick, arguments, write)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
