@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from experiments import processes, report, trials
 from experiments.report import Figure
 from experiments.trials import Trial
-from gasil_jax import command_line, run, shards
+from gasil_jax import command_line, shards
 from gasil_jax.command_line import InputError
 
 
@@ -71,7 +71,7 @@ def main(
       write: figure and page.
     """
     program = f"experiments.{figure.name}"
-    return run.exit_status(
+    return command_line.exit_status(
         lambda: _run(
             command_line.parse(Options, arguments, program), figure, make, quick, write
         )

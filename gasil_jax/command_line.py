@@ -2,8 +2,10 @@
 
 import contextlib
 import io
+import pathlib
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import tyro
@@ -14,6 +16,7 @@ from tyro.constructors import (
 )
 
 from gasil_jax.config import Schedule
+from gasil_jax.interruption import Interrupted
 
 T = TypeVar("T")
 
@@ -121,3 +124,28 @@ def _in_one_line(refusal: str) -> str:
     name, whole, value = number.groups()
     kind = "a whole number" if whole else "a number"
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
+
+
+def check_new_file(path: pathlib.Path, endings: Sequence[str]) -> None:
+    """Raise `InputError` unless `out` can be a new file with one of these endings."""
+    if path.suffix not in endings:
+        raise InputError(f"out is {path}: it must end in {', '.join(endings)}")
+    if path.exists():
+        raise InputError(f"out is {path}, which exists: name a new file")
+
+
+def exit_status(work: Callable[[], int | None]) -> int:
+    """Do the work of a command line; its errors become lines on stderr.
+
+    Returns:
+      what the work says, or 0: done; 1: a folder or file can't be written; 2: bad
+      input; 128 and the signal's number: interrupted, and saved.
+    """
+    try:
+        return work() or 0
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    except Interrupted as interrupted:
+        print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
+        return 128 + interrupted.signal

@@ -1,9 +1,10 @@
 """Score policies: as a function, and ``python -m gasil_jax.evaluate RUN``."""
 
+import csv
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import jax
@@ -22,6 +23,7 @@ from gasil_jax import (
     run_folder,
     train,
 )
+from gasil_jax.command_line import InputError
 from gasil_jax.config import Config
 from gasil_jax.networks import Policy
 from gasil_jax.progress import announced
@@ -133,26 +135,37 @@ class Options:
       run: the run's folder.
       point: of a sweep, its number in results.csv; default the best by mean.
       checkpoint: which policies: last, or, of a run, best by mean return in training.
+      seed: score this one alone; default all.
       episodes: how many for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
       gymnasium: score in Gymnasium, on C MuJoCo, instead; for locomotion, with the
         policy's mean and without delay and noise.
       key: of the episodes' starts and actions.
+      out: also write every episode's return and length to this new file, CSV.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
     point: int | None = None
     checkpoint: Literal["last", "best"] = "last"
+    seed: int | None = None
     episodes: int = 20
     stochastic: bool = False
     gymnasium: bool = False
     key: int = 0
+    out: pathlib.Path | None = None
 
 
 def check_key(key: int) -> None:
-    """Raise `ValueError` for a key that is none of JAX's and of Gymnasium's."""
+    """Raise `InputError` for a key that is none of JAX's and of Gymnasium's."""
     if not 0 <= key < 2**32:
-        raise ValueError(f"key is {key}: it must be from 0 to {2**32 - 1}")
+        raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
+
+
+def seed_place(seeds: Sequence[int], seed: int) -> int:
+    """Where a seed is among a run's; raises `InputError` if it is not."""
+    if seed not in seeds:
+        raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
+    return seeds.index(seed)
 
 
 def load(
@@ -166,7 +179,7 @@ def load(
       point: of a sweep; default the best by mean.
 
     Raises:
-      ValueError: it is not the folder of a run, or has no such checkpoint, or the best
+      InputError: it is not the folder of a run, or has no such checkpoint, or the best
         is asked for of a point that shares its checkpoints with others.
     """
     from gasil_jax import checkpoint, saved_states
@@ -179,22 +192,25 @@ def load(
     config, count = saved.program.config, len(saved.program.members)
     if which == "best":
         if len(saved.places) < count:
-            raise ValueError(
+            raise InputError(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
         found = checkpoint.best(saved.root)
     if found is None:
         scored = " in whose time an episode ended" if which == "best" else ""
-        raise ValueError(f"run is {folder}: it has no whole checkpoint{scored}")
+        raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
-    env = environments.make_env(described["env"], **settings)
-    # All members have leaves of the same names.
-    init = lambda seed: train.init(
-        env, config, jax.random.key(seed), saved.program.hyperparameters[0]
-    )
-    like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-    states = found.restore(like)
+    try:
+        env = environments.make_env(described["env"], **settings)
+        # All members have leaves of the same names.
+        init = lambda seed: train.init(
+            env, config, jax.random.key(seed), saved.program.hyperparameters[0]
+        )
+        like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
+        states = found.restore(like)
+    except ValueError as error:
+        raise InputError(str(error)) from None
     if len(saved.places) < count:
         places = np.array(saved.places)
         states = jax.tree.map(lambda x: x[places], states)
@@ -216,7 +232,9 @@ def _score(
             )
         )
     )
-    keys = jax.random.split(jax.random.key(options.key), len(seeds))
+    # A seed scored alone scores as among others.
+    fold = lambda seed: jax.random.fold_in(jax.random.key(options.key), seed)
+    keys = jax.vmap(fold)(jnp.array(seeds, jnp.uint32))
     return jax.tree.map(np.asarray, score(states, keys))
 
 
@@ -237,23 +255,31 @@ def _score_in_gymnasium(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
-        if options.episodes < 1:
-            raise ValueError(f"episodes is {options.episodes}: it must be 1 or more")
-        check_key(options.key)
-        env, config, seeds, states = load(
-            options.run, options.checkpoint, options.point
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
+    if options.episodes < 1:
+        raise InputError(f"episodes is {options.episodes}: it must be 1 or more")
+    check_key(options.key)
+    if options.out is not None:
+        command_line.check_new_file(options.out, (".csv",))
+    env, config, seeds, states = load(options.run, options.checkpoint, options.point)
+    if options.seed is not None:
+        place = seed_place(seeds, options.seed)
+        seeds, states = (
+            [options.seed],
+            jax.tree.map(lambda x: x[np.array([place])], states),
         )
-        locomotion = hasattr(env.unwrapped, "task")
-        if options.gymnasium and not (locomotion and not options.stochastic):
-            raise ValueError(
-                "gymnasium is on: the run must be of a locomotion task, and "
-                "stochastic must be off"
-            )
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    locomotion = hasattr(env.unwrapped, "task")
+    if options.gymnasium and not (locomotion and not options.stochastic):
+        raise InputError(
+            "gymnasium is on: the run must be of a locomotion task, and stochastic "
+            "must be off"
+        )
+    if options.out is not None:
+        run_folder.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")
     with announced("evaluate", f"scoring {len(seeds)} policies"):
         if options.gymnasium:
@@ -269,7 +295,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{returns.std():10.2f}  {length.mean():6.1f}"
         )
     print(f"mean over seeds: {scores['episode_return'].mean():.2f}")
-    return 0
+    if options.out is not None:
+        _write(options.out, seeds, scores)
+        print(f"in {options.out}")
+
+
+def _write(
+    path: pathlib.Path, seeds: Sequence[int], scores: Mapping[str, np.ndarray]
+) -> None:
+    """A row for each episode."""
+    with path.open("x", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["seed", "episode", *scores])
+        for index, seed in enumerate(seeds):
+            columns = [values[index].tolist() for values in scores.values()]
+            for episode, values in enumerate(zip(*columns, strict=True)):
+                writer.writerow([seed, episode, *values])
 
 
 if __name__ == "__main__":

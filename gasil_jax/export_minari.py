@@ -165,33 +165,31 @@ def write(name: str, found: Sequence[Episode], **metadata: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
-        check_name(options.name)
-        env, config, seeds, states = evaluate.load(
-            options.run, options.checkpoint, options.point
-        )
-        if options.seed is not None and options.seed not in seeds:
-            raise InputError(
-                f"seed is {options.seed}: the run has {seeds[0]} to {seeds[-1]}"
-            )
-        limit = train.max_episode_steps(env, config)
-        most = states.hyperparameters.max_buffer_steps
-        members = [
-            batch.member(jax.device_get((states.good_trajectories, most)), index)
-            for index, seed in enumerate(seeds)
-            if options.seed in (None, seed)
-        ]
-        found = [
-            episode
-            for buffer, max_steps in members
-            for episode in episodes(buffer, limit, max_steps)
-        ]
-        if not found:
-            raise InputError(f"run is {options.run}: no whole episode is in its buffer")
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
+    check_name(options.name)
+    env, config, seeds, states = evaluate.load(
+        options.run, options.checkpoint, options.point
+    )
+    if options.seed is not None:
+        evaluate.seed_place(seeds, options.seed)
+    limit = train.max_episode_steps(env, config)
+    most = states.hyperparameters.max_buffer_steps
+    members = [
+        batch.member(jax.device_get((states.good_trajectories, most)), index)
+        for index, seed in enumerate(seeds)
+        if options.seed in (None, seed)
+    ]
+    found = [
+        episode
+        for buffer, max_steps in members
+        for episode in episodes(buffer, limit, max_steps)
+    ]
+    if not found:
+        raise InputError(f"run is {options.run}: no whole episode is in its buffer")
     described = run_folder.read(options.run)
     settings = dataclasses.asdict(described["settings"])
     description = _DESCRIPTION.format(
@@ -201,14 +199,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # A sweep's points may differ in it.
         gamma=float(states.hyperparameters.gamma[0]),
     )
-    try:
-        write(options.name, found, algorithm_name=config.agent, description=description)
-    except OSError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    write(options.name, found, algorithm_name=config.agent, description=description)
     steps = sum(len(episode.action) for episode in found)
     print(f"{len(found)} episodes, {steps} steps in {options.name}")
-    return 0
 
 
 if __name__ == "__main__":

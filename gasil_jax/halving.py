@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import run, run_folder, shards, sweep, trackers
+from gasil_jax import command_line, run, run_folder, shards, sweep, trackers
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config
 from gasil_jax.interruption import Interrupted, Interruption
@@ -402,7 +402,7 @@ def write(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    return run.exit_status(lambda: _main(arguments))
+    return command_line.exit_status(lambda: _main(arguments))
 
 
 def _main(arguments: Sequence[str] | None) -> None:

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from gasil_jax import command_line, run, run_folder, shards, sweep_tables
+from gasil_jax import command_line, run_folder, shards, sweep_tables
 from gasil_jax.command_line import InputError
 
 
@@ -139,7 +139,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    return run.exit_status(lambda: _main(arguments))
+    return command_line.exit_status(lambda: _main(arguments))
 
 
 def _main(arguments: Sequence[str] | None) -> None:

@@ -131,26 +131,22 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = command_line.parse(Options, arguments, "gasil_jax.plot")
-        labels = options.labels or (None,) * len(options.runs)
-        if not options.runs:
-            raise InputError("runs is empty: name one folder or more")
-        if len(labels) != len(options.runs):
-            raise InputError(f"labels are {len(labels)}: runs are {len(options.runs)}")
-        if options.out.suffix not in (".png", ".pdf", ".svg"):
-            raise InputError(f"out is {options.out}: it must end in .png, .pdf or .svg")
-        if options.out.exists():
-            raise InputError(f"out is {options.out}, which exists: name a new file")
-        runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "gasil_jax.plot")
+    labels = options.labels or (None,) * len(options.runs)
+    if not options.runs:
+        raise InputError("runs is empty: name one folder or more")
+    if len(labels) != len(options.runs):
+        raise InputError(f"labels are {len(labels)}: runs are {len(options.runs)}")
+    command_line.check_new_file(options.out, (".png", ".pdf", ".svg"))
+    runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
     try:
         draw(runs, options.out)
     except OSError as error:
-        print(f"error: {run_folder.unwritable(options.out, error)}", file=sys.stderr)
-        return 1
+        raise OSError(run_folder.unwritable(options.out, error)) from error
     print("run                             seeds  interquartile mean  95% interval")
     for run in runs:
         low, high = statistics.bootstrap_interval(run.final)
@@ -158,7 +154,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         interval = f"{low:.1f} to {high:.1f}"
         print(f"{run.label:30} {len(run.final):6} {middle:19.1f}  {interval}")
     print(f"in {options.out}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -233,55 +233,46 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    try:
-        options = command_line.parse(Options, arguments, "gasil_jax.render")
-        if options.out.suffix not in (*_PICTURES, _PAGE):
-            allowed = ", ".join((*_PICTURES, _PAGE))
-            raise InputError(f"out is {options.out}: it must end in {allowed}")
-        if options.out.exists():
-            raise InputError(f"out is {options.out}, which exists: name a new file")
-        for name in ("steps", "width", "height"):
-            if getattr(options, name) < 1:
-                value = getattr(options, name)
-                raise InputError(f"{name} is {value}: it must be 1 or more")
-        evaluate.check_key(options.key)
-        # A film's encoder takes no odd number of pixels.
-        size = (options.width + options.width % 2, options.height + options.height % 2)
-        env, _, seeds, states = evaluate.load(
-            options.run, options.checkpoint, options.point
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "gasil_jax.render")
+    command_line.check_new_file(options.out, (*_PICTURES, _PAGE))
+    for name in ("steps", "width", "height"):
+        if getattr(options, name) < 1:
+            value = getattr(options, name)
+            raise InputError(f"{name} is {value}: it must be 1 or more")
+    evaluate.check_key(options.key)
+    # A film's encoder takes no odd number of pixels.
+    size = (options.width + options.width % 2, options.height + options.height % 2)
+    env, _, seeds, states = evaluate.load(
+        options.run, options.checkpoint, options.point
+    )
+    seed = seeds[0] if options.seed is None else options.seed
+    place = evaluate.seed_place(seeds, seed)
+    if not hasattr(env.unwrapped, "model") and not hasattr(env.unwrapped, "layout"):
+        raise InputError("run is of an environment that can't be drawn")
+    if options.out.suffix == _PAGE and not hasattr(env.unwrapped, "model"):
+        raise InputError(
+            f"out is {options.out}, which is for locomotion: of the point mass it "
+            f"must end in {', '.join(_PICTURES)}"
         )
-        seed = seeds[0] if options.seed is None else options.seed
-        if seed not in seeds:
-            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
-        if not hasattr(env.unwrapped, "model") and not hasattr(env.unwrapped, "layout"):
-            raise InputError("run is of an environment that can't be drawn")
-        if options.out.suffix == _PAGE and not hasattr(env.unwrapped, "model"):
-            raise InputError(
-                f"out is {options.out}, which is for locomotion: of the point mass it "
-                f"must end in {', '.join(_PICTURES)}"
-            )
-        try:
-            options.out.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(run_folder.unwritable(options.out, error)) from None
-    except ValueError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    drawn = policy.from_state(batch.member(states, seeds.index(seed)), env)
+    run_folder.make_parent(options.out)
+    drawn = policy.from_state(batch.member(states, place), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     with announced("render", "compiling and running the episode"):
         path, total = episode(env, act, jax.random.key(options.key), options.steps)
     try:
         with announced("render", f"drawing {options.out}"):
             num_frames = save(env, path, size, options.out)
-    except (RuntimeError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
+    except RuntimeError as error:
+        # Of a graphics driver or a film's encoder: the file can't be written.
+        raise OSError(str(error)) from error
     print(
         f"seed {seed}: return {total:.1f} in {len(path) - 1} steps, "
         f"{num_frames} frames in {options.out}"
     )
-    return 0
 
 
 if __name__ == "__main__":

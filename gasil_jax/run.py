@@ -13,7 +13,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import jax
@@ -412,26 +412,9 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
     return np.where(count > 0, mean, newest)
 
 
-def exit_status(work: Callable[[], int | None]) -> int:
-    """Do the work of a command line; its errors become lines on stderr.
-
-    Returns:
-      what the work says, or 0: done; 1: the folder can't be written any more; 2: bad
-      input; 128 and the signal's number: interrupted, and saved.
-    """
-    try:
-        return work() or 0
-    except (InputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2 if isinstance(error, InputError) else 1
-    except Interrupted as interrupted:
-        print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
-        return 128 + interrupted.signal
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    return exit_status(lambda: _main(arguments))
+    return command_line.exit_status(lambda: _main(arguments))
 
 
 def _main(arguments: Sequence[str] | None) -> None:

@@ -47,6 +47,14 @@ def unwritable(folder: pathlib.Path, error: OSError) -> str:
     return f"out is {folder}, which can't be written: {error.strerror}"
 
 
+def make_parent(file: pathlib.Path) -> None:
+    """Make the folder of a file that `out` names; raises `InputError` if it can't."""
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(unwritable(file, error)) from None
+
+
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
     """Make the folder `out`, or else a new one of that name under runs/.
 

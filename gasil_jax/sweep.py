@@ -19,7 +19,16 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from gasil_jax import launch, merge, run, run_folder, shards, sweep_tables, trackers
+from gasil_jax import (
+    command_line,
+    launch,
+    merge,
+    run,
+    run_folder,
+    shards,
+    sweep_tables,
+    trackers,
+)
 from gasil_jax.command_line import InputError
 from gasil_jax.interruption import Interrupted, Interruption
 from gasil_jax.points import Point, make_points
@@ -133,7 +142,7 @@ def train(
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit status."""
-    return run.exit_status(lambda: _main(arguments))
+    return command_line.exit_status(lambda: _main(arguments))
 
 
 def _main(arguments: Sequence[str] | None) -> None:

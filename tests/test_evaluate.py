@@ -1,12 +1,14 @@
 """Saving, loading and scoring a run's policies."""
 
+import csv
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import checkpoint, evaluate, numpy_policy, policy
+from gasil_jax import checkpoint, evaluate, numpy_policy, policy, run
 
 # With the other tests that use it, so that it is trained once.
 pytestmark = pytest.mark.xdist_group("trained_point_mass")
@@ -66,3 +68,37 @@ def test_stochastic_scores_vary_more(trained_point_mass):
         deterministic=deterministic,
     )["episode_return"]
     assert float(jnp.std(score(False))) > float(jnp.std(score(True)))
+
+
+def test_one_seed_scores_as_among_all_and_every_episode_is_written(tmp_path, capsys):
+    folder = str(tmp_path / "run")
+    toy = ("--hidden-sizes", "8", "--batch-steps", "64", "--num-envs", "4")
+    begin = ("--seeds", "2", "--first-seed", "4", "--total-steps", "64")
+    arguments = ("--env", "point_mass", "--agent", "ppo", *begin, *toy, "--out", folder)
+    assert run.main(arguments) == 0
+    capsys.readouterr()
+    out = tmp_path / "new" / "scores.csv"
+    flags = ["--episodes", "3", "--stochastic"]
+    assert evaluate.main([folder, *flags, "--out", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["seed"], row["episode"]) for row in rows] == [
+        (seed, episode) for seed in ("4", "5") for episode in "012"
+    ]
+    for line, seed in zip(lines[1:3], "45", strict=True):
+        returns = [float(row["episode_return"]) for row in rows if row["seed"] == seed]
+        assert line.split()[2] == f"{np.mean(returns):.2f}"
+    assert {row["episode_length"] for row in rows} == {"50"}
+    assert evaluate.main([folder, *flags, "--seed", "5"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == lines[2]
+    # Nothing is written over, and what can't be scored is refused before it is.
+    for arguments, message in (
+        (("--out", str(out)), "which exists: name a new file"),
+        (("--out", str(out.with_suffix(".txt"))), "it must end in .csv"),
+        (("--out", str(out / "x.csv")), "can't be written"),
+        (("--seed", "6"), "seed is 6: the run has 4 to 5"),
+    ):
+        assert evaluate.main([folder, *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
