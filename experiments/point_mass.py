@@ -13,7 +13,7 @@ from experiments.report import Figure
 from experiments.trials import Results, Trial
 from gasil_jax import presets
 
-AGENTS = ("ppo", "ppo+gasil")
+AGENTS = trials.PAIR
 STEPS = random_search.STEPS["point_mass"]
 
 

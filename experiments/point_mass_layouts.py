@@ -26,13 +26,14 @@ import jax.numpy as jnp
 import numpy as np
 
 import gasil_jax
+from experiments.trials import PAIR
 from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
 from gasil_jax import command_line, logging, presets
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 
-AGENTS = ("ppo", "ppo+gasil")
+AGENTS = PAIR
 _MOST_OBJECTS = 12
 _FIRST_SEED = 1000
 # Added to the standard error: a lead of less is none, however alike the seeds are.

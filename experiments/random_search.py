@@ -38,7 +38,7 @@ import numpy as np
 
 from experiments import command, report, trials, two_stage
 from experiments.report import Figure
-from experiments.trials import AGENTS, TASKS, Trial
+from experiments.trials import AGENTS, PAIR, TASKS, Trial
 from gasil_jax.points import Point
 
 DELAY = 20
@@ -186,9 +186,8 @@ def make() -> list[Trial]:
     every: list[tuple[Any, ...]] = [
         (env, agent, delay) for env in TASKS for delay in (1, DELAY) for agent in AGENTS
     ]
-    two = ("ppo", "ppo+gasil")
-    every += [("walker2d", agent, 1, NOISE) for agent in two]
-    every += [("point_mass", agent) for agent in two]
+    every += [("walker2d", agent, 1, NOISE) for agent in PAIR]
+    every += [("point_mass", agent) for agent in PAIR]
     second = [confirmation(*each) for each in every]
     return [search(*each) for each in every] + [x for x in second if x is not None]
 

@@ -9,9 +9,8 @@ from collections.abc import Sequence
 
 from experiments import command, random_search, report
 from experiments.report import Figure
-from experiments.trials import Trial
+from experiments.trials import PAIR, Trial
 
-AGENTS = ("ppo", "ppo+gasil")
 NOISES = (0.0, 0.05, 0.1, 0.5)
 
 FIGURE = Figure(
@@ -31,7 +30,7 @@ def make() -> list[Trial]:
     """Both agents at every noise."""
     tuned = all(
         random_search.is_whole("walker2d", agent, obs_noise=random_search.NOISE)
-        for agent in AGENTS
+        for agent in PAIR
     )
     tuned_at = {
         noise: random_search.NOISE if noise and tuned else 0.0 for noise in NOISES
@@ -47,7 +46,7 @@ def make() -> list[Trial]:
             ),
         )
         for noise in NOISES
-        for agent in AGENTS
+        for agent in PAIR
     ]
 
 

@@ -23,6 +23,8 @@ from gasil_jax.command_line import InputError
 
 #: The paper's agents, as figures 5 and 7 compare them.
 AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
+#: Those of the figures that compare two: on the point mass and under noise.
+PAIR = ("ppo", "ppo+gasil")
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 RESULTS = pathlib.Path(__file__).parent / "results"
 
