@@ -1,8 +1,7 @@
-"""Parsing a command line into a dataclass, with refusals of one line."""
+"""From a command line to a dataclass, and from its errors to a line and a status."""
 
 import contextlib
 import io
-import pathlib
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -126,20 +125,13 @@ def _in_one_line(refusal: str) -> str:
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
-def check_new_file(path: pathlib.Path, endings: Sequence[str]) -> None:
-    """Raise `InputError` unless `out` can be a new file with one of these endings."""
-    if path.suffix not in endings:
-        raise InputError(f"out is {path}: it must end in {', '.join(endings)}")
-    if path.exists():
-        raise InputError(f"out is {path}, which exists: name a new file")
-
-
 def exit_status(work: Callable[[], int | None]) -> int:
     """Do the work of a command line; its errors become lines on stderr.
 
     Returns:
-      what the work says, or 0: done; 1: a folder or file can't be written; 2: bad
-      input; 128 and the signal's number: interrupted, and saved.
+      what the work says, or 0: done; 1: a folder or file can't be read or written,
+      or a program that was started failed; 2: bad input; 128 and the signal's
+      number: interrupted, and saved.
     """
     try:
         return work() or 0

@@ -19,6 +19,7 @@ from gasil_jax import (
     environments,
     normalization,
     numpy_policy,
+    output_file,
     policy,
     run_folder,
     train,
@@ -232,7 +233,7 @@ def _score(
             )
         )
     )
-    # A seed scored alone scores as among others.
+    # A seed scored alone has the starts and draws that it has among others.
     fold = lambda seed: jax.random.fold_in(jax.random.key(options.key), seed)
     keys = jax.vmap(fold)(jnp.array(seeds, jnp.uint32))
     return jax.tree.map(np.asarray, score(states, keys))
@@ -264,7 +265,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         raise InputError(f"episodes is {options.episodes}: it must be 1 or more")
     check_key(options.key)
     if options.out is not None:
-        command_line.check_new_file(options.out, (".csv",))
+        output_file.check(options.out, (".csv",))
     env, config, seeds, states = load(options.run, options.checkpoint, options.point)
     if options.seed is not None:
         place = seed_place(seeds, options.seed)
@@ -272,14 +273,14 @@ def _main(arguments: Sequence[str] | None) -> None:
             [options.seed],
             jax.tree.map(lambda x: x[np.array([place])], states),
         )
-    locomotion = hasattr(env.unwrapped, "task")
+    locomotion = environments.is_locomotion(env)
     if options.gymnasium and not (locomotion and not options.stochastic):
         raise InputError(
             "gymnasium is on: the run must be of a locomotion task, and stochastic "
             "must be off"
         )
     if options.out is not None:
-        run_folder.make_parent(options.out)
+        output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")
     with announced("evaluate", f"scoring {len(seeds)} policies"):
         if options.gymnasium:
@@ -304,7 +305,7 @@ def _write(
     path: pathlib.Path, seeds: Sequence[int], scores: Mapping[str, np.ndarray]
 ) -> None:
     """A row for each episode."""
-    with path.open("x", newline="") as file:
+    with output_file.whole(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["seed", "episode", *scores])
         for index, seed in enumerate(seeds):

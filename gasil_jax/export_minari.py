@@ -174,15 +174,14 @@ def _main(arguments: Sequence[str] | None) -> None:
     env, config, seeds, states = evaluate.load(
         options.run, options.checkpoint, options.point
     )
+    places = range(len(seeds))
     if options.seed is not None:
-        evaluate.seed_place(seeds, options.seed)
+        place = evaluate.seed_place(seeds, options.seed)
+        places = range(place, place + 1)
     limit = train.max_episode_steps(env, config)
     most = states.hyperparameters.max_buffer_steps
-    members = [
-        batch.member(jax.device_get((states.good_trajectories, most)), index)
-        for index, seed in enumerate(seeds)
-        if options.seed in (None, seed)
-    ]
+    buffers = jax.device_get((states.good_trajectories, most))
+    members = [batch.member(buffers, place) for place in places]
     found = [
         episode
         for buffer, max_steps in members

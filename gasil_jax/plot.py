@@ -9,7 +9,14 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
-from gasil_jax import command_line, logging, plotting, run_folder, statistics
+from gasil_jax import (
+    command_line,
+    logging,
+    output_file,
+    plotting,
+    run_folder,
+    statistics,
+)
 from gasil_jax.command_line import InputError
 from gasil_jax.run import final_returns
 
@@ -141,12 +148,11 @@ def _main(arguments: Sequence[str] | None) -> None:
         raise InputError("runs is empty: name one folder or more")
     if len(labels) != len(options.runs):
         raise InputError(f"labels are {len(labels)}: runs are {len(options.runs)}")
-    command_line.check_new_file(options.out, (".png", ".pdf", ".svg"))
+    output_file.check(options.out, (".png", ".pdf", ".svg"))
     runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
-    try:
-        draw(runs, options.out)
-    except OSError as error:
-        raise OSError(run_folder.unwritable(options.out, error)) from error
+    output_file.make_parent(options.out)
+    with output_file.whole(options.out) as partial:
+        draw(runs, partial)
     print("run                             seeds  interquartile mean  95% interval")
     for run in runs:
         low, high = statistics.bootstrap_interval(run.final)

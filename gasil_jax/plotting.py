@@ -35,7 +35,7 @@ def draw_band(
 
 
 def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
-    """Write a figure as a PNG, its folder too where that is missing, and close it."""
+    """Write a figure as its path ends in, the folder too if missing, and close it."""
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)

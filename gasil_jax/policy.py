@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
 
 
@@ -84,6 +85,7 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
 def _make(arrays: dict[str, np.ndarray]) -> Callable[..., jax.Array]:
     arrays = jax.tree.map(jnp.asarray, arrays)
 
+    @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         action, log_std = numpy_policy.mean_and_log_std(arrays, observation, jnp)
         if key is not None:

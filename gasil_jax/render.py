@@ -12,6 +12,7 @@ import sys
 import types
 import warnings
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
 # MuJoCo looks at it when it is imported; without a display EGL draws on a CPU too.
@@ -22,12 +23,23 @@ import jax
 import numpy as np
 import tyro
 
-from gasil_jax import batch, command_line, evaluate, policy, run_folder
+from gasil_jax import (
+    batch,
+    command_line,
+    environments,
+    evaluate,
+    output_file,
+    policy,
+)
 from gasil_jax.command_line import InputError
 from gasil_jax.progress import announced
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
+
+
+class NoOpenGL(RuntimeError):
+    """MuJoCo has nothing to draw with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +102,7 @@ def locomotion_frames(
     """Pictures (height, width, 3) uint8 of physics states, and frames a second.
 
     Raises:
-      RuntimeError: no OpenGL can be had.
+      NoOpenGL: none can be had.
     """
     import mujoco
 
@@ -104,7 +116,7 @@ def locomotion_frames(
         renderer = mujoco.Renderer(model, size[1], size[0])
     # The GL library's own errors are of many types.
     except Exception as error:
-        raise RuntimeError(
+        raise NoOpenGL(
             f"no OpenGL for MuJoCo to draw with ({error}): install libegl1 or "
             "libosmesa6, and set MUJOCO_GL to egl or osmesa"
         ) from None
@@ -184,12 +196,13 @@ def save(
     """Write physics states as what the suffix of `path` says; returns the frames.
 
     Raises:
-      RuntimeError: a package or library is missing.
+      NoOpenGL: of locomotion's pictures, where none can be had.
+      OSError: it can't be written.
     """
     if path.suffix == _PAGE:
         path.write_text(locomotion_page(env, states))
         return len(states)
-    draw = locomotion_frames if hasattr(env.unwrapped, "model") else point_mass_frames
+    draw = locomotion_frames if environments.is_locomotion(env) else point_mass_frames
     frames, fps = draw(env, states, size)
     write(frames, fps, path)
     return len(frames)
@@ -199,18 +212,13 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
     """Write frames as a film, or as a strip of eight of them.
 
     Raises:
-      RuntimeError: a package is missing.
+      OSError: it can't be written.
     """
     from PIL import Image
 
     if path.suffix == ".mp4":
-        try:
-            import imageio_ffmpeg
-        except ImportError:
-            raise RuntimeError(
-                "an .mp4 needs the package imageio-ffmpeg (pip install "
-                '"gasil_jax[render]"); a .gif or .png needs nothing'
-            ) from None
+        import imageio_ffmpeg
+
         height, width = frames[0].shape[:2]
         # By default it stretches a picture to multiples of sixteen.
         writer = imageio_ffmpeg.write_frames(
@@ -220,6 +228,9 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
         writer.close()
+        # It does not look at how ffmpeg ended.
+        if not (path.exists() and path.stat().st_size):
+            raise OSError("ffmpeg wrote nothing")
     elif path.suffix == ".gif":
         images = [Image.fromarray(frame) for frame in frames]
         duration = 1000.0 / fps
@@ -238,7 +249,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.render")
-    command_line.check_new_file(options.out, (*_PICTURES, _PAGE))
+    output_file.check(options.out, (*_PICTURES, _PAGE))
+    if options.out.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise InputError(
+            f"out is {options.out}: an .mp4 needs the package imageio-ffmpeg (pip "
+            'install "gasil_jax[render]"); a .gif or .png needs nothing'
+        )
     for name in ("steps", "width", "height"):
         if getattr(options, name) < 1:
             value = getattr(options, name)
@@ -251,23 +267,26 @@ def _main(arguments: Sequence[str] | None) -> None:
     )
     seed = seeds[0] if options.seed is None else options.seed
     place = evaluate.seed_place(seeds, seed)
-    if not hasattr(env.unwrapped, "model") and not hasattr(env.unwrapped, "layout"):
+    locomotion = environments.is_locomotion(env)
+    if not (locomotion or environments.is_point_mass(env)):
         raise InputError("run is of an environment that can't be drawn")
-    if options.out.suffix == _PAGE and not hasattr(env.unwrapped, "model"):
+    if options.out.suffix == _PAGE and not locomotion:
         raise InputError(
             f"out is {options.out}, which is for locomotion: of the point mass it "
             f"must end in {', '.join(_PICTURES)}"
         )
-    run_folder.make_parent(options.out)
+    output_file.make_parent(options.out)
     drawn = policy.from_state(batch.member(states, place), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     with announced("render", "compiling and running the episode"):
         path, total = episode(env, act, jax.random.key(options.key), options.steps)
     try:
-        with announced("render", f"drawing {options.out}"):
-            num_frames = save(env, path, size, options.out)
-    except RuntimeError as error:
-        # Of a graphics driver or a film's encoder: the file can't be written.
+        with (
+            announced("render", f"drawing {options.out}"),
+            output_file.whole(options.out) as partial,
+        ):
+            num_frames = save(env, path, size, partial)
+    except NoOpenGL as error:
         raise OSError(str(error)) from error
     print(
         f"seed {seed}: return {total:.1f} in {len(path) - 1} steps, "

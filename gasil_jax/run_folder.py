@@ -44,15 +44,9 @@ def check(out: pathlib.Path, resume: bool) -> None:
 
 def unwritable(folder: pathlib.Path, error: OSError) -> str:
     """What is said of a folder or file that can't be written."""
-    return f"out is {folder}, which can't be written: {error.strerror}"
-
-
-def make_parent(file: pathlib.Path) -> None:
-    """Make the folder of a file that `out` names; raises `InputError` if it can't."""
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(unwritable(file, error)) from None
+    # Libraries raise it without a number, some in several lines.
+    why = error.strerror or str(error).partition("\n")[0]
+    return f"out is {folder}, which can't be written: {why}"
 
 
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:

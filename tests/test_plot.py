@@ -65,7 +65,7 @@ def test_runs_are_drawn(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "point_mass, ppo" in printed and "95% interval" in printed
     assert out.read_bytes().startswith(b"\x89PNG")
-    assert plot.main([*folders, "--out", "/proc/nowhere/figure.png"]) == 1
+    assert plot.main([*folders, "--out", "/proc/nowhere/figure.png"]) == 2
     assert "error: out is /proc/nowhere/figure.png" in capsys.readouterr().err
     assert plot.main([*folders, "--out", str(tmp_path / "new" / "er" / "x.svg")]) == 0
     capsys.readouterr()

@@ -125,8 +125,28 @@ def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
         assert message in error and len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize("suffix", [".gif", ".png", ".mp4"])
+def test_a_film_that_cannot_be_written_is_one_line(suffix, point_mass, capsys):
+    path = f"/proc/film{suffix}"
+    assert render.main([str(point_mass), "--out", path, "--steps", "2"]) == 1
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith(f"error: out is {path}, which can't be written: ")
+
+
+def test_a_film_is_whole_or_not_there(point_mass, tmp_path, monkeypatch, capsys):
+    def half(frames, fps, path):
+        path.write_bytes(b"x")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(render, "write", half)
+    path = tmp_path / "film.gif"
+    assert render.main([str(point_mass), "--out", str(path), "--steps", "2"]) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_missing_package_is_named(point_mass, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     path = tmp_path / "film.mp4"
-    assert render.main([str(point_mass), "--out", str(path)]) == 1
+    assert render.main([str(point_mass), "--out", str(path)]) == 2
     assert "needs the package imageio-ffmpeg" in capsys.readouterr().err

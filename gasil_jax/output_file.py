@@ -1,0 +1,43 @@
+"""One file that `out` names: refused beforehand, or written whole."""
+
+import contextlib
+import os
+import pathlib
+from collections.abc import Iterator, Sequence
+
+from gasil_jax.command_line import InputError
+from gasil_jax.run_folder import unwritable
+
+
+def check(path: pathlib.Path, endings: Sequence[str]) -> None:
+    """Raise `InputError` unless it can be a new file with one of these endings."""
+    if path.suffix not in endings:
+        raise InputError(f"out is {path}: it must end in {', '.join(endings)}")
+    if path.exists():
+        raise InputError(f"out is {path}, which exists: name a new file")
+
+
+def make_parent(path: pathlib.Path) -> None:
+    """Make the folder that it goes in; raises `InputError` if that can't be."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(unwritable(path, error)) from None
+
+
+@contextlib.contextmanager
+def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Gives a path beside it to write to, which becomes it in the end, or nothing.
+
+    Raises:
+      OSError: it can't be written, in one line that names it.
+    """
+    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield partial
+        partial.rename(path)
+    except OSError as error:
+        raise OSError(unwritable(path, error)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
