@@ -14,7 +14,6 @@ All rows of a task are compiled first and then timed in turn, again and again, s
 ratio is of numbers from the same minutes; a speed is the median of the repeats.
 """
 
-import argparse
 import dataclasses
 import importlib.util
 import multiprocessing
@@ -31,7 +30,8 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
-from gasil_jax import batch, logging, presets
+from gasil_jax import batch, command_line, logging, output_file, presets
+from gasil_jax.command_line import InputError
 from gasil_jax.environments import Settings, available_cores, prepare
 
 TASKS = tuple(name for name in gasil_envs.names() if name != "point_mass")
@@ -43,6 +43,41 @@ VARIANTS = {
     "mujoco-euler": {"physics": "mujoco", "integrator": "euler"},
 }
 BASELINE = "stable-baselines3"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure speed and fidelity.
+
+    Attributes:
+      tables: of physics, training and scaling.
+      envs: the tasks.
+      variants: ways of building a task, in the physics table.
+      num_envs: environments at once, in the physics table.
+      num_steps: of random actions in a repeat.
+      skip_errors: measure no error of a step, which takes a compilation more.
+      repeats: how many times each row is timed.
+      devices: CPU devices; default the cores.
+      seeds: of training; in the scaling table a device's.
+      training_envs: of a seed; default the preset's.
+      training_variants: ways of building a task, in the training table.
+      iterations: of training in a repeat.
+      out: a new file; default runs/benchmark-TIME.json.
+    """
+
+    tables: tuple[str, ...] = ("physics", "training")
+    envs: tuple[str, ...] = ("walker2d",)
+    variants: tuple[str, ...] = tuple(VARIANTS)
+    num_envs: tuple[int, ...] = (64,)
+    num_steps: int = 20
+    skip_errors: bool = False
+    repeats: int = 5
+    devices: int | None = None
+    seeds: int = 10
+    training_envs: int | None = None
+    training_variants: tuple[str, ...] = ("ours", "mujoco")
+    iterations: int = 2
+    out: pathlib.Path | None = None
 
 
 @dataclasses.dataclass
@@ -151,7 +186,7 @@ def one_step_error(env: Any, reference: Any, num_envs: int, num_steps: int) -> f
     return float(np.median(error.max(axis=1)))
 
 
-def physics_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+def physics_table(options: Options) -> Iterator[list[Row]]:
     """A list of rows for each task and number of environments."""
     for env_name in options.envs:
         reference = gasil_envs.make(env_name, physics="mujoco")
@@ -171,7 +206,7 @@ def physics_table(options: argparse.Namespace) -> Iterator[list[Row]]:
 def training_row(
     env_name: str,
     name: str,
-    options: argparse.Namespace,
+    options: Options,
     seeds: int,
     devices: Sequence[jax.Device],
 ) -> Row:
@@ -244,7 +279,7 @@ def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
     return Row(env_name, name, processes * num_envs, run)
 
 
-def training_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+def training_table(options: Options) -> Iterator[list[Row]]:
     """A list of rows for each task."""
     for env_name in options.envs:
         config = presets.preset(env_name, "ppo+gasil", "paper")
@@ -264,7 +299,7 @@ def training_table(options: argparse.Namespace) -> Iterator[list[Row]]:
         yield rows
 
 
-def scaling_table(options: argparse.Namespace) -> Iterator[list[Row]]:
+def scaling_table(options: Options) -> Iterator[list[Row]]:
     """A list of rows for each task: 1, 2, 4 ... devices, all of them at last."""
     devices = jax.devices()
     doubled = [2**power for power in range(len(devices)) if 2**power < len(devices)]
@@ -303,7 +338,7 @@ def show(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return described
 
 
-_COLUMNS = "envs     steps/s  ratio compile s  error of a step"
+_HEAD = "envs     steps/s  ratio compile s  error of a step"
 TABLES = {
     "physics": physics_table,
     "training": training_table,
@@ -311,40 +346,38 @@ TABLES = {
 }
 
 
-def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Options from the command line."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    add = parser.add_argument
-    add("--tables", nargs="+", choices=TABLES, default=("physics", "training"))
-    add("--envs", nargs="+", choices=TASKS, default=("walker2d",))
-    add("--variants", nargs="+", choices=VARIANTS, default=tuple(VARIANTS))
-    add("--num-envs", type=int, nargs="+", default=(64,), help="of the physics table")
-    add("--num-steps", type=int, default=20, help="of random actions in a repeat")
-    add("--skip-errors", action="store_true", help="they take a compilation more")
-    add("--repeats", type=int, default=5)
-    add("--devices", type=int, help="CPU devices; default the cores")
-    add("--seeds", type=int, default=10, help="of training; in scaling a device's")
-    add("--training-envs", type=int, help="of a seed; default the preset's")
-    add(
-        "--training-variants",
-        nargs="+",
-        choices=VARIANTS,
-        default=("ours", "mujoco"),
-    )
-    add("--iterations", type=int, default=2, help="of training in a repeat")
-    add("--out", type=pathlib.Path, help="default runs/benchmark-TIME.json")
-    return parser.parse_args(arguments)
+def _check(options: Options) -> None:
+    for name, known in (
+        ("tables", TABLES),
+        ("envs", TASKS),
+        ("variants", VARIANTS),
+        ("training_variants", VARIANTS),
+    ):
+        if unknown := set(getattr(options, name)) - set(known):
+            raise InputError(f"{name} has {min(unknown)!r}: allowed {', '.join(known)}")
+    numbers = {"num_envs": min(options.num_envs, default=0)}
+    for name in ("num_steps", "repeats", "seeds", "iterations"):
+        numbers[name] = getattr(options, name)
+    for name in ("devices", "training_envs"):
+        if getattr(options, name) is not None:
+            numbers[name] = getattr(options, name)
+    for name, value in numbers.items():
+        if value < 1:
+            raise InputError(f"{name} is {value}: it must be 1 or more")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print the tables and write them; returns the exit status."""
-    options = parse(arguments)
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "experiments.benchmark")
+    _check(options)
     stamp = time.strftime("%Y%m%d-%H%M%S")
     out = options.out or pathlib.Path("runs", f"benchmark-{stamp}.json")
-    if out.exists():
-        print(f"error: out is {out}, which exists: name a new file", file=sys.stderr)
-        return 2
-    out.parent.mkdir(parents=True, exist_ok=True)
+    output_file.check(out, (".json",))
+    output_file.make_parent(out)
     count = options.devices or available_cores()
     prepare(Settings(physics="mujoco"), count)
     jax.config.update("jax_num_cpu_devices", count)
@@ -353,20 +386,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     result = {
         "device": f"{len(devices)} x {devices[0].device_kind}",
         "cores": available_cores(),
-        "options": {name: str(value) for name, value in vars(options).items()},
+        "options": {
+            name: str(value) for name, value in dataclasses.asdict(options).items()
+        },
         "versions": logging.versions(),
         "tables": {name: [] for name in options.tables},
     }
     print(f"{result['device']}, {result['cores']} cores")
     for table in options.tables:
-        print(f"{table:51}{_COLUMNS}", flush=True)
+        print(f"{table:51}{_HEAD}", flush=True)
         for rows in TABLES[table](options):
             time_in_turn(rows, options.repeats)
             result["tables"][table] += show(rows)
             # After every task: a benchmark that is cut off has its first figures.
             logging.write_json(out, result)
     print(f"in {out}")
-    return 0
 
 
 if __name__ == "__main__":

@@ -150,7 +150,8 @@ def _run(
                 trials.collect(trial, runs, folder)
     if part.count == 1:
         write(figure, wanted, results)
-        print(f"in {results / figure.name}.md")
+        page = results / f"{figure.name}.md"
+        print(f"in {page}" if page.exists() else f"{results} has nothing to show yet")
     return 0
 
 

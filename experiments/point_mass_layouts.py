@@ -29,7 +29,7 @@ import gasil_jax
 from experiments.trials import PAIR
 from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
-from gasil_jax import command_line, logging, presets
+from gasil_jax import command_line, logging, output_file, presets
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 
@@ -257,6 +257,11 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
 
 def _check(options: Options) -> None:
     least = {"count": 1, "chunk": 1, "seeds": 2, "total_steps": 10 * 2048}
+    for name in ("learning_rates", "alphas"):
+        if not getattr(options, name):
+            raise InputError(f"{name} is empty: name one or more")
+    if (lowest := min((options.first, *options.layouts))) < 0:
+        raise InputError(f"layout is {lowest}: it must be 0 or more")
     for name, low in least.items():
         if (value := getattr(options, name)) < low:
             raise InputError(f"{name} is {value}: it must be {low} or more")
@@ -264,18 +269,12 @@ def _check(options: Options) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Evaluate layouts that have not been; returns the exit status."""
-    try:
-        options = command_line.parse(
-            Options, arguments, "experiments.point_mass_layouts"
-        )
-        _check(options)
-        return _run(options)
-    except InputError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
+    return command_line.exit_status(lambda: _main(arguments))
 
 
-def _run(options: Options) -> int:
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "experiments.point_mass_layouts")
+    _check(options)
     jax.config.update("jax_default_matmul_precision", "highest")
     numbers = options.layouts or tuple(
         range(options.first, options.first + options.count)
@@ -298,7 +297,8 @@ def _run(options: Options) -> int:
         path = options.out / f"{chunk[0]}-{chunk[-1]}.csv"
         if not path.exists():
             new = evaluate(chunk, options, programs)
-            with path.open("x", newline="") as file:
+            # Whole or not: what is there counts as done.
+            with output_file.whole(path) as partial, partial.open("w") as file:
                 writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
                 writer.writeheader()
                 writer.writerows(new)
@@ -307,7 +307,6 @@ def _run(options: Options) -> int:
         print(path, flush=True)
     for ahead, said in rank(rows)[:20]:
         print(f"{ahead:+.1f} {said}")
-    return 0
 
 
 if __name__ == "__main__":

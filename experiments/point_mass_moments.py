@@ -7,7 +7,7 @@ discriminator pays most at a place, of 16 directions at full speed, with every o
 still there; the stronger its colour the higher the reward. ``--animate`` makes a film.
 """
 
-import argparse
+import dataclasses
 import itertools
 import pathlib
 import sys
@@ -21,11 +21,34 @@ import numpy as np
 
 import gasil_jax
 from experiments import point_mass, trials
-from gasil_jax import batch, normalization, plotting, policy
+from gasil_jax import (
+    batch,
+    command_line,
+    normalization,
+    output_file,
+    plotting,
+    policy,
+)
+from gasil_jax.command_line import InputError
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train one seed of PPO and of PPO+GASIL and draw what they learn.
+
+    Attributes:
+      total_steps: of the seed.
+      animate: make a film of so many frames instead.
+      out: folder of the picture or film, which is made anew.
+    """
+
+    total_steps: int = point_mass.STEPS
+    animate: int = 0
+    out: pathlib.Path = trials.RESULTS
 
 
 def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
@@ -178,7 +201,6 @@ def animate(env: Any, moments: Moments, path: pathlib.Path) -> None:
         figure.suptitle(_draw_row(panels, env, moments, number))
         _titles(panels, moments)
 
-    path.parent.mkdir(parents=True, exist_ok=True)
     film = FuncAnimation(figure, frame, frames=frames)
     film.save(path, writer=PillowWriter(fps=2), dpi=80)
     plt.close(figure)
@@ -190,16 +212,17 @@ SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train one seed of both agents and draw; returns the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--total-steps", type=int, default=point_mass.STEPS)
-    parser.add_argument("--animate", type=int, default=0, help="frames of a film")
-    parser.add_argument("--out", type=pathlib.Path, default=trials.RESULTS)
-    options = parser.parse_args(arguments)
-    if options.total_steps < 1 or options.animate < 0:
-        print(
-            "error: total-steps must be 1 or more, animate 0 or more", file=sys.stderr
-        )
-        return 2
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    options = command_line.parse(Options, arguments, "experiments.point_mass_moments")
+    for name, least in (("total_steps", 1), ("animate", 0)):
+        if (value := getattr(options, name)) < least:
+            raise InputError(f"{name} is {value}: it must be {least} or more")
+    name = "point_mass.gif" if options.animate else "point_mass_moments.png"
+    path = options.out / name
+    output_file.make_parent(path)
     jax.config.update("jax_default_matmul_precision", "highest")
     matplotlib.use("Agg")
     env = gasil_jax.make_env("point_mass")
@@ -208,14 +231,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for agent in point_mass.AGENTS:
         config = point_mass.config(agent).replace(total_steps=options.total_steps)
         moments[agent] = config, train(env, config, shares)
-    if options.animate:
-        path = options.out / "point_mass.gif"
-        animate(env, moments, path)
-    else:
-        path = options.out / "point_mass_moments.png"
-        draw(env, moments, path)
+    (animate if options.animate else draw)(env, moments, path)
     print(f"in {path}")
-    return 0
 
 
 if __name__ == "__main__":

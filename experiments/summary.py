@@ -1,5 +1,6 @@
 """All figures in one page: ``python -m experiments.summary``."""
 
+import dataclasses
 import sys
 from collections.abc import Sequence
 
@@ -14,6 +15,7 @@ from experiments import (
     stochastic_walker2d,
     trials,
 )
+from gasil_jax import command_line
 
 #: Each figure with the function that makes its trials.
 FIGURES = (
@@ -86,10 +88,19 @@ def page() -> str:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Write the page; returns the exit status."""
+    return command_line.exit_status(lambda: _main(arguments))
+
+
+def _main(arguments: Sequence[str] | None) -> None:
+    command_line.parse(Options, arguments, "experiments.summary")
     path = trials.RESULTS / "README.md"
     path.write_text(page())
     print(f"in {path}")
-    return 0
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Write the page of all figures, from the CSV files alone."""
 
 
 if __name__ == "__main__":

@@ -43,7 +43,10 @@ def second(first: Trial, folder: pathlib.Path) -> Trial | None:
 
 
 def best(first: Trial, folder: pathlib.Path) -> Point | None:
-    """The best point of a search so far, by its results in a folder."""
+    """The best point of a search so far, by its results in a folder.
+
+    None before the first stage is complete.
+    """
     known = trials.read_whole(first, folder)
     if known is None:
         return None

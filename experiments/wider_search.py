@@ -6,7 +6,8 @@ search. Learning rate and alpha are the values that did best in the first (by th
 of the points that have them: each met every value of the others equally often), and all
 32 points of the other three hyperparameters get two seeds, then the best four get four
 more. The best point of all has ten seeds, those of figure 7, with whose curves it is
-compared.
+compared. The command lists and trains a stage once the one before it is complete: start
+it three times.
 """
 
 import dataclasses
@@ -28,6 +29,7 @@ from experiments import (
 )
 from experiments.report import Figure
 from experiments.trials import Results, Trial
+from gasil_jax.points import Point
 
 AGENT = "ppo+gasil"
 # What a first search leaves open.
@@ -47,16 +49,15 @@ def _gather(
     """What is there of the tuned agent on each task, beside figure 7's curves."""
     figure7 = comparison.make(random_search.DELAY)
     before = report.panels(figure7, results / delayed_mujoco.FIGURE.name)
-    shown: dict[str, dict[str, Results]] = {}
+    shown = {}
     for panel, curves in report.panels(wanted, results / FIGURE.name).items():
         env = panel.removesuffix(_SEARCH)
-        if env not in shown:
-            others = dict(before.get(env, {}))
-            if AGENT in others:
-                others[_FIRST] = others.pop(AGENT)
-            shown[env] = others
-        if panel == env:
-            shown[env] |= curves
+        others = dict(before.get(env, {}))
+        if AGENT in others:
+            others[_FIRST] = others.pop(AGENT)
+        # The panel of the tuned agent comes after that of its search.
+        if found := others | (curves if panel == env else {}):
+            shown[env] = found
     return shown
 
 
@@ -103,30 +104,33 @@ def make() -> list[Trial]:
             continue
         second = two_stage.second(first, folder)
         wanted += [first] if second is None else [first, second]
-        if two_stage.is_whole(first, folder):
+        best = two_stage.best(first, folder)
+        if best is not None and two_stage.is_whole(first, folder):
             wanted.append(
                 Trial(
                     name=f"{env}/{AGENT}",
                     env=env,
                     agent=AGENT,
-                    points=(two_stage.best(first, folder) or {},),
+                    points=(best,),
                     reward_delay=first.reward_delay,
                 )
             )
     return wanted
 
 
-def _grids(wanted: Sequence[Trial], results: pathlib.Path) -> str:
-    """What each search found, a table for each task: Markdown."""
-    parts = [
-        "## The searches",
-        "Mean return of the last fifth of training, two seeds; in a cell the smaller "
-        "buffer, then the larger.",
-    ]
+def _searches(wanted: Sequence[Trial], results: pathlib.Path) -> str:
+    """What each search found, a table for each task, and its second stage: Markdown."""
+    folder = results / FIGURE.name
+    parts = []
     for trial in wanted:
-        known = trials.read_whole(trial, results / FIGURE.name)
-        if known is not None and trial.name.endswith(f"{_SEARCH}/{AGENT}"):
-            parts += [_grid(known)]
+        known = trials.read_whole(trial, folder)
+        if known is None or not trial.name.endswith(f"{_SEARCH}/{AGENT}"):
+            continue
+        again = two_stage.second(trial, folder)
+        again = again and trials.read_whole(again, folder)
+        parts += [_grid(known), _second_stage(known, again)]
+    if parts:
+        parts.insert(0, "## The searches")
     return "\n\n".join(parts)
 
 
@@ -139,9 +143,16 @@ def _grid(known: Results) -> str:
     updates, rates, sizes = (
         sorted({point[name] for point in points}) for name in _FREE
     )
-    task = known.trial.name.split(_SEARCH)[0]
-    head = [f"{task}, updates", *(f"at {rate:g}" for rate in rates)]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    fixed = {name: value for name, value in points[0].items() if name not in _FREE}
+    lines = [
+        f"**{known.trial.name.split(_SEARCH)[0]}**, {_said(fixed)}: mean return of the "
+        f"last fifth of training of {len(known.seeds)} seeds, by discriminator updates "
+        f"and learning rate; in a cell with buffers of {' and '.join(map(str, sizes))} "
+        "steps.",
+        "",
+        f"| updates | {' | '.join(f'at {rate:g}' for rate in rates)} |",
+        "|---" * (1 + len(rates)) + "|",
+    ]
     for count in updates:
         cells = [
             ", ".join(f"{score_of[count, rate, size]:.0f}" for size in sizes)
@@ -151,11 +162,30 @@ def _grid(known: Results) -> str:
     return "\n".join(lines)
 
 
+def _second_stage(first: Results, second: Results | None) -> str:
+    if second is None:
+        return "The best four have not been tried again yet."
+    tried = ", ".join(f"{score:.0f}" for score in two_stage.scores(second))
+    point, final = two_stage.best_point(first, second)
+    return (
+        f"The best four, on {len(second.seeds)} other seeds: {tried}. Chosen: "
+        f"{_said(point)}; {final.mean():.0f} over {len(final)} seeds of both stages."
+    )
+
+
+def _said(point: Point) -> str:
+    return ", ".join(f"{name} {value:g}" for name, value in point.items())
+
+
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
     """Write the page, with the searches, and the figure of what there is."""
-    more = [figure.more, _grids(wanted, results)]
-    more = "\n\n".join(part for part in more if part)
-    report.write(dataclasses.replace(figure, more=more), wanted, results)
+    searches = _searches(wanted, results)
+    if figure.shown(wanted, results):
+        more = "\n\n".join(part for part in (figure.more, searches) if part)
+        report.write(dataclasses.replace(figure, more=more), wanted, results)
+    elif searches:
+        page = results / f"{figure.name}.md"
+        page.write_text(f"# {figure.title}\n\n{searches}\n")
 
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from experiments import (
+    benchmark,
     command,
     comparison,
     delayed_mujoco,
@@ -71,16 +72,22 @@ def toy(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("module", "only"),
+    ("module", "only", "shown"),
     [
-        (mujoco, "hopper/ppo"),
-        (delayed_mujoco, "ant/ppo+bc"),
-        (stochastic_walker2d, "noise 0/ppo"),
-        (hyperparameters, "discriminator_updates/1"),
-        (wider_search, "hopper-search/ppo+gasil"),
+        (mujoco, "hopper/ppo", "| hopper | ppo | 2 |"),
+        (delayed_mujoco, "ant/ppo+bc", "| ant | ppo+bc | 2 |"),
+        (stochastic_walker2d, "noise 0/ppo", "| noise 0 | ppo | 2 |"),
+        (
+            hyperparameters,
+            "discriminator_updates/1",
+            "| discriminator_updates | 1 | 2 |",
+        ),
+        (wider_search, "hopper-search/ppo+gasil", "**hopper**, learning_rate"),
     ],
 )
-def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, capsys):
+def test_an_experiment_trains_goes_on_and_reports(
+    module, only, shown, toy, tmp_path, capsys
+):
     name = module.FIGURE.name
     folders = ("--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results"))
     arguments = ("--only", only, "--seeds", "2", "--total-steps", "512", *folders)
@@ -96,7 +103,9 @@ def test_an_experiment_trains_goes_on_and_reports(module, only, toy, tmp_path, c
         expected = "" if np.isnan(value) else f"{value:.6g}"
         assert row["episode_return"] == expected
     page = tmp_path / "results" / f"{name}.md"
-    assert only.split("/")[0].removesuffix("-search") in page.read_text()
+    assert shown in page.read_text()
+    # A picture of curves, and none where there are none yet.
+    assert page.with_suffix(".png").exists() == (module is not wider_search)
     # Nothing is trained twice, and other settings do not get in between.
     capsys.readouterr()
     assert module.main(arguments) == 0
@@ -296,6 +305,7 @@ def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch)
     assert "ppo+gasil better than ppo+gasil of figure 7: no, it is lower on 1" in page
     # The last point is of most updates at the least rate with the larger buffer.
     assert "| 20 | 30, 31 | 28, 29 | 26, 27 | 24, 25 |" in page
+    assert "on 4 other seeds: 0, 0, 99, 0. Chosen: learning_rate 0.0003" in page
 
 
 def test_every_pair_of_values_is_drawn_equally_often():
@@ -363,6 +373,32 @@ def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
     assert mujoco.main([*arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("module", "arguments", "message"),
+    [
+        (benchmark, ("--tables", "speed"), "tables has 'speed': allowed physics"),
+        (benchmark, ("--repeats", "0"), "repeats is 0: it must be 1 or more"),
+        (benchmark, ("--out", "x.csv"), "out is x.csv: it must end in .json"),
+        (point_mass_layouts, ("--layouts", "-1"), "layout is -1"),
+        (point_mass_layouts, ("--seeds", "1"), "seeds is 1"),
+        (point_mass_moments, ("--animate", "-1"), "animate is -1"),
+        (point_mass_moments, ("--out", "/proc/x"), "out is /proc/x/point_mass_mom"),
+        (summary, ("--help-me",), "Unrecognized options: --help-me"),
+    ],
+)
+def test_the_other_commands_refuse_alike(module, arguments, message, capsys):
+    assert module.main([*arguments]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+def test_a_report_of_nothing_says_so(tmp_path, capsys):
+    arguments = ["--report", "--runs", str(tmp_path), "--results", str(tmp_path)]
+    assert mujoco.main(arguments) == 0
+    assert "nothing to show yet" in capsys.readouterr().out
+    assert not list(tmp_path.iterdir())
 
 
 PUBLISHED = (
