@@ -14,17 +14,16 @@ cost several times as much, have half as many in either stage: 16 for each agent
 two learning rates, and two seeds more for the best four points (PPO+GASIL's best two on
 delayed ant were tried with two further ones, which are not used); humanoid's are a
 third as long as those of its figure. For figure 6 walker2d has a search with noise 0.1
-on the observations, the middle of the paper's three; where the table below lacks it, it
-is not run yet. On the point mass both agents have the learning rates 1e-3, 3e-4, 1e-4
-and 3e-5, eight seeds each, and PPO+GASIL else what its preset has (alpha 1, 20 updates
-at 3e-4).
+on the observations, the middle of the paper's three. On the point mass both agents have
+the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else what
+its preset has (alpha 1, 20 updates at 3e-4).
 
 Nothing uses what is in `results/first_search/`: a first search that drew PPO+GASIL's
 points otherwise, each value equally often but not each pair (no point had 20
 discriminator updates with the policy's learning rate 3e-4, nor alpha 1 with more than
-one update at it), figures from it and of a point that more seeds replaced, a search of
-all of PPO+GASIL's hyperparameters on the point mass, and PPO's on ant with 128
-environments of 16 steps (64 of 32 now: a reward comes every 20).
+one update at it), figures from it and of points that more seeds or a search under noise
+replaced, a search of all of PPO+GASIL's hyperparameters on the point mass, and PPO's on
+ant with 128 environments of 16 steps (64 of 32 now: a reward comes every 20).
 """
 
 import dataclasses
