@@ -20,12 +20,12 @@ FIGURE = Figure(
     "standard deviation 0.05, 0.1 and 0.5, is added to the observations.",
     more="""**What it says.** Without noise both agents have what the search chose
 there, where PPO+GASIL's bonus has no weight ([figure 5](mujoco.md)); with noise what a
-search of its own chose at 0.1 ([both](random_search.md)): for PPO+GASIL alpha 0.2 and five
-updates at 3e-4, for PPO the same learning rate as without. In that search PPO+GASIL was
-well ahead of PPO, as the best of sixteen points on few seeds is; on ten new seeds it is
-not. A seed learns to walk or it does not, so that the intervals are wide, and at 0.1
-and above nearly none does in 1M steps. With the points that were chosen without noise
-(`first_search/`) there was no gap either.""",
+search of its own chose at 0.1 ([both](random_search.md)): for PPO+GASIL alpha 0.2 and
+five updates at 3e-4, for PPO the same learning rate as without. In that search
+PPO+GASIL was well ahead of PPO, as the best of sixteen points on few seeds is; on ten
+new seeds it is not. A seed learns to walk or it does not, so that the intervals are
+wide, and at 0.1 and above nearly none does in 1M steps. With the points that were
+chosen without noise (`first_search/`) there was no gap either.""",
     conclude=lambda shown: report.gaps(shown, "noise 0", "ppo+gasil", "ppo"),
 )
 
