@@ -13,13 +13,14 @@ FIGURE = Figure(
     claim="With the reward given every 20 steps, PPO+GASIL improves PPO, and "
     "outperforms PPO+BC and PPO+SIL, on all tasks by a large margin.",
     more="""**What was tried, and what it says.** PPO+GASIL learns most on hopper,
-walker2d and halfcheetah, but one seed learns to run and another never does, so that
-ten seeds leave wide intervals on a task. On swimmer it learns least: a step's reward
-is about 0.04 there, and the bonus that the search chose (alpha 0.2, alpha log 2 =
-0.14) outweighs it. On ant no agent has learned to walk after 1M steps, PPO+SIL comes
+walker2d and halfcheetah, but one seed learns to run and another never does, so that ten
+seeds leave wide intervals on a task. On swimmer it learns least: a step's reward is
+about 0.04 there, and the bonus that the search chose (alpha 0.2, alpha log 2 = 0.14)
+outweighs it. On ant no agent has learned to walk after 1M steps, PPO+SIL comes
 furthest: PPO+GASIL's episodes last 40 to 100 steps at the end. What decides is the
 choice of hyperparameters. A first search (`first_search/`, [why](random_search.md))
-chose points whose ten seeds were no better than PPO. Other hyperparameters do better
+chose points whose ten seeds were no better than PPO. A [wider search](wider_search.md)
+of PPO+GASIL alone found none that are better over all. Other hyperparameters do better
 still where an episode ends with a fall, and a reward that is never negative also pays
 for staying up: the discriminator's reward alone, agent `gasil` with alpha 1 and 20
 updates at 3e-4, which no search chose, had on hopper 2416 ± 200 (mean and standard

@@ -14,6 +14,7 @@ from experiments import (
     report,
     stochastic_walker2d,
     trials,
+    wider_search,
 )
 from gasil_jax import command_line
 
@@ -23,6 +24,7 @@ FIGURES = (
     (mujoco.FIGURE, lambda: comparison.make(1)),
     (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
     (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
+    (wider_search.FIGURE, wider_search.make),
     (hyperparameters.FIGURE, hyperparameters.make),
 )
 # Of all agents on the locomotion tasks, with the reward's delay.
@@ -45,10 +47,11 @@ def table() -> str:
 
 
 def tallies() -> tuple[str, ...]:
-    """What the comparisons of figures 5 and 7 come to: Markdown."""
+    """What figures 5 and 7 and the wider search come to: Markdown."""
     return tuple(
-        figure.conclusions(figure.shown(comparison.make(delay), trials.RESULTS))
-        for figure, delay in _COMPARISONS
+        figure.conclusions(figure.shown(make(), trials.RESULTS))
+        for figure, make in FIGURES
+        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE, wider_search.FIGURE)
     )
 
 
