@@ -47,11 +47,11 @@ def table() -> str:
 
 
 def tallies() -> tuple[str, ...]:
-    """What figures 5 and 7 and the wider search come to: Markdown."""
+    """What the comparisons of figures 5 and 7 come to: Markdown."""
     return tuple(
         figure.conclusions(figure.shown(make(), trials.RESULTS))
         for figure, make in FIGURES
-        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE, wider_search.FIGURE)
+        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE)
     )
 
 
