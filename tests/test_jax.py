@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import compatibility, good_trajectories, ppo
+from gasil_jax import compatibility, good_trajectories, policy, ppo
 
 
 def test_batched_reduction_is_right_on_cpu():
@@ -99,6 +99,9 @@ def test_matrices_are_multiplied_in_full_precision():
     found = list(products(jaxpr.jaxpr))
     assert len(found) > 10
     assert set(found) == {(highest, highest)}
+    act = policy.from_state(gasil_jax.init(env, CONFIG, jax.random.key(0)), env)
+    found = list(products(jax.make_jaxpr(act)(jnp.zeros(env.observation_size)).jaxpr))
+    assert found and set(found) == {(highest, highest)}
     # What the program asks for itself it gets.
     with jax.default_matmul_precision("default"):
         jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)

@@ -253,7 +253,9 @@ def test_the_documented_agent_and_task_train(tmp_path, monkeypatch, capsys):
     # At most 20 steps of at most 0.1.
     assert (metrics["episode_length"] <= 20).all()
 
-    (tmp_path / "my_tasks.py").write_text(task)
+    # Whatever its attributes are called, it is none of ours.
+    names = "Line.model = Line.layout = Line.task = None"
+    (tmp_path / "my_tasks.py").write_text(f"{task}\n{names}\n")
     monkeypatch.syspath_prepend(tmp_path)
     out = str(tmp_path / "out")
     small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
@@ -261,6 +263,10 @@ def test_the_documented_agent_and_task_train(tmp_path, monkeypatch, capsys):
     assert run.main([*arguments, *small.split()]) == 0
     assert evaluate.main([out, "--episodes", "2"]) == 0
     assert re.search(r"5 +2 +-[0-9.]+ +[0-9.]+ +20.0", capsys.readouterr().out)
+    assert render.main([out, "--out", str(tmp_path / "line.gif")]) == 2
+    assert "of an environment that can't be drawn" in capsys.readouterr().err
+    assert evaluate.main([out, "--gymnasium"]) == 2
+    assert "must be of a locomotion task" in capsys.readouterr().err
 
 
 def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
