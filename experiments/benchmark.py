@@ -355,15 +355,10 @@ def _check(options: Options) -> None:
     ):
         if unknown := set(getattr(options, name)) - set(known):
             raise InputError(f"{name} has {min(unknown)!r}: allowed {', '.join(known)}")
-    numbers = {"num_envs": min(options.num_envs, default=0)}
-    for name in ("num_steps", "repeats", "seeds", "iterations"):
-        numbers[name] = getattr(options, name)
-    for name in ("devices", "training_envs"):
-        if getattr(options, name) is not None:
-            numbers[name] = getattr(options, name)
-    for name, value in numbers.items():
-        if value < 1:
-            raise InputError(f"{name} is {value}: it must be 1 or more")
+    if (fewest := min(options.num_envs, default=0)) < 1:
+        raise InputError(f"num_envs is {fewest}: it must be 1 or more")
+    command_line.check_least(options, num_steps=1, repeats=1, seeds=1, iterations=1)
+    command_line.check_least(options, devices=1, training_envs=1)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -101,12 +101,8 @@ def _run(
         for name in ("seeds", "total_steps")
         if getattr(options, name) is not None
     }
-    for name, value in changes.items():
-        if value < 1:
-            raise InputError(f"{name} is {value}: it must be 1 or more")
+    command_line.check_least(options, seeds=1, total_steps=1, processes=1)
     if options.processes is not None:
-        if options.processes < 1:
-            raise InputError(f"processes is {options.processes}: it must be 1 or more")
         if part.count > 1 or options.devices is not None or options.share_counts:
             raise InputError(
                 f"processes is {options.processes}: --part, --devices and "

@@ -33,7 +33,6 @@ from gasil_jax import command_line, logging, output_file, presets
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 
-AGENTS = PAIR
 _MOST_OBJECTS = 12
 _FIRST_SEED = 1000
 # Added to the standard error: a lead of less is none, however alike the seeds are.
@@ -231,7 +230,7 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
     found = []
     for number in sorted({int(row["layout"]) for row in rows}):
         best = {}
-        for agent in AGENTS:
+        for agent in PAIR:
             by_point: dict[tuple[float, float], list[tuple[float, float]]] = {}
             for row in rows:
                 if int(row["layout"]) == number and row["agent"] == agent:
@@ -242,7 +241,7 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
                 by_point.items(), key=lambda item: np.mean([x[1] for x in item[1]])
             )
             best[agent] = (point, np.array(scores))
-        (ppo_point, ppo), (point, gasil) = (best[agent] for agent in AGENTS)
+        (ppo_point, ppo), (point, gasil) = (best[agent] for agent in PAIR)
         error = np.sqrt(sum(x[:, 1].var(ddof=1) / len(x) for x in (ppo, gasil)))
         ahead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + _MARGIN)
         said = (
@@ -256,15 +255,12 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
 
 
 def _check(options: Options) -> None:
-    least = {"count": 1, "chunk": 1, "seeds": 2, "total_steps": 10 * 2048}
     for name in ("learning_rates", "alphas"):
         if not getattr(options, name):
             raise InputError(f"{name} is empty: name one or more")
     if (lowest := min((options.first, *options.layouts))) < 0:
         raise InputError(f"layout is {lowest}: it must be 0 or more")
-    for name, low in least.items():
-        if (value := getattr(options, name)) < low:
-            raise InputError(f"{name} is {value}: it must be {low} or more")
+    command_line.check_least(options, count=1, chunk=1, seeds=2, total_steps=10 * 2048)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -289,7 +285,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         raise InputError(f"out is {options.out}, which is of other options")
     programs = {
         agent: jax.jit(jax.vmap(make_returns(configuration(agent, options))))
-        for agent in AGENTS
+        for agent in PAIR
     }
     rows: list[dict[str, Any]] = []
     for begin in range(0, len(numbers), options.chunk):

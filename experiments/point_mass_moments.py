@@ -29,7 +29,6 @@ from gasil_jax import (
     plotting,
     policy,
 )
-from gasil_jax.command_line import InputError
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
@@ -217,9 +216,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "experiments.point_mass_moments")
-    for name, least in (("total_steps", 1), ("animate", 0)):
-        if (value := getattr(options, name)) < least:
-            raise InputError(f"{name} is {value}: it must be {least} or more")
+    command_line.check_least(options, total_steps=1, animate=0)
     name = "point_mass.gif" if options.animate else "point_mass_moments.png"
     path = options.out / name
     output_file.make_parent(path)

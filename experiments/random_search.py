@@ -169,15 +169,20 @@ def search(
     )
 
 
+def stages(
+    env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
+) -> two_stage.Stages | None:
+    """What there is of a search; None where its first stage is not complete."""
+    trial = search(env, agent, reward_delay, obs_noise)
+    return two_stage.read(trial, trials.RESULTS / FIGURE.name)
+
+
 def confirmation(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> Trial | None:
     """The second stage of the search that tunes an agent on a task."""
-    return two_stage.second(search(env, agent, reward_delay, obs_noise), _folder())
-
-
-def _folder() -> pathlib.Path:
-    return trials.RESULTS / FIGURE.name
+    found = stages(env, agent, reward_delay, obs_noise)
+    return found and found.again
 
 
 def make() -> list[Trial]:
@@ -198,14 +203,16 @@ def best(
 
     While the second is not, the first's best.
     """
-    return two_stage.best(search(env, agent, reward_delay, obs_noise), _folder())
+    found = stages(env, agent, reward_delay, obs_noise)
+    return found and found.best
 
 
 def is_whole(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> bool:
     """Whether both stages of a search are complete, so that `best` is final."""
-    return two_stage.is_whole(search(env, agent, reward_delay, obs_noise), _folder())
+    found = stages(env, agent, reward_delay, obs_noise)
+    return found is not None and found.is_whole
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
@@ -231,7 +238,7 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
             if second is not None and not second.complete:
                 second = None
             chosen, final = two_stage.best_point(known, second)
-            said = ", ".join(f"{key} {value:g}" for key, value in chosen.items())
+            said = report.point(chosen)
             cells = [name, agent, _size(known), _size(second), said]
             score = two_stage.scores(known)
             cells += [f"{final.mean():.0f}", str(len(final))]

@@ -11,6 +11,7 @@ import numpy as np
 from experiments import trials
 from experiments.trials import Results, Trial
 from gasil_jax import plot, plotting, statistics
+from gasil_jax.points import Point
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,13 +250,17 @@ def optimum(
     return "\n".join(lines)
 
 
+def point(of: Point) -> str:
+    """A point in words."""
+    return ", ".join(f"{name} {value:g}" for name, value in of.items())
+
+
 def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """What each curve was trained with, beyond the appendix's defaults."""
     lines = ["| task | agent | hyperparameters | trained with |", "|---|---|---|---|"]
     for panel, curves in shown.items():
         for curve, known in curves.items():
-            point = known.trial.points[0]
-            values = [f"{name} {value:g}" for name, value in point.items()]
+            values = [said] if (said := point(known.trial.points[0])) else []
             if known.trial.num_envs != trials.NUM_ENVS:
                 values.append(f"{known.trial.num_envs} environments")
             made = {

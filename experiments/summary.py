@@ -49,9 +49,8 @@ def table() -> str:
 def tallies() -> tuple[str, ...]:
     """What the comparisons of figures 5 and 7 come to: Markdown."""
     return tuple(
-        figure.conclusions(figure.shown(make(), trials.RESULTS))
-        for figure, make in FIGURES
-        if figure in (mujoco.FIGURE, delayed_mujoco.FIGURE)
+        figure.conclusions(figure.shown(comparison.make(delay), trials.RESULTS))
+        for figure, delay in _COMPARISONS
     )
 
 

@@ -5,6 +5,7 @@ The best of many points on few seeds is partly the luckiest.
 
 import dataclasses
 import pathlib
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,46 +21,47 @@ _SEEDS_OF = {"ant": 2, "humanoid": 2}
 _ENOUGH_SEEDS = 8
 
 
-def second(first: Trial, folder: pathlib.Path) -> Trial | None:
-    """The trial that gives the best points of a search more seeds.
+class Stages(NamedTuple):
+    """What there is of a search whose first stage is complete.
 
-    None before the search is complete, and where its points have enough.
-
-    Args:
-      first: the search.
-      folder: of its results.
+    Attributes:
+      first: its results.
+      again: the trial that gives its best points more seeds; None where they have
+        enough.
+      second: the results of that, once it is complete.
     """
-    known = trials.read_whole(first, folder)
-    if known is None or first.seeds >= _ENOUGH_SEEDS:
+
+    first: Results
+    again: Trial | None
+    second: Results | None
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether nothing is left to train, so that `best` is final."""
+        return self.again is None or self.second is not None
+
+    @property
+    def best(self) -> Point:
+        """The best point so far: of the second stage once there is one."""
+        return best_point(self.first, self.second)[0]
+
+
+def read(search: Trial, folder: pathlib.Path) -> Stages | None:
+    """A search by its results in a folder; None before its first stage is complete."""
+    first = trials.read_whole(search, folder)
+    if first is None:
         return None
-    best_first = np.argsort(-scores(known), kind="stable")
-    return dataclasses.replace(
-        first,
-        name=first.name + SUFFIX,
-        points=tuple(first.points[i] for i in best_first[:_POINTS]),
-        seeds=_SEEDS_OF.get(first.env, _SEEDS),
+    if search.seeds >= _ENOUGH_SEEDS:
+        return Stages(first, None, None)
+    best_first = np.argsort(-scores(first), kind="stable")
+    again = dataclasses.replace(
+        search,
+        name=search.name + SUFFIX,
+        points=tuple(search.points[i] for i in best_first[:_POINTS]),
+        seeds=_SEEDS_OF.get(search.env, _SEEDS),
         first_seed=_FIRST_SEED,
     )
-
-
-def best(first: Trial, folder: pathlib.Path) -> Point | None:
-    """The best point of a search so far, by its results in a folder.
-
-    None before the first stage is complete.
-    """
-    known = trials.read_whole(first, folder)
-    if known is None:
-        return None
-    again = second(first, folder)
-    return best_point(known, again and trials.read_whole(again, folder))[0]
-
-
-def is_whole(first: Trial, folder: pathlib.Path) -> bool:
-    """Whether both stages of a search are in a folder's results."""
-    if trials.read_whole(first, folder) is None:
-        return False
-    again = second(first, folder)
-    return again is None or trials.read_whole(again, folder) is not None
+    return Stages(first, again, trials.read_whole(again, folder))
 
 
 def scores(known: Results) -> np.ndarray:

@@ -29,7 +29,6 @@ from experiments import (
 )
 from experiments.report import Figure
 from experiments.trials import Results, Trial
-from gasil_jax.points import Point
 
 AGENT = "ppo+gasil"
 # What a first search leaves open.
@@ -79,15 +78,14 @@ seeds are wanted, not more points. Swimmer's search is half done. The other curv
 
 def search(env: str) -> Trial | None:
     """The search on a task; None before figure 7's own is complete."""
-    first = random_search.search(env, AGENT, random_search.DELAY)
-    known = trials.read_whole(first, trials.RESULTS / random_search.FIGURE.name)
+    known = random_search.stages(env, AGENT, random_search.DELAY)
     if known is None:
         return None
     space = dict(random_search.space(env, AGENT))
     for name in set(space) - set(_FREE):
-        space[name] = (_best_value(known, name),)
+        space[name] = (_best_value(known.first, name),)
     return dataclasses.replace(
-        first,
+        known.first.trial,
         name=f"{env}{_SEARCH}/{AGENT}",
         points=random_search.every_point(space),
         seeds=_SEEDS,
@@ -109,16 +107,18 @@ def make() -> list[Trial]:
     for env in TASKS:
         if (first := search(env)) is None:
             continue
-        second = two_stage.second(first, folder)
-        wanted += [first] if second is None else [first, second]
-        best = two_stage.best(first, folder)
-        if best is not None and two_stage.is_whole(first, folder):
+        wanted.append(first)
+        if (known := two_stage.read(first, folder)) is None:
+            continue
+        if known.again is not None:
+            wanted.append(known.again)
+        if known.is_whole:
             wanted.append(
                 Trial(
                     name=f"{env}/{AGENT}",
                     env=env,
                     agent=AGENT,
-                    points=(best,),
+                    points=(known.best,),
                     reward_delay=first.reward_delay,
                 )
             )
@@ -130,12 +130,10 @@ def _searches(wanted: Sequence[Trial], results: pathlib.Path) -> str:
     folder = results / FIGURE.name
     parts = []
     for trial in wanted:
-        known = trials.read_whole(trial, folder)
-        if known is None or not trial.name.endswith(f"{_SEARCH}/{AGENT}"):
+        if not trial.name.endswith(f"{_SEARCH}/{AGENT}"):
             continue
-        again = two_stage.second(trial, folder)
-        again = again and trials.read_whole(again, folder)
-        parts += [_grid(known), _second_stage(known, again)]
+        if (known := two_stage.read(trial, folder)) is not None:
+            parts += [_grid(known.first), _second_stage(known.first, known.second)]
     if parts:
         parts.insert(0, "## The searches")
     return "\n\n".join(parts)
@@ -152,8 +150,9 @@ def _grid(known: Results) -> str:
     )
     fixed = {name: value for name, value in points[0].items() if name not in _FREE}
     lines = [
-        f"**{known.trial.name.split(_SEARCH)[0]}**, {_said(fixed)}: mean return of the "
-        f"last fifth of training of {len(known.seeds)} seeds, by discriminator updates "
+        f"**{known.trial.name.split(_SEARCH)[0]}**, {report.point(fixed)}: mean "
+        f"return of the last fifth of training of {len(known.seeds)} seeds, by "
+        "discriminator updates "
         f"and learning rate; in a cell with buffers of {' and '.join(map(str, sizes))} "
         "steps.",
         "",
@@ -176,12 +175,9 @@ def _second_stage(first: Results, second: Results | None) -> str:
     point, final = two_stage.best_point(first, second)
     return (
         f"The best four, on {len(second.seeds)} other seeds: {tried}. Chosen: "
-        f"{_said(point)}; {final.mean():.0f} over {len(final)} seeds of both stages."
+        f"{report.point(point)}; {final.mean():.0f} over {len(final)} seeds of both "
+        "stages."
     )
-
-
-def _said(point: Point) -> str:
-    return ", ".join(f"{name} {value:g}" for name, value in point.items())
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:

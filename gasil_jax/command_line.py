@@ -5,7 +5,7 @@ import io
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import tyro
 from tyro.constructors import (
@@ -123,6 +123,19 @@ def _in_one_line(refusal: str) -> str:
     name, whole, value = number.groups()
     kind = "a whole number" if whole else "a number"
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
+
+
+def check_least(options: Any, **least: int) -> None:
+    """Raise `InputError` for numbers below what is allowed; None is no number.
+
+    Args:
+      options: a dataclass.
+      least: of its fields by name.
+    """
+    for name, low in least.items():
+        value = getattr(options, name)
+        if value is not None and value < low:
+            raise InputError(f"{name} is {value}: it must be {low} or more")
 
 
 def exit_status(work: Callable[[], int | None]) -> int:

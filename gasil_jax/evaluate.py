@@ -162,15 +162,11 @@ def check_key(key: int) -> None:
         raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
 
 
-def seed_place(seeds: Sequence[int], seed: int) -> int:
-    """Where a seed is among a run's; raises `InputError` if it is not."""
-    if seed not in seeds:
-        raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
-    return seeds.index(seed)
-
-
 def load(
-    folder: pathlib.Path, which: str = "last", point: int | None = None
+    folder: pathlib.Path,
+    which: str = "last",
+    point: int | None = None,
+    seed: int | None = None,
 ) -> tuple[Any, Config, list[int], Any]:
     """Environment, config, seed numbers and states (seed, ...) of a run or point.
 
@@ -178,10 +174,11 @@ def load(
       folder: of the run or sweep, finished or not.
       which: of its checkpoints, "last" or "best" (the highest mean return).
       point: of a sweep; default the best by mean.
+      seed: its number; default all.
 
     Raises:
-      InputError: it is not the folder of a run, or has no such checkpoint, or the best
-        is asked for of a point that shares its checkpoints with others.
+      InputError: it is not the folder of a run, or has no such checkpoint or seed, or
+        the best is asked for of a point that shares its checkpoints with others.
     """
     from gasil_jax import checkpoint, saved_states
 
@@ -212,10 +209,14 @@ def load(
         states = found.restore(like)
     except ValueError as error:
         raise InputError(str(error)) from None
-    if len(saved.places) < count:
-        places = np.array(saved.places)
+    seeds, places = saved.seeds, np.array(saved.places)
+    if seed is not None:
+        if seed not in seeds:
+            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
+        seeds, places = [seed], places[[seeds.index(seed)]]
+    if len(places) < count:
         states = jax.tree.map(lambda x: x[places], states)
-    return env, config, saved.seeds, states
+    return env, config, seeds, states
 
 
 def _score(
@@ -261,18 +262,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
-    if options.episodes < 1:
-        raise InputError(f"episodes is {options.episodes}: it must be 1 or more")
+    command_line.check_least(options, episodes=1)
     check_key(options.key)
     if options.out is not None:
         output_file.check(options.out, (".csv",))
-    env, config, seeds, states = load(options.run, options.checkpoint, options.point)
-    if options.seed is not None:
-        place = seed_place(seeds, options.seed)
-        seeds, states = (
-            [options.seed],
-            jax.tree.map(lambda x: x[np.array([place])], states),
-        )
+    env, config, seeds, states = load(
+        options.run, options.checkpoint, options.point, options.seed
+    )
     locomotion = environments.is_locomotion(env)
     if options.gymnasium and not (locomotion and not options.stochastic):
         raise InputError(

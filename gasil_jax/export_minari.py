@@ -172,16 +172,12 @@ def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
     check_name(options.name)
     env, config, seeds, states = evaluate.load(
-        options.run, options.checkpoint, options.point
+        options.run, options.checkpoint, options.point, options.seed
     )
-    places = range(len(seeds))
-    if options.seed is not None:
-        place = evaluate.seed_place(seeds, options.seed)
-        places = range(place, place + 1)
     limit = train.max_episode_steps(env, config)
     most = states.hyperparameters.max_buffer_steps
     buffers = jax.device_get((states.good_trajectories, most))
-    members = [batch.member(buffers, place) for place in places]
+    members = [batch.member(buffers, place) for place in range(len(seeds))]
     found = [
         episode
         for buffer, max_steps in members

@@ -255,18 +255,13 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"out is {options.out}: an .mp4 needs the package imageio-ffmpeg (pip "
             'install "gasil_jax[render]"); a .gif or .png needs nothing'
         )
-    for name in ("steps", "width", "height"):
-        if getattr(options, name) < 1:
-            value = getattr(options, name)
-            raise InputError(f"{name} is {value}: it must be 1 or more")
+    command_line.check_least(options, steps=1, width=1, height=1)
     evaluate.check_key(options.key)
     # A film's encoder takes no odd number of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
     env, _, seeds, states = evaluate.load(
-        options.run, options.checkpoint, options.point
+        options.run, options.checkpoint, options.point, options.seed
     )
-    seed = seeds[0] if options.seed is None else options.seed
-    place = evaluate.seed_place(seeds, seed)
     locomotion = environments.is_locomotion(env)
     if not (locomotion or environments.is_point_mass(env)):
         raise InputError("run is of an environment that can't be drawn")
@@ -276,7 +271,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"must end in {', '.join(_PICTURES)}"
         )
     output_file.make_parent(options.out)
-    drawn = policy.from_state(batch.member(states, place), env)
+    drawn = policy.from_state(batch.member(states, 0), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     with announced("render", "compiling and running the episode"):
         path, total = episode(env, act, jax.random.key(options.key), options.steps)
@@ -289,7 +284,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     except NoOpenGL as error:
         raise OSError(str(error)) from error
     print(
-        f"seed {seed}: return {total:.1f} in {len(path) - 1} steps, "
+        f"seed {seeds[0]}: return {total:.1f} in {len(path) - 1} steps, "
         f"{num_frames} frames in {options.out}"
     )
 

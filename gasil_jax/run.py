@@ -176,10 +176,9 @@ def check(options: Options) -> None:
         trackers.check(options.log)
     except ValueError as error:
         raise InputError(str(error)) from None
-    for name in ("seeds", "devices", "checkpoint_every", "keep_checkpoints"):
-        value = getattr(options, name)
-        if value is not None and value < 1:
-            raise InputError(f"{name} is {value}: it must be 1 or more")
+    command_line.check_least(
+        options, seeds=1, devices=1, checkpoint_every=1, keep_checkpoints=1
+    )
     last = 2**32 - options.seeds
     if not 0 <= options.first_seed <= last:
         raise InputError(

@@ -36,7 +36,7 @@ def check(out: pathlib.Path, resume: bool) -> None:
     while not place.exists():
         place = place.parent
     try:
-        with tempfile.TemporaryDirectory(prefix=".writable-", dir=place):
+        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=place):
             pass
     except OSError as error:
         raise InputError(unwritable(out, error)) from None

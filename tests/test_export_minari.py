@@ -70,7 +70,7 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     told = {}
     load = evaluate.load
 
-    def of_a_swept_point(folder, which, point):
+    def of_a_swept_point(folder, which, point, seed):
         env, config, seeds, states = load(folder)
         floats = states.hyperparameters
         floats = floats.replace(gamma=0.9 * jnp.ones_like(floats.gamma))
