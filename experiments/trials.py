@@ -9,6 +9,7 @@ machines can share an experiment.
 import csv
 import dataclasses
 import io
+import itertools
 import json
 import os
 import pathlib
@@ -32,9 +33,8 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 NUM_ENVS = 32
 #: More where physics is slow, for a GPU is fast only with thousands.
 NUM_ENVS_OF = {"ant": 64, "humanoid": 64}
-# The appendix's values, which a trial's points stand on; no tuned preset, and no
-# schedule of alpha: the paper's, of humanoid, begins at 2M steps.
-_FLAGS = ("--preset", "paper", "--alpha-schedule")
+# The appendix's values, which a trial's points stand on; no tuned preset.
+_FLAGS = ("--preset", "paper")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,6 +52,7 @@ class Trial:
       first_seed: the number of the first.
       total_steps: of a seed.
       rows: of a seed in the results: so many equal parts of training.
+      alpha_schedule: (environment steps, factor of alpha); default always 1.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Trial:
     first_seed: int = 0
     total_steps: int = 1_000_000
     rows: int = 50
+    alpha_schedule: tuple[tuple[float, float], ...] = ()
 
     @property
     def num_envs(self) -> int:
@@ -77,6 +79,8 @@ class Trial:
             del fields[name]
         if self.env in NUM_ENVS_OF:
             fields["num_envs"] = self.num_envs
+        if not self.alpha_schedule:
+            del fields["alpha_schedule"]
         return fields | {"points": [dict(point) for point in self.points]}
 
 
@@ -113,6 +117,7 @@ def train(
     return sweep.main(
         [
             *("--env", trial.env, "--agent", trial.agent, *_FLAGS),
+            *("--alpha-schedule", *map(str, itertools.chain(*trial.alpha_schedule))),
             *("--reward-delay", str(trial.reward_delay)),
             *("--obs-noise", str(trial.obs_noise), "--num-envs", str(trial.num_envs)),
             *("--seeds", str(trial.seeds), "--first-seed", str(trial.first_seed)),
