@@ -35,9 +35,7 @@ def make() -> list[Trial]:
         for trial in comparison.make(delay):
             if trial.env == "humanoid":
                 name = f"{panel}/{trial.agent}"
-                wanted.append(
-                    dataclasses.replace(trial, name=name, total_steps=STEPS)
-                )
+                wanted.append(dataclasses.replace(trial, name=name, total_steps=STEPS))
     (tuned,) = (trial for trial in wanted if trial.name == "dense/ppo+gasil")
     scheduled = dataclasses.replace(
         tuned,
@@ -51,9 +49,7 @@ def make() -> list[Trial]:
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """PPO and PPO+GASIL with the delayed reward."""
     return [
-        trial
-        for trial in wanted
-        if trial.name in ("delayed/ppo", "delayed/ppo+gasil")
+        trial for trial in wanted if trial.name in ("delayed/ppo", "delayed/ppo+gasil")
     ]
 
 
