@@ -1,9 +1,9 @@
 """Humanoid over 3M steps, as in the paper: ``python -m experiments.humanoid``.
 
-Figures 5 and 7 have every task at 1M steps. Here humanoid gets the 3M of the paper, with
-the hyperparameters that the search of those figures found. Dense PPO+GASIL is trained
-with alpha fixed, as on the other tasks, and with the paper's schedule too: 0 until 2M
-steps, so PPO till then, and risen to 0.02 at 3M (appendix).
+Figures 5 and 7 have every task at 1M steps. Here humanoid gets the 3M of the paper,
+with the hyperparameters that the search of those figures found. Dense PPO+GASIL is
+trained with alpha fixed, as on the other tasks, and with the paper's schedule too: 0
+until 2M steps, so PPO till then, and risen to 0.02 at 3M (appendix).
 """
 
 import dataclasses
