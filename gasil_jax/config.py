@@ -92,6 +92,9 @@ class Config:
       clip_epsilon_schedule: the same for PPO's clip range.
       alpha_schedule: the same for alpha. The paper's rule for Humanoid, 0 for 2M
         steps and then up to alpha until 3M, is ((2e6, 0), (3e6, 1)).
+      normalize_rewards: whether PPO's rewards are divided by the standard deviation of
+        their running discounted sum (OpenAI baselines' ppo2). Alpha is in that unit
+        then, not in the environment's.
       expert: what GAIL imitates: an .npz file with arrays "observation" and
         "action", or "minari:" and the name of a data set.
       max_episode_steps: an episode is truncated after so many steps; None takes
@@ -118,6 +121,7 @@ class Config:
     learning_rate_schedule: Schedule = ()
     clip_epsilon_schedule: Schedule = ()
     alpha_schedule: Schedule = ()
+    normalize_rewards: bool = False
     expert: str | None = None
     max_episode_steps: int | None = None
     hyperparameters: Hyperparameters = dataclasses.field(
@@ -188,7 +192,10 @@ _HYPERPARAMETER_RANGES = {
 
 _SCHEDULES = ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule")
 _SIZES = ("hidden_sizes", "discriminator_hidden_sizes")
-_NOT_A_COUNT = ("agent", "expert", "hyperparameters", *_SCHEDULES)
+_NOT_A_COUNT = (
+    *("agent", "normalize_rewards", "expert", "hyperparameters"),
+    *_SCHEDULES,
+)
 
 
 def validate(config: Config, agents: tuple[str, ...]) -> None:
@@ -215,6 +222,11 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
                 raise ValueError(
                     f"{field.name} is {value}: it must be a whole number, 1 or more"
                 )
+    if not isinstance(config.normalize_rewards, bool):
+        raise ValueError(
+            f"normalize_rewards is {config.normalize_rewards!r}: it must be True or "
+            "False"
+        )
     for whole, part in (("batch_steps", "num_envs"), ("batch_steps", "minibatch_size")):
         total, size = getattr(config, whole), getattr(config, part)
         if total % size:

@@ -12,7 +12,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs.precision import full_precision
-from gasil_jax import good_trajectories, normalization, ppo, rollout, schedules
+from gasil_jax import (
+    good_trajectories,
+    normalization,
+    ppo,
+    reward_normalization,
+    rollout,
+    schedules,
+)
 from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.imitation import AGENTS
 from gasil_jax.imitation.interface import Context
@@ -28,6 +35,7 @@ class TrainState(struct.PyTreeNode):
       params: {"policy": ..., "value": ...}.
       optimizer_state: of both, the same keys.
       normalizer: of observations.
+      reward_normalizer: of rewards; None where they are not normalized.
       environments: the running episodes, (env, ...).
       history: the last steps of each environment, (env, steps, ...).
       good_trajectories: the buffer B of the paper.
@@ -40,6 +48,7 @@ class TrainState(struct.PyTreeNode):
     params: Any
     optimizer_state: Any
     normalizer: normalization.Normalizer
+    reward_normalizer: reward_normalization.RewardNormalizer | None
     environments: rollout.EnvironmentStates
     history: good_trajectories.History
     good_trajectories: good_trajectories.GoodTrajectories
@@ -85,6 +94,11 @@ def init(
         params=params,
         optimizer_state={name: transform.init(params[name]) for name in params},
         normalizer=normalization.init(observation_size),
+        reward_normalizer=(
+            reward_normalization.init(config.num_envs)
+            if config.normalize_rewards
+            else None
+        ),
         environments=rollout.init(env, env_key, config.num_envs),
         history=good_trajectories.init_history(
             config.num_envs,
@@ -146,6 +160,18 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         state.good_trajectories, history, episodes, hp.max_buffer_steps
     )
 
+    # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
+    reward_normalizer, reward_scale = state.reward_normalizer, jnp.float32(1.0)
+    reward_metrics = {}
+    if reward_normalizer is not None:
+        reward_normalizer = reward_normalization.update(
+            reward_normalizer, batch.reward, batch.ended, hp.gamma
+        )
+        reward_scale = reward_normalization.scale(reward_normalizer)
+        reward_metrics["reward_scale"] = reward_scale
+        reward = reward_normalization.normalize(reward_normalizer, batch.reward)
+        batch = batch.replace(reward=reward)
+
     # Sample good trajectories, update the discriminator by equation 8, and shape the
     # reward with it (section 4.3): what the agent imitates with does so.
     context = Context(
@@ -153,6 +179,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         history=history,
         good_trajectories=buffer,
         normalizer=state.normalizer,
+        reward_scale=reward_scale,
         hyperparameters=hp,
         config=config,
         policy=policy,
@@ -211,6 +238,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         optimizer_state=optimizer_state,
         # Only now: within an iteration the policy that acts is the one that learns.
         normalizer=normalization.update(state.normalizer, batch.observation),
+        reward_normalizer=reward_normalizer,
         environments=environments,
         history=history,
         good_trajectories=buffer,
@@ -234,6 +262,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         "explained_variance": 1.0
         - jnp.var(return_ - values) / (jnp.var(return_) + 1e-8),
         "learning_rate": hp.learning_rate,
+        **reward_metrics,
         **ppo_metrics,
     }
     for own in (imitation_metrics, policy_metrics):

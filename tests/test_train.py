@@ -123,6 +123,7 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
         ({"num_envs": True}, "num_envs is True"),
         ({"hidden_sizes": [64, 64]}, "hidden_sizes is .* must be a tuple"),
         ({"alpha_schedule": (2e6, 0.0)}, "alpha_schedule is .*points"),
+        ({"normalize_rewards": 1}, "normalize_rewards is 1: it must be True or"),
         ({"minibatch_size": 60}, "nearest that does is"),
         ({"num_envs": 3}, "num_envs is 3"),
         ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' imitates none"),

@@ -18,10 +18,12 @@ class Context(struct.PyTreeNode):
     """What an imitation module sees of an iteration.
 
     Attributes:
-      rollout: the batch, (time, env, ...).
+      rollout: the batch, (time, env, ...), its reward normalized where it is.
       history: the last steps of each environment, the batch's in it.
       good_trajectories: the buffer, the batch's ended episodes in it.
       normalizer: of the observations, as the policy used it in the batch.
+      reward_scale: (), what rewards were divided by; 1 where they are not normalized.
+        The buffer's and the history's are not.
       hyperparameters: the floats.
       config: the static configuration.
       policy: (params, normalized observation) -> mean, log standard deviation.
@@ -32,6 +34,7 @@ class Context(struct.PyTreeNode):
     history: History
     good_trajectories: GoodTrajectories
     normalizer: Normalizer
+    reward_scale: jax.Array
     hyperparameters: Hyperparameters
     config: Config = struct.field(pytree_node=False)
     policy: Callable[..., tuple[jax.Array, jax.Array]] = struct.field(pytree_node=False)

@@ -219,7 +219,8 @@ def _update_policy(
 ) -> tuple[Replay, Any, Any, Metrics]:
     config, hyperparameters = context.config, context.hyperparameters
     normalize = lambda x: normalization.normalize(context.normalizer, x)
-    scale = return_scale(replay)
+    # The replay's returns are the environment's; the value is of normalized rewards.
+    scale = return_scale(replay) / context.reward_scale
 
     def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
         observation = normalize(rows.observation)
@@ -243,6 +244,7 @@ def _update_policy(
             key, replay.replace(priority=priority), config.sil_minibatch_size
         )
         rows = replay.at(place)
+        rows = rows._replace(return_=rows.return_ / context.reward_scale)
         gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
             params, rows, weight
         )
