@@ -226,11 +226,21 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         "seeds of both stages; median and worst are of the first stage's points. Where "
         "an agent other than PPO has no second stage yet, its best point may change.",
         "",
-        "| task | agent | first stage | second | best point | its mean | seeds "
-        "| median | worst |",
-        "|---|---|---|---|---|---|---|---|---|",
+        table(wanted, results / figure.name),
     ]
-    for name, curves in report.panels(wanted, results / figure.name).items():
+    results.mkdir(parents=True, exist_ok=True)
+    (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
+
+
+def table(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
+    """What searches have found: Markdown, empty where none is there.
+
+    Args:
+      wanted: both stages of each.
+      folder: of their results.
+    """
+    lines = []
+    for name, curves in report.panels(wanted, folder).items():
         for agent, known in curves.items():
             if agent.endswith(two_stage.SUFFIX):
                 continue
@@ -244,8 +254,13 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
             cells += [f"{final.mean():.0f}", str(len(final))]
             cells += [f"{x:.0f}" for x in (np.median(score), score.min())]
             lines.append(f"| {' | '.join(cells)} |")
-    results.mkdir(parents=True, exist_ok=True)
-    (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
+    if lines:
+        lines[:0] = [
+            "| task | agent | first stage | second | best point | its mean | seeds "
+            "| median | worst |",
+            "|---|---|---|---|---|---|---|---|---|",
+        ]
+    return "\n".join(lines)
 
 
 def _size(known: trials.Results | None) -> str:

@@ -53,6 +53,7 @@ class Trial:
       total_steps: of a seed.
       rows: of a seed in the results: so many equal parts of training.
       alpha_schedule: (environment steps, factor of alpha); default always 1.
+      normalize_rewards: whether PPO's rewards are.
     """
 
     name: str
@@ -66,6 +67,7 @@ class Trial:
     total_steps: int = 1_000_000
     rows: int = 50
     alpha_schedule: tuple[tuple[float, float], ...] = ()
+    normalize_rewards: bool = False
 
     @property
     def num_envs(self) -> int:
@@ -79,8 +81,10 @@ class Trial:
             del fields[name]
         if self.env in NUM_ENVS_OF:
             fields["num_envs"] = self.num_envs
-        if not self.alpha_schedule:
-            del fields["alpha_schedule"]
+        # Results that are older than these fields have none of them.
+        for name in ("alpha_schedule", "normalize_rewards"):
+            if not fields[name]:
+                del fields[name]
         return fields | {"points": [dict(point) for point in self.points]}
 
 
@@ -118,6 +122,9 @@ def train(
         [
             *("--env", trial.env, "--agent", trial.agent, *_FLAGS),
             *("--alpha-schedule", *map(str, itertools.chain(*trial.alpha_schedule))),
+            "--normalize-rewards"
+            if trial.normalize_rewards
+            else "--no-normalize-rewards",
             *("--reward-delay", str(trial.reward_delay)),
             *("--obs-noise", str(trial.obs_noise), "--num-envs", str(trial.num_envs)),
             *("--seeds", str(trial.seeds), "--first-seed", str(trial.first_seed)),

@@ -1,20 +1,25 @@
 """A search in two stages: many points on few seeds, then the best again on more.
 
-The best of many points on few seeds is partly the luckiest.
+The best of many points on few seeds is partly the luckiest. A figure may hold searches
+of its own beside its curves: in panels whose name ends with `PANEL_SUFFIX`.
 """
 
 import dataclasses
 import pathlib
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from experiments import trials
+from experiments import report, trials
+from experiments.report import Figure
 from experiments.trials import Results, Trial
 from gasil_jax.points import Point
 
 #: What the name of a second stage ends with.
 SUFFIX = "-best"
+#: What the name of a search's panel ends with, in a figure of its own curves.
+PANEL_SUFFIX = "-search"
 _POINTS, _SEEDS, _FIRST_SEED = 4, 4, 2000
 # Where a run costs several times as much.
 _SEEDS_OF = {"ant": 2, "humanoid": 2}
@@ -62,6 +67,60 @@ def read(search: Trial, folder: pathlib.Path) -> Stages | None:
         first_seed=_FIRST_SEED,
     )
     return Stages(first, again, trials.read_whole(again, folder))
+
+
+def is_search(trial: Trial) -> bool:
+    """Whether a figure's trial is of one of its searches."""
+    return trial.name.split("/")[0].endswith(PANEL_SUFFIX)
+
+
+def trials_of(search: Trial, folder: pathlib.Path) -> list[Trial]:
+    """A search's stages so far and, once it is whole, ten seeds of its best point.
+
+    Args:
+      search: PANEL-search/CURVE.
+      folder: of the results.
+
+    Returns:
+      Up to three trials, the last of the name PANEL/CURVE with figures' own settings.
+    """
+    known = read(search, folder)
+    if known is None:
+        return [search]
+    found = [search] if known.again is None else [search, known.again]
+    if known.is_whole:
+        panel, curve = search.name.split("/")
+        final = Trial(
+            name=f"{panel.removesuffix(PANEL_SUFFIX)}/{curve}",
+            env=search.env,
+            agent=search.agent,
+            points=(known.best,),
+            reward_delay=search.reward_delay,
+            normalize_rewards=search.normalize_rewards,
+        )
+        found.append(final)
+    return found
+
+
+def write(
+    figure: Figure, wanted: Sequence[Trial], results: pathlib.Path, searches: str
+) -> None:
+    """Write a figure's page and picture, or a page of its searches alone.
+
+    Args:
+      figure: which.
+      wanted: its trials.
+      results: the folder of all results.
+      searches: what they found, Markdown; empty where there is nothing.
+    """
+    if searches:
+        searches = f"## The searches\n\n{searches}"
+    if figure.shown(wanted, results):
+        more = "\n\n".join(part for part in (figure.more, searches) if part)
+        report.write(dataclasses.replace(figure, more=more), wanted, results)
+    elif searches:
+        page = results / f"{figure.name}.md"
+        page.write_text(f"# {figure.title}\n\n{searches}\n")
 
 
 def scores(known: Results) -> np.ndarray:

@@ -38,8 +38,6 @@ TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer")
 _SEEDS = 2
 # The agent's curve in figure 7, beside the one of here.
 _FIRST = f"{AGENT} of figure 7"
-# What the name of a search's panel ends with.
-_SEARCH = "-search"
 
 
 def _gather(
@@ -50,7 +48,7 @@ def _gather(
     before = report.panels(figure7, results / delayed_mujoco.FIGURE.name)
     shown = {}
     for panel, curves in report.panels(wanted, results / FIGURE.name).items():
-        env = panel.removesuffix(_SEARCH)
+        env = panel.removesuffix(two_stage.PANEL_SUFFIX)
         others = dict(before.get(env, {}))
         if AGENT in others:
             others[_FIRST] = others.pop(AGENT)
@@ -86,7 +84,7 @@ def search(env: str) -> Trial | None:
         space[name] = (_best_value(known.first, name),)
     return dataclasses.replace(
         known.first.trial,
-        name=f"{env}{_SEARCH}/{AGENT}",
+        name=f"{env}{two_stage.PANEL_SUFFIX}/{AGENT}",
         points=random_search.every_point(space),
         seeds=_SEEDS,
     )
@@ -103,26 +101,8 @@ def _best_value(known: Results, name: str) -> Any:
 def make() -> list[Trial]:
     """On each task the search's stages, and ten seeds of its best point once whole."""
     folder = trials.RESULTS / FIGURE.name
-    wanted = []
-    for env in TASKS:
-        if (first := search(env)) is None:
-            continue
-        wanted.append(first)
-        if (known := two_stage.read(first, folder)) is None:
-            continue
-        if known.again is not None:
-            wanted.append(known.again)
-        if known.is_whole:
-            wanted.append(
-                Trial(
-                    name=f"{env}/{AGENT}",
-                    env=env,
-                    agent=AGENT,
-                    points=(known.best,),
-                    reward_delay=first.reward_delay,
-                )
-            )
-    return wanted
+    first = [found for env in TASKS if (found := search(env)) is not None]
+    return [trial for each in first for trial in two_stage.trials_of(each, folder)]
 
 
 def _searches(wanted: Sequence[Trial], results: pathlib.Path) -> str:
@@ -130,12 +110,11 @@ def _searches(wanted: Sequence[Trial], results: pathlib.Path) -> str:
     folder = results / FIGURE.name
     parts = []
     for trial in wanted:
-        if not trial.name.endswith(f"{_SEARCH}/{AGENT}"):
+        # The second stage is read with its first.
+        if not two_stage.is_search(trial) or trial.name.endswith(two_stage.SUFFIX):
             continue
         if (known := two_stage.read(trial, folder)) is not None:
             parts += [_grid(known.first), _second_stage(known.first, known.second)]
-    if parts:
-        parts.insert(0, "## The searches")
     return "\n\n".join(parts)
 
 
@@ -150,7 +129,7 @@ def _grid(known: Results) -> str:
     )
     fixed = {name: value for name, value in points[0].items() if name not in _FREE}
     lines = [
-        f"**{known.trial.name.split(_SEARCH)[0]}**, {report.point(fixed)}: mean "
+        f"**{known.trial.env}**, {report.point(fixed)}: mean "
         f"return of the last fifth of training of {len(known.seeds)} seeds, by "
         "discriminator updates "
         f"and learning rate; in a cell with buffers of {' and '.join(map(str, sizes))} "
@@ -182,13 +161,7 @@ def _second_stage(first: Results, second: Results | None) -> str:
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
     """Write the page, with the searches, and the figure of what there is."""
-    searches = _searches(wanted, results)
-    if figure.shown(wanted, results):
-        more = "\n\n".join(part for part in (figure.more, searches) if part)
-        report.write(dataclasses.replace(figure, more=more), wanted, results)
-    elif searches:
-        page = results / f"{figure.name}.md"
-        page.write_text(f"# {figure.title}\n\n{searches}\n")
+    two_stage.write(figure, wanted, results, _searches(wanted, results))
 
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
@@ -196,7 +169,7 @@ def quick(wanted: Sequence[Trial]) -> list[Trial]:
     return [
         dataclasses.replace(trial, points=trial.points[:4])
         for trial in wanted
-        if trial.name == f"hopper{_SEARCH}/{AGENT}"
+        if trial.name == f"hopper{two_stage.PANEL_SUFFIX}/{AGENT}"
     ]
 
 
