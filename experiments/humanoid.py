@@ -33,9 +33,10 @@ def make() -> list[Trial]:
     wanted = []
     for panel, delay in _PANELS.items():
         for trial in comparison.make(delay):
-            if trial.env == "humanoid":
-                name = f"{panel}/{trial.agent}"
-                wanted.append(dataclasses.replace(trial, name=name, total_steps=STEPS))
+            task, curve = trial.name.split("/")
+            if task == "humanoid":
+                change = {"name": f"{panel}/{curve}", "total_steps": STEPS}
+                wanted.append(dataclasses.replace(trial, **change))
     (tuned,) = (trial for trial in wanted if trial.name == "dense/ppo+gasil")
     scheduled = dataclasses.replace(
         tuned,

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from experiments import (
     comparison,
     delayed_mujoco,
+    humanoid,
     hyperparameters,
     mujoco,
+    normalized_rewards,
     point_mass,
     random_search,
     report,
@@ -24,7 +26,9 @@ FIGURES = (
     (mujoco.FIGURE, lambda: comparison.make(1)),
     (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
     (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
+    (normalized_rewards.FIGURE, normalized_rewards.make),
     (wider_search.FIGURE, wider_search.make),
+    (humanoid.FIGURE, humanoid.make),
     (hyperparameters.FIGURE, hyperparameters.make),
 )
 # Of all agents on the locomotion tasks, with the reward's delay.

@@ -128,8 +128,9 @@ def _grid(known: Results) -> str:
         sorted({point[name] for point in points}) for name in _FREE
     )
     fixed = {name: value for name, value in points[0].items() if name not in _FREE}
+    env = known.trial.name.split(two_stage.PANEL_SUFFIX)[0]
     lines = [
-        f"**{known.trial.env}**, {report.point(fixed)}: mean "
+        f"**{env}**, {report.point(fixed)}: mean "
         f"return of the last fifth of training of {len(known.seeds)} seeds, by "
         "discriminator updates "
         f"and learning rate; in a cell with buffers of {' and '.join(map(str, sizes))} "

@@ -22,8 +22,10 @@ from experiments import (
     command,
     comparison,
     delayed_mujoco,
+    humanoid,
     hyperparameters,
     mujoco,
+    normalized_rewards,
     point_mass,
     point_mass_layouts,
     point_mass_moments,
@@ -35,7 +37,7 @@ from experiments import (
     trials,
     wider_search,
 )
-from gasil_jax import shards
+from gasil_jax import run_folder, shards
 from gasil_jax.config import Config
 from gasil_jax.interruption import Interrupted
 
@@ -60,15 +62,18 @@ def toy(monkeypatch):
 
         monkeypatch.setattr(module, "make", make)
 
-    def make_wider(make=wider_search.make):
-        return [
-            dataclasses.replace(
-                trial, env="point_mass", points=trial.points[:1], first_seed=0
-            )
-            for trial in make()
-        ]
+    # Their searches: one point, and the seeds of figures.
+    for module in (wider_search, normalized_rewards):
 
-    monkeypatch.setattr(wider_search, "make", make_wider)
+        def make_search(make=module.make):
+            return [
+                dataclasses.replace(
+                    trial, env="point_mass", points=trial.points[:1], first_seed=0
+                )
+                for trial in make()
+            ]
+
+        monkeypatch.setattr(module, "make", make_search)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +87,9 @@ def toy(monkeypatch):
             "discriminator_updates/1",
             "| discriminator_updates | 1 | 2 |",
         ),
+        (humanoid, "dense/ppo+gasil from 2M", "| dense | ppo+gasil from 2M | 2 |"),
         (wider_search, "hopper-search/ppo+gasil", "**hopper**, learning_rate"),
+        (normalized_rewards, "hopper-search/ppo", "| hopper-search | ppo | 1 x 2 |"),
     ],
 )
 def test_an_experiment_trains_goes_on_and_reports(
@@ -105,7 +112,8 @@ def test_an_experiment_trains_goes_on_and_reports(
     page = tmp_path / "results" / f"{name}.md"
     assert shown in page.read_text()
     # A picture of curves, and none where there are none yet.
-    assert page.with_suffix(".png").exists() == (module is not wider_search)
+    of_searches = module in (wider_search, normalized_rewards)
+    assert page.with_suffix(".png").exists() == (not of_searches)
     # Nothing is trained twice, and other settings do not get in between.
     capsys.readouterr()
     assert module.main(arguments) == 0
@@ -113,6 +121,21 @@ def test_an_experiment_trains_goes_on_and_reports(
     changed = [*arguments, "--total-steps", "1024", "--report"]
     assert module.main(changed) == 2
     assert "is of other settings" in capsys.readouterr().err
+
+
+def test_a_trial_trains_with_all_that_it_says(tmp_path):
+    plain = trials.Trial("a/b", "point_mass", "ppo+gasil", seeds=1, total_steps=512)
+    trial = dataclasses.replace(
+        plain, alpha_schedule=((1e3, 0.0), (2e3, 1.0)), normalize_rewards=True
+    )
+    flags = (*TOY, "--num-envs", "4", "--devices", "1")
+    assert trials.train(trial, tmp_path, 1, 1, flags) == 0
+    config = run_folder.read(tmp_path / trial.name)["config"]
+    assert config.alpha_schedule == trial.alpha_schedule
+    assert config.normalize_rewards
+    # Results that were there before trials had these fields are still theirs.
+    assert not {"alpha_schedule", "normalize_rewards"} & set(plain.settings())
+    assert trial.settings()["alpha_schedule"] and trial.settings()["normalize_rewards"]
 
 
 def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
@@ -294,7 +317,7 @@ def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch)
     final = wider_search.make()[2]
     assert final.points == (second.points[2],) and final.name == "hopper/ppo+gasil"
     figure7 = comparison.make(random_search.DELAY)[3]
-    assert final == dataclasses.replace(figure7, points=final.points)
+    assert final == dataclasses.replace(figure7, points=final.points, seeds=10)
     write_results(tmp_path / "wider_search", final, (77.0,))
     wanted = wider_search.make()
     shown = wider_search.FIGURE.shown(wanted, tmp_path)["hopper"]
@@ -306,6 +329,24 @@ def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch)
     # The last point is of most updates at the least rate with the larger buffer.
     assert "| 20 | 30, 31 | 28, 29 | 26, 27 | 24, 25 |" in page
     assert "on 4 other seeds: 0, 0, 99, 0. Chosen: learning_rate 0.0003" in page
+
+
+def test_what_a_search_beside_curves_finds_is_trained_alike(tmp_path, monkeypatch):
+    monkeypatch.setattr(trials, "RESULTS", tmp_path)
+    search = normalized_rewards.search("hopper", "ppo")
+    assert search in normalized_rewards.make() and search.normalize_rewards
+    write_results(tmp_path / "normalized_rewards", search, (1.0, 3.0, 2.0, 0.0))
+    (final,) = (t for t in normalized_rewards.make() if t.name == "hopper/ppo")
+    assert final.points == search.points[1:2] and final.normalize_rewards
+    assert (final.first_seed, final.seeds) == (0, 10)
+    shown = normalized_rewards.FIGURE.shown(normalized_rewards.make(), tmp_path)
+    assert not shown
+    write_results(tmp_path / "normalized_rewards", final, (77.0,))
+    wanted = normalized_rewards.make()
+    normalized_rewards.write(normalized_rewards.FIGURE, wanted, tmp_path)
+    page = (tmp_path / "normalized_rewards.md").read_text()
+    assert "| hopper | ppo | 10 | 77.0 [77.0, 77.0] |" in page
+    assert "| hopper-search | ppo | 4 x 8 |  | learning_rate 0.0001 | 3 | 8 |" in page
 
 
 def test_every_pair_of_values_is_drawn_equally_often():
