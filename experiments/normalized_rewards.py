@@ -1,32 +1,35 @@
-"""Delayed rewards, normalized: ``python -m experiments.normalized_rewards``.
+"""Rewards, normalized: ``python -m experiments.normalized_rewards``.
 
 The paper's implementation is OpenAI baselines', whose ``ppo2`` normalizes rewards on
 MuJoCo tasks and whose ``ppo1`` does not; the paper does not say which it has, and the
-appendix's range of alpha means another thing with each. Figure 7 has rewards as they
-are. Here every agent trains with normalized rewards, tuned anew: the same search over
-the appendix's ranges with the same number of runs (random_search.md), then ten seeds of
-the best point. The command lists and trains a stage once the one before it is complete:
-start it three times.
+appendix's range of alpha means another thing with each. Figures 5 and 7 have rewards as
+they are. Here every agent trains with normalized rewards, tuned anew: the same search
+over the appendix's ranges with the same number of runs (random_search.md), then ten
+seeds of the best point. The command lists and trains a stage once the one before it is
+complete: start it three times.
 """
 
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from experiments import (
     command,
     delayed_mujoco,
+    mujoco,
     random_search,
     report,
     trials,
     two_stage,
 )
 from experiments.report import Figure
-from experiments.trials import AGENTS, Results, Trial
+from experiments.trials import AGENTS, PAIR, Results, Trial
 
 #: Ant and humanoid cost several times as much, and no agent has learned to walk there.
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer")
+# With the figure that has the same rewards as they are.
+_DELAYS = {random_search.DELAY: delayed_mujoco.FIGURE, 1: mujoco.FIGURE}
 
 
 def _gather(
@@ -37,19 +40,32 @@ def _gather(
     return report.panels(tuned, results / FIGURE.name)
 
 
+def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
+    """The tally of the delayed rewards and of those that are not, Markdown."""
+    parts = []
+    for delay, figure in _DELAYS.items():
+        names = [random_search.panel(env, delay) for env in TASKS]
+        those = {name: shown[name] for name in names if name in shown}
+        if said := report.tally(those, AGENTS[-1]):
+            parts.append(f"{figure.title}, rewards normalized:\n\n{said}")
+    return "\n\n".join(parts)
+
+
 FIGURE = Figure(
     name="normalized_rewards",
-    title="Delayed rewards, normalized (paper, figure 7)",
-    claim=delayed_mujoco.FIGURE.claim,
+    title="Normalized rewards (paper, figures 5 and 7)",
+    claim=" ".join(figure.claim for figure in _DELAYS.values()),
+    conclude=_conclude,
     gather=_gather,
 )
 
 
-def search(env: str, agent: str) -> Trial:
+def search(env: str, agent: str, reward_delay: int) -> Trial:
     """The trial that tunes an agent on a task."""
+    panel = random_search.panel(env, reward_delay)
     return dataclasses.replace(
-        random_search.search(env, agent, random_search.DELAY),
-        name=f"{env}{two_stage.PANEL_SUFFIX}/{agent}",
+        random_search.search(env, agent, reward_delay),
+        name=f"{panel}{two_stage.PANEL_SUFFIX}/{agent}",
         normalize_rewards=True,
     )
 
@@ -59,9 +75,10 @@ def make() -> list[Trial]:
     folder = trials.RESULTS / FIGURE.name
     return [
         trial
+        for delay in _DELAYS
         for env in TASKS
         for agent in AGENTS
-        for trial in two_stage.trials_of(search(env, agent), folder)
+        for trial in two_stage.trials_of(search(env, agent, delay), folder)
     ]
 
 
@@ -73,8 +90,8 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
 
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
-    """Four points each of PPO and PPO+GASIL on hopper."""
-    names = [search("hopper", agent).name for agent in ("ppo", "ppo+gasil")]
+    """Four points each of PPO and PPO+GASIL on delayed hopper."""
+    names = [search("hopper", agent, random_search.DELAY).name for agent in PAIR]
     return [
         dataclasses.replace(trial, points=trial.points[:4])
         for trial in wanted

@@ -89,7 +89,11 @@ def toy(monkeypatch):
         ),
         (humanoid, "dense/ppo+gasil from 2M", "| dense | ppo+gasil from 2M | 2 |"),
         (wider_search, "hopper-search/ppo+gasil", "**hopper**, learning_rate"),
-        (normalized_rewards, "hopper-search/ppo", "| hopper-search | ppo | 1 x 2 |"),
+        (
+            normalized_rewards,
+            "hopper-delayed-search/ppo",
+            "| hopper-delayed-search | ppo | 1 x 2 |",
+        ),
     ],
 )
 def test_an_experiment_trains_goes_on_and_reports(
@@ -333,10 +337,10 @@ def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch)
 
 def test_what_a_search_beside_curves_finds_is_trained_alike(tmp_path, monkeypatch):
     monkeypatch.setattr(trials, "RESULTS", tmp_path)
-    search = normalized_rewards.search("hopper", "ppo")
+    search = normalized_rewards.search("hopper", "ppo", random_search.DELAY)
     assert search in normalized_rewards.make() and search.normalize_rewards
     write_results(tmp_path / "normalized_rewards", search, (1.0, 3.0, 2.0, 0.0))
-    (final,) = (t for t in normalized_rewards.make() if t.name == "hopper/ppo")
+    (final,) = (t for t in normalized_rewards.make() if t.name == "hopper-delayed/ppo")
     assert final.points == search.points[1:2] and final.normalize_rewards
     assert (final.first_seed, final.seeds) == (0, 10)
     shown = normalized_rewards.FIGURE.shown(normalized_rewards.make(), tmp_path)
@@ -345,8 +349,29 @@ def test_what_a_search_beside_curves_finds_is_trained_alike(tmp_path, monkeypatc
     wanted = normalized_rewards.make()
     normalized_rewards.write(normalized_rewards.FIGURE, wanted, tmp_path)
     page = (tmp_path / "normalized_rewards.md").read_text()
-    assert "| hopper | ppo | 10 | 77.0 [77.0, 77.0] |" in page
-    assert "| hopper-search | ppo | 4 x 8 |  | learning_rate 0.0001 | 3 | 8 |" in page
+    assert "| hopper-delayed | ppo | 10 | 77.0 [77.0, 77.0] |" in page
+    row = "| hopper-delayed-search | ppo | 4 x 8 |  | learning_rate 0.0001 | 3 | 8 |"
+    assert row in page
+    # The two rewards are counted apart.
+    agents = ("ppo", "ppo+gasil")
+    shown = {
+        panel: {
+            agent: trials.Results(
+                dataclasses.replace(final, agent=agent),
+                np.arange(10),
+                np.array([100]),
+                np.full((1, 10, 1), score),
+                (),
+            )
+            for agent, score in zip(agents, scores, strict=True)
+        }
+        for panel, scores in (("hopper-delayed", (1.0, 2.0)), ("hopper", (2.0, 1.0)))
+    }
+    delayed, dense = normalized_rewards.FIGURE.conclusions(shown).split(
+        "rewards normalized"
+    )[1:]
+    assert "ppo+gasil better than ppo: yes on 1 of 1" in delayed
+    assert "ppo+gasil better than ppo: no, it is lower on 1 of 1" in dense
 
 
 def test_every_pair_of_values_is_drawn_equally_often():
