@@ -11,7 +11,6 @@ import dataclasses
 import io
 import itertools
 import json
-import os
 import pathlib
 import subprocess
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import run_folder, shards, sweep, sweep_tables
+from gasil_jax import output_file, run_folder, shards, sweep, sweep_tables
 from gasil_jax.command_line import InputError
 
 #: The paper's agents, as figures 5 and 7 compare them.
@@ -201,10 +200,8 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
 
 
 def _write_whole(path: pathlib.Path, text: str) -> None:
-    # At once, and each process by a name of its own: parts may run side by side.
-    written = path.with_name(f"{path.name}.{os.getpid()}")
-    written.write_text(text)
-    written.replace(path)
+    with output_file.whole(path) as partial:
+        partial.write_text(text)
 
 
 def _is_of(trial: Trial, described: pathlib.Path) -> bool:
@@ -230,7 +227,7 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
     target = results / f"{trial.name}.csv"
     if target.exists():
         return
-    for described in sorted(results.parent.glob("*/*/*.json")):
+    for described in sorted(results.parent.glob("*/*/[!.]*.json")):
         if not _is_of(trial, described):
             continue
         other = dataclasses.replace(

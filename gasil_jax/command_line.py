@@ -1,11 +1,12 @@
 """From a command line to a dataclass, and from its errors to a line and a status."""
 
 import contextlib
+import dataclasses
 import io
 import re
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -89,6 +90,13 @@ def parse(
     Raises:
       InputError: what tyro refuses, its message in one line.
     """
+    # Of these tyro says the value and not the name.
+    switches = _switches(options)
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        flag, equals, value = argument.partition("=")
+        name = flag.removeprefix("--").replace("-", "_")
+        if equals and flag.startswith("--") and name in switches:
+            raise InputError(f"{name} is {value!r}: it takes no value")
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), _REGISTRY:
@@ -103,6 +111,17 @@ def parse(
         if exit_.code in (0, None):
             raise
         raise InputError(_in_one_line(printed.getvalue())) from None
+
+
+def _switches(kind: Any) -> set[str]:
+    """Names of what is on or off, in a dataclass and in those inside it."""
+    found = set()
+    for name, hint in get_type_hints(kind).items():
+        if hint is bool:
+            found |= {name, f"no_{name}"}
+        elif dataclasses.is_dataclass(hint):
+            found |= _switches(hint)
+    return found
 
 
 def _in_one_line(refusal: str) -> str:

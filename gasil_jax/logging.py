@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from gasil_jax import output_file
+
 #: Metrics that every metrics.csv has, in this order; an agent's own follow.
 COLUMNS = (
     "env_steps",
@@ -47,11 +49,10 @@ def _version(package: str) -> str | None:
 
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-    """Write atomically, so that a reader never sees half a file."""
-    temporary = path.with_name(path.name + ".partial")
+    """Write a whole file, or none."""
     text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
-    temporary.write_text(text + "\n")
-    temporary.replace(path)
+    with output_file.whole(path) as partial:
+        partial.write_text(text + "\n")
 
 
 def _to_json(value: Any) -> Any:

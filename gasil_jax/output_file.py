@@ -1,4 +1,4 @@
-"""One file that `out` names: refused beforehand, or written whole."""
+"""Files that are refused beforehand, or written whole."""
 
 import contextlib
 import os
@@ -6,7 +6,13 @@ import pathlib
 from collections.abc import Iterator, Sequence
 
 from gasil_jax.command_line import InputError
-from gasil_jax.run_folder import unwritable
+
+
+def unwritable(path: pathlib.Path, error: OSError) -> str:
+    """What is said of a folder or file that can't be written."""
+    # Libraries raise it without a number, some in several lines.
+    why = error.strerror or str(error).partition("\n")[0]
+    return f"out is {path}, which can't be written: {why}"
 
 
 def check(path: pathlib.Path, endings: Sequence[str]) -> None:
@@ -28,6 +34,8 @@ def make_parent(path: pathlib.Path) -> None:
 @contextlib.contextmanager
 def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Gives a path beside it to write to, which becomes it in the end, or nothing.
+
+    So no reader sees half a file, and processes may write the same one side by side.
 
     Raises:
       OSError: it can't be written, in one line that names it.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gasil_envs.precision import full_precision
-from gasil_jax import normalization, numpy_policy
+from gasil_jax import normalization, numpy_policy, output_file
 
 
 def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
@@ -39,7 +39,7 @@ def save(
     seeds: Sequence[int],
     final_return: np.ndarray,
 ) -> None:
-    """Write the policies of a batch of states as one ``.npz``, atomically.
+    """Write the policies of a batch of states as one ``.npz``, whole.
 
     Args:
       path: where to.
@@ -48,15 +48,13 @@ def save(
       seeds: their numbers.
       final_return: (seeds,), NaN where unknown.
     """
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        arrays: dict[str, Any] = {
-            "seeds": np.asarray(seeds, np.int64),
-            "final_return": np.asarray(final_return, np.float64),
-            **weights(states, env),
-        }
-        np.savez(file, **arrays)
-    partial.replace(path)
+    arrays: dict[str, Any] = {
+        "seeds": np.asarray(seeds, np.int64),
+        "final_return": np.asarray(final_return, np.float64),
+        **weights(states, env),
+    }
+    with output_file.whole(path) as partial:
+        np.savez(partial, **arrays)
 
 
 def load_policy(

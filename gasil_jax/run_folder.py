@@ -15,6 +15,7 @@ from typing import Any
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.environments import Settings
+from gasil_jax.output_file import unwritable
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
@@ -40,13 +41,6 @@ def check(out: pathlib.Path, resume: bool) -> None:
             pass
     except OSError as error:
         raise InputError(unwritable(out, error)) from None
-
-
-def unwritable(folder: pathlib.Path, error: OSError) -> str:
-    """What is said of a folder or file that can't be written."""
-    # Libraries raise it without a number, some in several lines.
-    why = error.strerror or str(error).partition("\n")[0]
-    return f"out is {folder}, which can't be written: {why}"
 
 
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
