@@ -260,9 +260,16 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     lines = ["| task | agent | hyperparameters | trained with |", "|---|---|---|---|"]
     for panel, curves in shown.items():
         for curve, known in curves.items():
-            values = [said] if (said := point(known.trial.points[0])) else []
-            if known.trial.num_envs != trials.NUM_ENVS:
-                values.append(f"{known.trial.num_envs} environments")
+            trial = known.trial
+            values = [said] if (said := point(trial.points[0])) else []
+            values += [
+                f"alpha x {factor:g} at {steps:g} steps"
+                for steps, factor in trial.alpha_schedule
+            ]
+            if trial.normalize_rewards:
+                values.append("rewards normalized")
+            if trial.num_envs != trials.NUM_ENVS:
+                values.append(f"{trial.num_envs} environments")
             made = {
                 f"{made['physics']} physics, jax {made['versions'].get('jax', '?')}, "
                 f"collected at commit {made['commit'] or 'unknown'}"

@@ -121,9 +121,7 @@ def train(
         [
             *("--env", trial.env, "--agent", trial.agent, *_FLAGS),
             *("--alpha-schedule", *map(str, itertools.chain(*trial.alpha_schedule))),
-            "--normalize-rewards"
-            if trial.normalize_rewards
-            else "--no-normalize-rewards",
+            f"--{'' if trial.normalize_rewards else 'no-'}normalize-rewards",
             *("--reward-delay", str(trial.reward_delay)),
             *("--obs-noise", str(trial.obs_noise), "--num-envs", str(trial.num_envs)),
             *("--seeds", str(trial.seeds), "--first-seed", str(trial.first_seed)),
