@@ -130,7 +130,7 @@ def _run(
     if done := len(chosen) - len(todo):
         print(f"{done} of {len(chosen)} trials are in {folder} already")
     if options.report:
-        for trial in chosen:
+        for trial in todo:
             trials.collect(trial, runs, folder)
     elif options.processes is not None:
         each = [(trial, trials.known(trial, folder)) for trial in todo]

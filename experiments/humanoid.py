@@ -8,11 +8,11 @@ until 2M steps, so PPO till then, and risen to 0.02 at 3M (appendix).
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from experiments import command, comparison, random_search
+from experiments import command, comparison, random_search, report
 from experiments.report import Figure
-from experiments.trials import Trial
+from experiments.trials import Results, Trial
 
 #: Environment steps of a seed (paper, appendix).
 STEPS = 3_000_000
@@ -20,11 +20,22 @@ STEPS = 3_000_000
 ALPHA, ALPHA_SCHEDULE = 0.02, ((2e6, 0.0), (3e6, 1.0))
 _PANELS = {"dense": 1, "delayed": random_search.DELAY}
 
+
+def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
+    """The tally of each reward, Markdown."""
+    tallies = {
+        panel: report.tally({panel: curves}, "ppo+gasil")
+        for panel, curves in shown.items()
+    }
+    return "\n\n".join(f"{panel}:\n\n{said}" for panel, said in tallies.items() if said)
+
+
 FIGURE = Figure(
     name="humanoid",
     title="Humanoid over 3M steps (paper, figures 5 and 7)",
     claim="PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large "
     "margin where the reward is delayed.",
+    conclude=_conclude,
 )
 
 

@@ -222,10 +222,6 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         "",
         " ".join(__doc__.split("\n\n", 1)[1].split()),
         "",
-        "Returns are of the last fifth of training. The best point's mean is over its "
-        "seeds of both stages; median and worst are of the first stage's points. Where "
-        "an agent other than PPO has no second stage yet, its best point may change.",
-        "",
         table(wanted, results / figure.name),
     ]
     results.mkdir(parents=True, exist_ok=True)
@@ -233,7 +229,7 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
 
 
 def table(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
-    """What searches have found: Markdown, empty where none is there.
+    """What searches have found, and what is what: Markdown, empty where none is there.
 
     Args:
       wanted: both stages of each.
@@ -256,6 +252,11 @@ def table(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
             lines.append(f"| {' | '.join(cells)} |")
     if lines:
         lines[:0] = [
+            "Returns are of the last fifth of training. The best point's mean is over "
+            "its seeds of both stages; median and worst are of the first stage's "
+            "points. Where an agent other than PPO has no second stage yet, its best "
+            "point may change.",
+            "",
             "| task | agent | first stage | second | best point | its mean | seeds "
             "| median | worst |",
             "|---|---|---|---|---|---|---|---|---|",

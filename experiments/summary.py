@@ -81,12 +81,10 @@ def page() -> str:
         folder = trials.RESULTS / figure.name
         missing = [x.name for x in wanted if trials.read_whole(x, folder) is None]
         parts += [f"## {figure.title}", f"**Claim.** {figure.claim}"]
-        if shown:
-            parts += [
-                figure.conclusions(shown),
-                f"[Tables, curves and settings]({figure.name}.md).",
-                figure.more,
-            ]
+        conclusions = figure.conclusions(shown)
+        linked = (trials.RESULTS / f"{figure.name}.md").exists()
+        link = f"[Tables, curves and settings]({figure.name}.md)." if linked else ""
+        parts += [conclusions, link, figure.more if shown else ""]
         if missing:
             parts.append(f"Not run yet, or not wholly: {', '.join(missing)}.")
     return "\n\n".join(part for part in parts if part) + "\n"

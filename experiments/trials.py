@@ -8,7 +8,6 @@ machines can share an experiment.
 
 import csv
 import dataclasses
-import io
 import itertools
 import json
 import pathlib
@@ -186,15 +185,18 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         rows = new | rows
     if len(rows) > found:
         target.parent.mkdir(parents=True, exist_ok=True)
-        file = io.StringIO()
-        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        for key in sorted(rows, key=lambda key: tuple(map(int, key))):
-            writer.writerows(rows[key])
+        in_order = sorted(rows, key=lambda key: tuple(map(int, key)))
         content = {"settings": trial.settings(), "made": made}
         # The CSV file last: where it is, its settings are.
         _write_whole(described, json.dumps(content, indent=2) + "\n")
-        _write_whole(target, file.getvalue())
+        _write_rows(target, [row for key in in_order for row in rows[key]])
+
+
+def _write_rows(target: pathlib.Path, rows: Iterable[Mapping[str, Any]]) -> None:
+    with output_file.whole(target) as partial, partial.open("w", newline="") as file:
+        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def _write_whole(path: pathlib.Path, text: str) -> None:
@@ -233,11 +235,11 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
         )
         known = read(other, results.parent)
         seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
-        if known is not None and known.seeds.tolist() == list(seeds):
+        if known is not None and set(seeds) <= set(known.seeds.tolist()):
+            rows = _read(described.with_suffix(".csv"))
             target.parent.mkdir(parents=True, exist_ok=True)
-            for suffix in (".json", ".csv"):
-                text = described.with_suffix(suffix).read_text()
-                _write_whole(target.with_suffix(suffix), text)
+            _write_whole(target.with_suffix(".json"), described.read_text())
+            _write_rows(target, [row for row in rows if int(row["seed"]) in seeds])
             return
 
 

@@ -82,7 +82,7 @@ def trials_of(search: Trial, folder: pathlib.Path) -> list[Trial]:
       folder: of the results.
 
     Returns:
-      Up to three trials, the last of the name PANEL/CURVE with figures' own settings.
+      Up to three trials, the last of the name PANEL/CURVE.
     """
     known = read(search, folder)
     if known is None:

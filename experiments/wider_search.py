@@ -5,9 +5,9 @@ all of them tried; PPO+GASIL has 256, of which it tries sixteen. Here it gets an
 search. Learning rate and alpha are the values that did best in the first (by the mean
 of the points that have them: each met every value of the others equally often), and all
 32 points of the other three hyperparameters get two seeds, then the best four get four
-more. The best point of all has ten seeds, those of figure 7, with whose curves it is
-compared. The command lists and trains a stage once the one before it is complete: start
-it three times.
+more. The best point of all has ten seeds, the first of figure 7's, with whose curves it
+is compared. The command lists and trains a stage once the one before it is complete:
+start it three times.
 """
 
 import dataclasses

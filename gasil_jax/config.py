@@ -94,7 +94,7 @@ class Config:
         steps and then up to alpha until 3M, is ((2e6, 0), (3e6, 1)).
       normalize_rewards: whether PPO's rewards are divided by the standard deviation of
         their running discounted sum (OpenAI baselines' ppo2). Alpha is in that unit
-        then, not in the environment's.
+        then, not in the environment's. Agents gasil and gail have no such reward.
       expert: what GAIL imitates: an .npz file with arrays "observation" and
         "action", or "minari:" and the name of a data set.
       max_episode_steps: an episode is truncated after so many steps; None takes

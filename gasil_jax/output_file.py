@@ -1,8 +1,8 @@
 """Files that are refused beforehand, or written whole."""
 
 import contextlib
-import os
 import pathlib
+import uuid
 from collections.abc import Iterator, Sequence
 
 from gasil_jax.command_line import InputError
@@ -40,7 +40,8 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
       OSError: it can't be written, in one line that names it.
     """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    # No number of a process: those of several hosts may be the same.
+    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         yield partial
         partial.rename(path)

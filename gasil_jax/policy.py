@@ -53,8 +53,8 @@ def save(
         "final_return": np.asarray(final_return, np.float64),
         **weights(states, env),
     }
-    with output_file.whole(path) as partial:
-        np.savez(partial, **arrays)
+    with output_file.whole(path) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)
 
 
 def load_policy(

@@ -162,6 +162,11 @@ def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
         assert trials.read(changed, here) is None
     same = dataclasses.replace(trial, name="0/ppo")
     trials.adopt(same, here)
+    # Of more seeds those that are wanted.
+    fewer = dataclasses.replace(trial, name="0/fewer", seeds=1)
+    trials.adopt(fewer, here)
+    assert trials.known(fewer, here) == {(0, 0)}
+    assert trials.read(fewer, here).final.tolist() == [[1.5]]
     # Results of other settings are no results, and are not written over.
     other = dataclasses.replace(same, obs_noise=0.1)
     assert trials.read(other, here) is None

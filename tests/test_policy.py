@@ -83,3 +83,11 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
         (tmp_path / "policy.npz").write_bytes(content)
         with pytest.raises(ValueError, match="is not a saved policy"):
             gasil_jax.load_policy(tmp_path)
+
+
+def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_path):
+    env, _, states = trained_point_mass
+    path = tmp_path / "best.weights"
+    policy.save(path, states, env, [5, 6, 7], np.zeros(3))
+    assert list(tmp_path.iterdir()) == [path]
+    assert set(numpy_policy.read(path, 5)) >= {"mean", "log_std"}
