@@ -95,6 +95,7 @@ def calls_of(script, folder, **variables):
     listed = folder / "calls"
     listed.unlink(missing_ok=True)
     stubs = {
+        "nvidia-cuda-mps-control": "true",
         "python": f'echo "$(printf "%q " "$@")" >> {listed}',
         "srun": 'exec "$@"',
     }
@@ -107,6 +108,19 @@ def calls_of(script, folder, **variables):
     return [shlex.split(line) for line in listed.read_text().splitlines()]
 
 
+BASH = re.findall(r"```bash\n(.*?)```", SCALING, re.DOTALL)
+
+
+def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
+    started = calls_of(BASH[0], tmp_path)
+    assert all(call[:2] == ["-m", "gasil_jax.run"] for call in started)
+    agents = [
+        command_line.parse(run.Options, call[2:], "gasil_jax.run").config.agent
+        for call in started
+    ]
+    assert sorted(agents) == ["ppo", "ppo+bc", "ppo+gasil", "ppo+sil"]
+
+
 def shard_of(call):
     assert call[:2] == ["-m", "gasil_jax.sweep"]
     arguments = call[2:]
@@ -117,7 +131,7 @@ def shard_of(call):
 
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     """In a real shell, with stand-ins for the schedulers and for Python."""
-    shell, slurm = re.findall(r"```bash\n(.*?)```", SCALING, re.DOTALL)
+    shell, slurm = BASH[1:]
     *trained, merged = calls_of(shell, tmp_path)
     assert sorted(shard_of(call) for call in trained) == [
         (number, 4, "OUT") for number in range(1, 5)

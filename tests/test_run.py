@@ -115,7 +115,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env hopper --obs-noise -1", "obs_noise is -1"),
         ("--env hopper --out /proc/nowhere/run", "can't be written"),
         ("--env hopper --total-step 5", "--total-steps"),
-        ("--env hopper --resume=3", "Unrecognized options: 3"),
+        ("--env hopper --resume=3", "resume is '3': it takes no value"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
         ("--env brax:ant --physics mujoco", "brax:ant has its own"),
         ("--env nowhere:Line", "'nowhere:Line' can't be imported: No module"),
