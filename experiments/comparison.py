@@ -6,11 +6,10 @@ from experiments.trials import AGENTS, TASKS, Trial
 #: Seeds of a task with delayed rewards, where they are not ten. One learns to run and
 #: another does not, so that ten tell few agents apart.
 DELAYED_SEEDS = {"hopper": 20, "walker2d": 20, "halfcheetah": 20}
-SEEDS = 10
 
 
 def make(reward_delay: int) -> list[Trial]:
-    """Every agent on every task, `SEEDS` or `DELAYED_SEEDS` of each.
+    """Every agent on every task, ten seeds or `DELAYED_SEEDS` of each.
 
     Where a task has not been searched, its agents have the appendix's first values.
     Humanoid has 1M steps as the others, and its alpha is fixed as theirs; the paper's
@@ -24,7 +23,7 @@ def make(reward_delay: int) -> list[Trial]:
             agent=agent,
             points=(random_search.best(env, agent, reward_delay) or {},),
             reward_delay=reward_delay,
-            seeds=more.get(env, SEEDS),
+            seeds=more.get(env, Trial.seeds),
         )
         for env in TASKS
         for agent in AGENTS

@@ -23,11 +23,8 @@ _PANELS = {"dense": 1, "delayed": random_search.DELAY}
 
 def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """The tally of each reward, Markdown."""
-    tallies = {
-        panel: report.tally({panel: curves}, "ppo+gasil")
-        for panel, curves in shown.items()
-    }
-    return "\n\n".join(f"{panel}:\n\n{said}" for panel, said in tallies.items() if said)
+    alone = {panel: {panel: curves} for panel, curves in shown.items()}
+    return report.tallies(alone, "ppo+gasil")
 
 
 FIGURE = Figure(

@@ -42,13 +42,12 @@ def _gather(
 
 def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """The tally of the delayed rewards and of those that are not, Markdown."""
-    parts = []
+    groups = {}
     for delay, figure in _DELAYS.items():
         names = [random_search.panel(env, delay) for env in TASKS]
         those = {name: shown[name] for name in names if name in shown}
-        if said := report.tally(those, AGENTS[-1]):
-            parts.append(f"{figure.title}, rewards normalized:\n\n{said}")
-    return "\n\n".join(parts)
+        groups[f"{figure.title}, rewards normalized"] = those
+    return report.tallies(groups, AGENTS[-1])
 
 
 FIGURE = Figure(
@@ -92,11 +91,7 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """Four points each of PPO and PPO+GASIL on delayed hopper."""
     names = [search("hopper", agent, random_search.DELAY).name for agent in PAIR]
-    return [
-        dataclasses.replace(trial, points=trial.points[:4])
-        for trial in wanted
-        if trial.name in names
-    ]
+    return two_stage.quick(wanted, names)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

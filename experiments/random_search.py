@@ -26,7 +26,6 @@ replaced, a search of all of PPO+GASIL's hyperparameters on the point mass, and 
 ant with 128 environments of 16 steps (64 of 32 now: a reward comes every 20).
 """
 
-import dataclasses
 import itertools
 import pathlib
 import sys
@@ -270,12 +269,7 @@ def _size(known: trials.Results | None) -> str:
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """Four points each of PPO and PPO+GASIL on hopper."""
-    names = ("hopper/ppo", "hopper/ppo+gasil")
-    return [
-        dataclasses.replace(trial, points=trial.points[:4])
-        for trial in wanted
-        if trial.name in names
-    ]
+    return two_stage.quick(wanted, ("hopper/ppo", "hopper/ppo+gasil"))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -192,6 +192,14 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
     return "\n".join(lines)
 
 
+def tallies(
+    groups: Mapping[str, Mapping[str, Mapping[str, Results]]], favourite: str
+) -> str:
+    """The tally of each group of panels under its name, Markdown."""
+    found = {name: tally(shown, favourite) for name, shown in groups.items()}
+    return "\n\n".join(f"{name}:\n\n{said}" for name, said in found.items() if said)
+
+
 def gaps(
     shown: Mapping[str, Mapping[str, Results]], first: str, favourite: str, other: str
 ) -> str:

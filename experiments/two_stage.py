@@ -6,7 +6,7 @@ of its own beside its curves: in panels whose name ends with `PANEL_SUFFIX`.
 
 import dataclasses
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -96,10 +96,21 @@ def trials_of(search: Trial, folder: pathlib.Path) -> list[Trial]:
             agent=search.agent,
             points=(known.best,),
             reward_delay=search.reward_delay,
+            obs_noise=search.obs_noise,
+            alpha_schedule=search.alpha_schedule,
             normalize_rewards=search.normalize_rewards,
         )
         found.append(final)
     return found
+
+
+def quick(wanted: Sequence[Trial], names: Collection[str]) -> list[Trial]:
+    """Four points each of the searches of these names."""
+    return [
+        dataclasses.replace(trial, points=trial.points[:4])
+        for trial in wanted
+        if trial.name in names
+    ]
 
 
 def write(

@@ -167,11 +167,7 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
 
 def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """Four points on hopper."""
-    return [
-        dataclasses.replace(trial, points=trial.points[:4])
-        for trial in wanted
-        if trial.name == f"hopper{two_stage.PANEL_SUFFIX}/{AGENT}"
-    ]
+    return two_stage.quick(wanted, (f"hopper{two_stage.PANEL_SUFFIX}/{AGENT}",))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -4,8 +4,8 @@ A row overrides `Config`'s and `Hyperparameters`' defaults; a flag overrides a r
 "tuned" has only what was measured: of the locomotion tasks what the search chose, with
 the environments that it ran with (experiments/results/random_search.md; the figures of
 experiments/results have the same). Rewards were as they are: with `normalize_rewards`
-another alpha is wanted. "paper" has what the appendix names for a task, with
-the defaults, which are the appendix's, for the rest.
+another alpha is wanted. "paper" has what the appendix names for a task, with the
+defaults, which are the appendix's, for the rest.
 """
 
 from collections.abc import Mapping
