@@ -2,13 +2,14 @@
 
 PPO+GASIL on Walker2d with what the search found best for it, but for one number. The
 paper's figure is of the dense reward; the delayed one is here too, for there the search
-chose an alpha with which the discriminator's reward is not small beside the task's.
+chose an alpha with which the discriminator's reward is not small beside the task's. So
+are both with normalized rewards, of whose searches the same is true.
 """
 
 import sys
 from collections.abc import Sequence
 
-from experiments import command, random_search, report
+from experiments import command, normalized_rewards, random_search, report
 from experiments.report import Figure
 from experiments.trials import Trial
 
@@ -17,8 +18,14 @@ VALUES = {
     "discriminator_updates": (1, 5, 10, 20),
 }
 
+
+def _panel(name: str, reward_delay: int, normalized: bool) -> str:
+    return normalized_rewards.panel(random_search.panel(name, reward_delay), normalized)
+
+
 _PANELS = {
-    random_search.panel(name, delay): [str(value) for value in values]
+    _panel(name, delay, normalized): [str(value) for value in values]
+    for normalized, _ in normalized_rewards.TUNED
     for delay in (1, random_search.DELAY)
     for name, values in VALUES.items()
 }
@@ -43,14 +50,16 @@ def make() -> list[Trial]:
     """A panel for each hyperparameter, a curve for each of its values."""
     return [
         Trial(
-            name=f"{random_search.panel(name, delay)}/{value}",
+            name=f"{_panel(name, delay, normalized)}/{value}",
             env="walker2d",
             agent="ppo+gasil",
             points=({**tuned, name: value},),
             reward_delay=delay,
+            normalize_rewards=normalized,
         )
+        for normalized, best in normalized_rewards.TUNED
         for delay in (1, random_search.DELAY)
-        for tuned in [random_search.best("walker2d", "ppo+gasil", delay) or {}]
+        for tuned in [best("walker2d", "ppo+gasil", delay) or {}]
         for name, values in VALUES.items()
         for value in values
     ]

@@ -12,7 +12,7 @@ complete: start it three times.
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from experiments import (
     command,
@@ -25,6 +25,7 @@ from experiments import (
 )
 from experiments.report import Figure
 from experiments.trials import AGENTS, PAIR, Results, Trial
+from gasil_jax.points import Point
 
 #: Ant and humanoid cost several times as much, and no agent has learned to walk there.
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer")
@@ -59,26 +60,53 @@ FIGURE = Figure(
 )
 
 
-def search(env: str, agent: str, reward_delay: int) -> Trial:
+def search(
+    env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
+) -> Trial:
     """The trial that tunes an agent on a task."""
-    panel = random_search.panel(env, reward_delay)
+    panel = random_search.panel(env, reward_delay, obs_noise)
     return dataclasses.replace(
-        random_search.search(env, agent, reward_delay),
+        random_search.search(env, agent, reward_delay, obs_noise),
         name=f"{panel}{two_stage.PANEL_SUFFIX}/{agent}",
         normalize_rewards=True,
     )
 
 
+def best(
+    env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
+) -> Point | None:
+    """The best point of a search; None where it is not whole."""
+    trial = search(env, agent, reward_delay, obs_noise)
+    found = two_stage.read(trial, trials.RESULTS / FIGURE.name)
+    return found.best if found is not None and found.is_whole else None
+
+
+#: Of rewards as they are and of normalized ones: whether they are, what a search found.
+TUNED: tuple[tuple[bool, Callable[..., Point | None]], ...] = (
+    (False, random_search.best),
+    (True, best),
+)
+
+
+def panel(name: str, normalized: bool) -> str:
+    """The name of a panel in a figure that has both rewards."""
+    return name + ("-normalized" if normalized else "")
+
+
 def make() -> list[Trial]:
-    """Each agent's search on each task, and ten seeds of its best point once whole."""
-    folder = trials.RESULTS / FIGURE.name
-    return [
-        trial
+    """Each agent's search on each task, and ten seeds of its best point once whole.
+
+    Under noise two agents' on walker2d, for figure 6.
+    """
+    every = [
+        search(env, agent, delay)
         for delay in _DELAYS
         for env in TASKS
         for agent in AGENTS
-        for trial in two_stage.trials_of(search(env, agent, delay), folder)
     ]
+    every += [search("walker2d", agent, 1, random_search.NOISE) for agent in PAIR]
+    folder = trials.RESULTS / FIGURE.name
+    return [trial for each in every for trial in two_stage.trials_of(each, folder)]
 
 
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
