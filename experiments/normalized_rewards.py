@@ -41,13 +41,24 @@ def _gather(
     return report.panels(tuned, results / FIGURE.name)
 
 
+def by_delay(
+    shown: Mapping[str, Mapping[str, Results]],
+) -> dict[int, dict[str, Mapping[str, Results]]]:
+    """Of what is shown the tasks of each reward: delay -> task -> curve -> results."""
+    found: dict[int, dict[str, Mapping[str, Results]]] = {}
+    for delay in _DELAYS:
+        for env in TASKS:
+            if (name := random_search.panel(env, delay)) in shown:
+                found.setdefault(delay, {})[env] = shown[name]
+    return found
+
+
 def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """The tally of the delayed rewards and of those that are not, Markdown."""
-    groups = {}
-    for delay, figure in _DELAYS.items():
-        names = [random_search.panel(env, delay) for env in TASKS]
-        those = {name: shown[name] for name in names if name in shown}
-        groups[f"{figure.title}, rewards normalized"] = those
+    groups = {
+        f"{_DELAYS[delay].title}, rewards normalized": tasks
+        for delay, tasks in by_delay(shown).items()
+    }
     return report.tallies(groups, AGENTS[-1])
 
 

@@ -206,14 +206,6 @@ def best(
     return found and found.best
 
 
-def is_whole(
-    env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
-) -> bool:
-    """Whether both stages of a search are complete, so that `best` is final."""
-    found = stages(env, agent, reward_delay, obs_noise)
-    return found is not None and found.is_whole
-
-
 def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> None:
     """The page: each search's best point, and how far apart the points are."""
     lines = [

@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from experiments import (
     comparison,
@@ -31,31 +31,69 @@ FIGURES = (
     (humanoid.FIGURE, humanoid.make),
     (hyperparameters.FIGURE, hyperparameters.make),
 )
-# Of all agents on the locomotion tasks, with the reward's delay.
-_COMPARISONS = ((mujoco.FIGURE, 1), (delayed_mujoco.FIGURE, random_search.DELAY))
+# Of all agents on the locomotion tasks, rewards as they are: by the reward's delay.
+_COMPARISONS = {1: mujoco.FIGURE, random_search.DELAY: delayed_mujoco.FIGURE}
 
 
-def table() -> str:
-    """The locomotion tasks that have results, an agent a column: Markdown."""
+def tuned() -> str:
+    """Every agent with what its tuned preset has, a task a row: Markdown.
+
+    First the tasks that were tuned with normalized rewards, then the others.
+    """
+    rows = {_row(env, delay): of for delay, tasks in _normalized() for env, of in tasks}
+    for delay, tasks in _as_they_are():
+        for env, curves in tasks:
+            if env not in normalized_rewards.TASKS:
+                rows[_row(env, delay)] = curves
+    return _table(rows)
+
+
+def as_they_are() -> str:
+    """Every agent on every task with rewards as they are: Markdown."""
+    return _table(
+        {_row(env, delay): of for delay, tasks in _as_they_are() for env, of in tasks}
+    )
+
+
+def tallies() -> tuple[str, ...]:
+    """What the agents with normalized rewards come to, delayed and dense: Markdown."""
+    return tuple(
+        report.tally(dict(tasks), trials.AGENTS[-1]) for _, tasks in _normalized()
+    )
+
+
+_Tasks = Iterable[tuple[str, Mapping[str, trials.Results]]]
+
+
+def _normalized() -> list[tuple[int, _Tasks]]:
+    """(delay, tasks), of which each is (name, curve -> results)."""
+    figure = normalized_rewards.FIGURE
+    shown = figure.shown(normalized_rewards.make(), trials.RESULTS)
+    found = normalized_rewards.by_delay(shown)
+    return [(delay, tasks.items()) for delay, tasks in found.items()]
+
+
+def _as_they_are() -> list[tuple[int, _Tasks]]:
+    return [
+        (delay, figure.shown(comparison.make(delay), trials.RESULTS).items())
+        for delay, figure in _COMPARISONS.items()
+    ]
+
+
+def _row(env: str, delay: int) -> str:
+    return env if delay == 1 else f"{env}, delayed"
+
+
+def _table(rows: Mapping[str, Mapping[str, trials.Results]]) -> str:
+    """An agent a column."""
     lines = [
         f"| | {' | '.join(agent.upper() for agent in trials.AGENTS)} |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for figure, delay in _COMPARISONS:
-        shown = figure.shown(comparison.make(delay), trials.RESULTS)
-        for task, curves in shown.items():
-            name = task if delay == 1 else f"{task}, delayed"
-            cells = [_cell(curves.get(agent)) for agent in trials.AGENTS]
-            lines.append(f"| {name} | {' | '.join(cells)} |")
+    for name, curves in rows.items():
+        cells = [_cell(curves.get(agent)) for agent in trials.AGENTS]
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     return "\n".join(lines)
-
-
-def tallies() -> tuple[str, ...]:
-    """What the comparisons of figures 5 and 7 come to: Markdown."""
-    return tuple(
-        figure.conclusions(figure.shown(comparison.make(delay), trials.RESULTS))
-        for figure, delay in _COMPARISONS
-    )
 
 
 def _cell(known: trials.Results | None) -> str:
@@ -73,7 +111,11 @@ def page() -> str:
         "Numbers are interquartile means over seeds of the return in the last tenth of "
         "training, with 95% bootstrap intervals; [how every agent was tuned]"
         "(random_search.md).",
-        table(),
+        "With what the tuned presets have, rewards normalized but for ant's and "
+        "humanoid's:",
+        tuned(),
+        "Rewards as they are:",
+        as_they_are(),
     ]
     for figure, make in FIGURES:
         wanted = make()

@@ -2,10 +2,11 @@
 
 A row overrides `Config`'s and `Hyperparameters`' defaults; a flag overrides a row.
 "tuned" has only what was measured: of the locomotion tasks what the search chose, with
-the environments that it ran with (experiments/results/random_search.md; the figures of
-experiments/results have the same). Rewards were as they are: with `normalize_rewards`
-another alpha is wanted. "paper" has what the appendix names for a task, with the
-defaults, which are the appendix's, for the rest.
+the environments that it ran with. Four have normalized rewards
+(experiments/results/normalized_rewards.md), ant and humanoid rewards as they are
+(random_search.md): an alpha is of the unit that it was tuned in, so that another is
+wanted where a flag changes that. "paper" has what the appendix names for a task, with
+the defaults, which are the appendix's, for the rest.
 """
 
 from collections.abc import Mapping
@@ -20,7 +21,7 @@ Rows = Mapping[tuple[str, str], Overrides]
 
 
 class _Found(NamedTuple):
-    """What the search chose for the agents of a task; the learning rate is 3e-4."""
+    """What the search chose for the agents of a task."""
 
     behavior_cloning_coefficient: float
     sil_coefficient: float
@@ -28,36 +29,53 @@ class _Found(NamedTuple):
     discriminator_updates: int
     discriminator_learning_rate: float
     buffer_steps: int
+    #: Agents whose learning rate is 1e-4; the others' is 3e-4.
+    slower: tuple[str, ...] = ()
 
 
-def _rows(found: Mapping[str, _Found]) -> Rows:
+# What each agent has of it.
+_NAMES: Mapping[str, tuple[str, ...]] = {
+    "ppo": (),
+    "ppo+bc": ("behavior_cloning_coefficient",),
+    "ppo+sil": ("sil_coefficient",),
+    "ppo+gasil": (
+        *("alpha", "discriminator_updates"),
+        *("discriminator_learning_rate", "buffer_steps"),
+    ),
+}
+
+
+def _rows(found: Mapping[str, _Found], shared: Overrides) -> Rows:
+    """Rows of every agent on every task, with what all of them share."""
     rows: dict[tuple[str, str], Overrides] = {}
     for env, chosen in found.items():
-        value = chosen._asdict()
-        for agent, names in (
-            ("ppo", ()),
-            ("ppo+bc", ("behavior_cloning_coefficient",)),
-            ("ppo+sil", ("sil_coefficient",)),
-            ("ppo+gasil", _Found._fields[2:]),
-        ):
-            num_envs = {"num_envs": 64 if env in ("ant", "humanoid") else 32}
-            rows[env, agent] = {name: value[name] for name in names} | num_envs
+        for agent, names in _NAMES.items():
+            row = {name: getattr(chosen, name) for name in names} | dict(shared)
+            if agent in chosen.slower:
+                row["learning_rate"] = 1e-4
+            rows[env, agent] = row
     return rows
 
 
+_NORMALIZED = {"normalize_rewards": True, "num_envs": 32}
 _DENSE = {
-    "hopper": _Found(0.1, 0.1, 1.0, 1, 3e-4, 1_000),
-    "walker2d": _Found(0.3, 1.0, 0.02, 5, 2e-5, 10_000),
-    "halfcheetah": _Found(1.0, 0.1, 0.2, 5, 3e-4, 10_000),
+    "hopper": _Found(0.1, 0.01, 0.1, 10, 1e-4, 10_000),
+    "walker2d": _Found(0.1, 1.0, 0.02, 5, 2e-5, 10_000),
+    "halfcheetah": _Found(0.01, 0.1, 0.02, 5, 2e-5, 10_000),
     "swimmer": _Found(1.0, 1.0, 0.02, 5, 2e-5, 10_000),
+}
+_DELAYED = {
+    "hopper": _Found(1.0, 1.0, 0.2, 20, 1e-5, 1_000),
+    "walker2d": _Found(1.0, 0.1, 1.0, 1, 3e-4, 1_000, slower=("ppo",)),
+    "halfcheetah": _Found(0.3, 0.3, 0.02, 5, 2e-5, 10_000),
+    "swimmer": _Found(1.0, 0.3, 0.02, 1, 1e-5, 10_000, slower=("ppo+gasil",)),
+}
+_AS_THEY_ARE = {"num_envs": 64}
+_DENSE_AS_THEY_ARE = {
     "ant": _Found(0.01, 0.01, 1.0, 10, 1e-5, 10_000),
     "humanoid": _Found(0.01, 0.01, 0.1, 1, 2e-5, 1_000),
 }
-_DELAYED = {
-    "hopper": _Found(1.0, 1.0, 0.2, 5, 3e-4, 10_000),
-    "walker2d": _Found(1.0, 1.0, 1.0, 10, 1e-5, 10_000),
-    "halfcheetah": _Found(0.01, 0.1, 1.0, 10, 1e-5, 10_000),
-    "swimmer": _Found(0.3, 0.3, 0.2, 20, 1e-5, 1_000),
+_DELAYED_AS_THEY_ARE = {
     "ant": _Found(0.01, 1.0, 0.1, 10, 1e-4, 10_000),
     "humanoid": _Found(0.1, 0.01, 0.1, 1, 2e-5, 1_000),
 }
@@ -88,7 +106,18 @@ class Preset(NamedTuple):
 
 
 PRESETS: Mapping[str, Preset] = {
-    "tuned": Preset({**_STRONG, **_rows(_DENSE)}, {**_STRONG, **_rows(_DELAYED)}),
+    "tuned": Preset(
+        {
+            **_STRONG,
+            **_rows(_DENSE, _NORMALIZED),
+            **_rows(_DENSE_AS_THEY_ARE, _AS_THEY_ARE),
+        },
+        {
+            **_STRONG,
+            **_rows(_DELAYED, _NORMALIZED),
+            **_rows(_DELAYED_AS_THEY_ARE, _AS_THEY_ARE),
+        },
+    ),
     "paper": Preset(
         {
             # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.

@@ -548,7 +548,7 @@ def test_the_summary_is_that_of_the_csv_files():
     path = trials.RESULTS / "README.md"
     assert path.read_text() == summary.page()
     readme = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
-    for generated in (summary.table(), *summary.tallies()):
+    for generated in (summary.tuned(), *summary.tallies()):
         assert generated in readme
 
 

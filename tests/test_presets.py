@@ -4,7 +4,7 @@ import pytest
 
 import gasil_envs
 import gasil_jax
-from experiments import random_search, trials
+from experiments import normalized_rewards, random_search, trials
 from gasil_jax import presets, run
 from gasil_jax.config import Config, validate
 
@@ -27,18 +27,14 @@ def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
 @pytest.mark.parametrize("reward_delay", [1, random_search.DELAY])
 @pytest.mark.parametrize("env", trials.TASKS)
 def test_the_tuned_rows_are_what_the_search_found(env, reward_delay):
-    """Of tasks whose search is whole; of others there are none."""
-    rows = presets.PRESETS["tuned"][reward_delay > 1]
-    whole = all(
-        random_search.is_whole(env, agent, reward_delay) for agent in trials.AGENTS
-    )
+    normalized = env in normalized_rewards.TASKS
+    best = dict(normalized_rewards.TUNED)[normalized]
     for agent in trials.AGENTS:
-        assert ((env, agent) in rows) == whole
-        if whole:
-            trial = random_search.search(env, agent, reward_delay)
-            found = random_search.best(env, agent, reward_delay)
-            expected = Config(agent=agent, num_envs=trial.num_envs).updated(found)
-            assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
+        trial = random_search.search(env, agent, reward_delay)
+        changes = {"num_envs": trial.num_envs, "normalize_rewards": normalized}
+        found = best(env, agent, reward_delay)
+        expected = Config(agent=agent).updated({**found, **changes})
+        assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
 
 
 def test_the_command_line_starts_from_the_preset():
