@@ -214,6 +214,8 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
         " ".join(__doc__.split("\n\n", 1)[1].split()),
         "",
         table(wanted, results / figure.name),
+        "",
+        effects(wanted, results / figure.name),
     ]
     results.mkdir(parents=True, exist_ok=True)
     (results / f"{figure.name}.md").write_text("\n".join(lines) + "\n")
@@ -251,6 +253,41 @@ def table(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
             "| task | agent | first stage | second | best point | its mean | seeds "
             "| median | worst |",
             "|---|---|---|---|---|---|---|---|---|",
+        ]
+    return "\n".join(lines)
+
+
+def effects(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
+    """What the values of PPO+GASIL's hyperparameters do: Markdown, empty for nothing.
+
+    Every value meets every value of the others equally often, so that the mean over the
+    points that have it tells what it does.
+
+    Args:
+      wanted: both stages of each search.
+      folder: of their results.
+    """
+    names = list(SPACES["ppo+gasil"])
+    lines = []
+    for panel, curves in report.panels(wanted, folder).items():
+        known = curves.get("ppo+gasil")
+        if known is None or not all(
+            set(point) == set(names) for point in known.trial.points
+        ):
+            continue
+        score, cells = two_stage.scores(known), [panel]
+        for name in names:
+            values = np.array([point[name] for point in known.trial.points])
+            means = [(x, score[values == x].mean()) for x in np.unique(values)]
+            cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in means))
+        lines.append(f"| {' | '.join(cells)} |")
+    if lines:
+        lines[:0] = [
+            "PPO+GASIL's points by each hyperparameter: the mean return of those that "
+            "have a value, in the first stage.",
+            "",
+            f"| task | {' | '.join(names)} |",
+            "|---|" + "---|" * len(names),
         ]
     return "\n".join(lines)
 

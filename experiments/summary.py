@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from experiments import (
     comparison,
+    constant_bonus,
     delayed_mujoco,
     humanoid,
     hyperparameters,
@@ -27,6 +28,7 @@ FIGURES = (
     (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
     (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
     (normalized_rewards.FIGURE, normalized_rewards.make),
+    (constant_bonus.FIGURE, constant_bonus.make),
     (wider_search.FIGURE, wider_search.make),
     (humanoid.FIGURE, humanoid.make),
     (hyperparameters.FIGURE, hyperparameters.make),

@@ -17,10 +17,12 @@ import jax
 import numpy as np
 import pytest
 
+import gasil_jax
 from experiments import (
     benchmark,
     command,
     comparison,
+    constant_bonus,
     delayed_mujoco,
     humanoid,
     hyperparameters,
@@ -52,7 +54,10 @@ def toy(monkeypatch):
     """Every trial on the point mass, with small networks and batches."""
     monkeypatch.setattr(trials, "_FLAGS", ("--preset", "paper", *TOY))
     monkeypatch.setattr(trials, "NUM_ENVS", 4)
-    for module in (comparison, stochastic_walker2d, hyperparameters, random_search):
+    for module in (
+        *(comparison, stochastic_walker2d, hyperparameters, random_search),
+        constant_bonus,
+    ):
 
         def make(*arguments, make=module.make):
             return [
@@ -94,6 +99,11 @@ def toy(monkeypatch):
             "hopper-delayed-search/ppo",
             "| hopper-delayed-search | ppo | 1 x 2 |",
         ),
+        (
+            constant_bonus,
+            "hopper-delayed/constant bonus",
+            "| hopper-delayed | constant bonus | 2 |",
+        ),
     ],
 )
 def test_an_experiment_trains_goes_on_and_reports(
@@ -125,6 +135,48 @@ def test_an_experiment_trains_goes_on_and_reports(
     changed = [*arguments, "--total-steps", "1024", "--report"]
     assert module.main(changed) == 2
     assert "is of other settings" in capsys.readouterr().err
+
+
+def test_the_effect_of_a_hyperparameter_is_the_mean_of_its_points(tmp_path):
+    trial = random_search.search("hopper", "ppo+gasil", random_search.DELAY)
+    write_results(tmp_path, trial, range(16))
+    lines = random_search.effects([trial], tmp_path).splitlines()
+    row = dict(zip(lines[2].split("|"), lines[4].split("|"), strict=True))
+    assert row[" task "] == " hopper-delayed "
+    for name, values in random_search.SPACES["ppo+gasil"].items():
+        for value in values:
+            has = [i for i, x in enumerate(trial.points) if x[name] == value]
+            assert len(has) in (4, 8)
+            assert f" {value:g}: {np.mean(has):.0f}" in row[f" {name} "]
+    # Another agent's points, and none.
+    other = random_search.search("hopper", "ppo+sil", random_search.DELAY)
+    write_results(tmp_path, other, range(8))
+    assert random_search.effects([other], tmp_path) == ""
+
+
+def test_the_control_differs_in_the_discriminator_alone():
+    for env in constant_bonus.TASKS:
+        of_env = [t for t in constant_bonus.make() if t.env == env]
+        plain, control, tuned = of_env
+        finals = {trial.name: trial for trial in normalized_rewards.make()}
+        assert plain == finals[plain.name] and tuned == finals[tuned.name]
+        point = {**tuned.points[0], **constant_bonus._HELD}
+        expected = dataclasses.replace(tuned, name=control.name, points=(point,))
+        assert control == expected
+
+
+def test_the_control_s_discriminator_is_held_at_a_half():
+    env = gasil_jax.make_env("point_mass")
+    small = {"total_steps": 20 * 512, "batch_steps": 512, "num_envs": 8}
+    probability = {}
+    for name, change in (
+        ("free", {**constant_bonus._HELD, "discriminator_entropy_coefficient": 1e-3}),
+        ("held", constant_bonus._HELD),
+    ):
+        config = Config(agent="ppo+gasil").updated({**small, **change})
+        _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+        probability[name] = metrics["discriminator_good_probability"][-1]
+    assert abs(probability["held"] - 0.5) < 0.005 < 0.02 < 0.5 - probability["free"]
 
 
 def test_a_trial_trains_with_all_that_it_says(tmp_path):
