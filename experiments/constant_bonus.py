@@ -32,6 +32,11 @@ FIGURE = Figure(
     title="Delayed rewards and a bonus that knows nothing",
     claim="The discriminator's reward, learned from good trajectories, acts as a "
     "useful reward shaping that makes learning easier.",
+    more="""**What it says.** A part is the bonus, more is imitation. On walker2d the
+bonus alone more than doubles PPO's return; PPO+GASIL is clearly ahead of it. On hopper
+six of its ten seeds stand still for the whole episode, which returns about 1000, and
+three run. The bonus has PPO+GASIL's alpha and learning rate; it was not
+tuned for itself.""",
 )
 
 

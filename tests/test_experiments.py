@@ -531,6 +531,7 @@ PUBLISHED = (
     stochastic_walker2d,
     hyperparameters,
     wider_search,
+    constant_bonus,
 )
 
 
@@ -602,6 +603,10 @@ def test_the_summary_is_that_of_the_csv_files():
     readme = (pathlib.Path(__file__).parent.parent / "README.md").read_text()
     for generated in (summary.tuned(), *summary.tallies()):
         assert generated in readme
+    shown = constant_bonus.FIGURE.shown(constant_bonus.make(), trials.RESULTS)
+    for curves in shown.values():
+        said = report.interval(curves[constant_bonus.CONSTANT].final[0])
+        assert said in " ".join(readme.split())
 
 
 def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
