@@ -18,12 +18,13 @@ on the observations, the middle of the paper's three. On the point mass both age
 the learning rates 1e-3, 3e-4, 1e-4 and 3e-5, eight seeds each, and PPO+GASIL else what
 its preset has (alpha 1, 20 updates at 3e-4).
 
-Nothing uses what is in `results/first_search/`: a first search that drew PPO+GASIL's
-points otherwise, each value equally often but not each pair (no point had 20
-discriminator updates with the policy's learning rate 3e-4, nor alpha 1 with more than
-one update at it), figures from it and of points that more seeds or a search under noise
-replaced, a search of all of PPO+GASIL's hyperparameters on the point mass, and PPO's on
-ant with 128 environments of 16 steps (64 of 32 now: a reward comes every 20).
+Rewards are as they are; `normalized_rewards.md` has the same search with normalized
+ones. Nothing uses what is in `results/first_search/`: a first search that drew
+PPO+GASIL's points otherwise, each value equally often but not each pair (no point had
+20 discriminator updates with the policy's learning rate 3e-4, nor alpha 1 with more
+than one update at it), figures from it and of points that more seeds or a search under
+noise replaced, a search of all of PPO+GASIL's hyperparameters on the point mass, and
+PPO's on ant with 128 environments of 16 steps (64 of 32 now: a reward comes every 20).
 """
 
 import itertools
@@ -260,8 +261,8 @@ def table(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
 def effects(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
     """What the values of PPO+GASIL's hyperparameters do: Markdown, empty for nothing.
 
-    Every value meets every value of the others equally often, so that the mean over the
-    points that have it tells what it does.
+    Every value meets every value of each other equally often, so that the mean over the
+    points that have it is of no other's doing; what two do together is not told apart.
 
     Args:
       wanted: both stages of each search.
@@ -284,7 +285,8 @@ def effects(wanted: Sequence[Trial], folder: pathlib.Path) -> str:
     if lines:
         lines[:0] = [
             "PPO+GASIL's points by each hyperparameter: the mean return of those that "
-            "have a value, in the first stage.",
+            "have a value, in the first stage (what two values do together is not told "
+            "apart).",
             "",
             f"| task | {' | '.join(names)} |",
             "|---|" + "---|" * len(names),

@@ -51,13 +51,20 @@ class Figure:
 
     def conclusions(self, shown: Mapping[str, Mapping[str, Results]]) -> str:
         """What the results that have all their seeds say of the claim, Markdown."""
-        shown = {
-            panel: {name: known for name, known in curves.items() if known.complete}
-            for panel, curves in shown.items()
-        }
+        shown = complete(shown)
         if self.conclude is not None:
             return self.conclude(shown)
         return tally(shown, self.favourite) if self.favourite else ""
+
+
+def complete(
+    shown: Mapping[str, Mapping[str, Results]],
+) -> dict[str, dict[str, Results]]:
+    """Of panel -> curve -> results those that have all their seeds."""
+    return {
+        panel: {name: known for name, known in curves.items() if known.complete}
+        for panel, curves in shown.items()
+    }
 
 
 def difference(ours: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:

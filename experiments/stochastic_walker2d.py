@@ -1,7 +1,7 @@
 """Noise on Walker2d (paper, figure 6): ``python -m experiments.stochastic_walker2d``.
 
 Without noise both agents have what the search found best for them there; with noise, of
-any strength, what it found best at 0.1, once that search is whole. So they have with
+any strength, what it found best at 0.1, once there is such a search. So they have with
 normalized rewards, whose searches are those of ``experiments.normalized_rewards``.
 """
 
@@ -16,13 +16,13 @@ NOISES = (0.0, 0.05, 0.1, 0.5)
 
 
 def _panel(noise: float, normalized: bool) -> str:
-    return normalized_rewards.panel(f"noise {noise:g}", normalized)
+    return normalized_rewards.panel_of(f"noise {noise:g}", normalized)
 
 
 def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """How far PPO+GASIL is ahead at each noise, of either unit of the reward."""
     groups = []
-    for normalized in (False, True):
+    for normalized in normalized_rewards.TUNED:
         names = [_panel(noise, normalized) for noise in NOISES]
         those = {name: shown[name] for name in names if name in shown}
         groups.append(report.gaps(those, names[0], "ppo+gasil", "ppo"))
@@ -49,7 +49,7 @@ chosen without noise (`first_search/`) there was no gap either.""",
 def make() -> list[Trial]:
     """Both agents at every noise, with rewards as they are and normalized."""
     wanted = []
-    for normalized, best in normalized_rewards.TUNED:
+    for normalized, best in normalized_rewards.TUNED.items():
         without, under = (
             {agent: best("walker2d", agent, obs_noise=noise) for agent in PAIR}
             for noise in (0.0, random_search.NOISE)

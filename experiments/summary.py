@@ -19,6 +19,7 @@ from experiments import (
     trials,
     wider_search,
 )
+from experiments.trials import Results
 from gasil_jax import command_line
 
 #: Each figure with the function that makes its trials.
@@ -34,7 +35,7 @@ FIGURES = (
     (hyperparameters.FIGURE, hyperparameters.make),
 )
 # Of all agents on the locomotion tasks, rewards as they are: by the reward's delay.
-_COMPARISONS = {1: mujoco.FIGURE, random_search.DELAY: delayed_mujoco.FIGURE}
+_COMPARISONS = {random_search.DELAY: delayed_mujoco.FIGURE, 1: mujoco.FIGURE}
 
 
 def tuned() -> str:
@@ -42,51 +43,57 @@ def tuned() -> str:
 
     First the tasks that were tuned with normalized rewards, then the others.
     """
-    rows = {_row(env, delay): of for delay, tasks in _normalized() for env, of in tasks}
-    for delay, tasks in _as_they_are():
-        for env, curves in tasks:
-            if env not in normalized_rewards.TASKS:
-                rows[_row(env, delay)] = curves
+    rows = dict(_rows(_normalized()))
+    for name, curves in _rows(_as_they_are()):
+        rows.setdefault(name, curves)
     return _table(rows)
 
 
 def as_they_are() -> str:
-    """Every agent on every task with rewards as they are: Markdown."""
-    return _table(
-        {_row(env, delay): of for delay, tasks in _as_they_are() for env, of in tasks}
-    )
+    """Every agent on the tasks that have normalized rewards too, without: Markdown."""
+    both = dict(_rows(_normalized()))
+    rows = dict(_rows(_as_they_are()))
+    return _table({name: curves for name, curves in rows.items() if name in both})
 
 
 def tallies() -> tuple[str, ...]:
     """What the agents with normalized rewards come to, delayed and dense: Markdown."""
     return tuple(
-        report.tally(dict(tasks), trials.AGENTS[-1]) for _, tasks in _normalized()
+        report.tally(report.complete(tasks), trials.AGENTS[-1])
+        for tasks in _normalized().values()
     )
 
 
-_Tasks = Iterable[tuple[str, Mapping[str, trials.Results]]]
+#: Task -> curve -> results.
+_Tasks = Mapping[str, Mapping[str, Results]]
 
 
-def _normalized() -> list[tuple[int, _Tasks]]:
-    """(delay, tasks), of which each is (name, curve -> results)."""
+def _normalized() -> Mapping[int, _Tasks]:
+    """By the reward's delay."""
     figure = normalized_rewards.FIGURE
     shown = figure.shown(normalized_rewards.make(), trials.RESULTS)
-    found = normalized_rewards.by_delay(shown)
-    return [(delay, tasks.items()) for delay, tasks in found.items()]
+    return normalized_rewards.by_delay(shown)
 
 
-def _as_they_are() -> list[tuple[int, _Tasks]]:
-    return [
-        (delay, figure.shown(comparison.make(delay), trials.RESULTS).items())
+def _as_they_are() -> Mapping[int, _Tasks]:
+    return {
+        delay: figure.shown(comparison.make(delay), trials.RESULTS)
         for delay, figure in _COMPARISONS.items()
-    ]
+    }
+
+
+def _rows(of: Mapping[int, _Tasks]) -> Iterable[tuple[str, Mapping[str, Results]]]:
+    """(name of the row, curve -> results), of all delays."""
+    for delay, tasks in of.items():
+        for env, curves in tasks.items():
+            yield _row(env, delay), curves
 
 
 def _row(env: str, delay: int) -> str:
     return env if delay == 1 else f"{env}, delayed"
 
 
-def _table(rows: Mapping[str, Mapping[str, trials.Results]]) -> str:
+def _table(rows: _Tasks) -> str:
     """An agent a column."""
     lines = [
         f"| | {' | '.join(agent.upper() for agent in trials.AGENTS)} |",
@@ -98,7 +105,7 @@ def _table(rows: Mapping[str, Mapping[str, trials.Results]]) -> str:
     return "\n".join(lines)
 
 
-def _cell(known: trials.Results | None) -> str:
+def _cell(known: Results | None) -> str:
     if known is None:
         return ""
     partly = "" if known.complete else f" ({len(known.seeds)} seeds)"
@@ -111,12 +118,11 @@ def page() -> str:
         "# The paper's claims, measured",
         "Written by `python -m experiments.summary` from the CSV files in this folder. "
         "Numbers are interquartile means over seeds of the return in the last tenth of "
-        "training, with 95% bootstrap intervals; [how every agent was tuned]"
-        "(random_search.md).",
-        "With what the tuned presets have, rewards normalized but for ant's and "
-        "humanoid's:",
+        "training, with 95% bootstrap intervals.",
+        "With what the tuned presets have: rewards [normalized]"
+        "(normalized_rewards.md), but for ant's and humanoid's:",
         tuned(),
-        "Rewards as they are:",
+        "[Rewards as they are](random_search.md):",
         as_they_are(),
     ]
     for figure, make in FIGURES:

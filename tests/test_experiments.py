@@ -155,14 +155,17 @@ def test_the_effect_of_a_hyperparameter_is_the_mean_of_its_points(tmp_path):
 
 
 def test_the_control_differs_in_the_discriminator_alone():
-    for env in constant_bonus.TASKS:
-        of_env = [t for t in constant_bonus.make() if t.env == env]
-        plain, control, tuned = of_env
-        finals = {trial.name: trial for trial in normalized_rewards.make()}
-        assert plain == finals[plain.name] and tuned == finals[tuned.name]
-        point = {**tuned.points[0], **constant_bonus._HELD}
-        expected = dataclasses.replace(tuned, name=control.name, points=(point,))
-        assert control == expected
+    wanted = constant_bonus.make()
+    assert len(wanted) == 3 * len(constant_bonus.TASKS)
+    for ppo, control, tuned in zip(*(wanted[i::3] for i in range(3)), strict=True):
+        assert (ppo.agent, tuned.agent) == trials.PAIR
+        assert ppo.env == tuned.env and ppo.normalize_rewards
+        before, after = tuned.settings(), control.settings()
+        (point,), (changed,) = before.pop("points"), after.pop("points")
+        assert before == after and before["normalize_rewards"]
+        names = {x for x in {*point, *changed} if point.get(x) != changed.get(x)}
+        assert "discriminator_entropy_coefficient" in names
+        assert all(name.startswith("discriminator_") for name in names)
 
 
 def test_the_control_s_discriminator_is_held_at_a_half():
@@ -175,8 +178,10 @@ def test_the_control_s_discriminator_is_held_at_a_half():
     ):
         config = Config(agent="ppo+gasil").updated({**small, **change})
         _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
-        probability[name] = metrics["discriminator_good_probability"][-1]
-    assert abs(probability["held"] - 0.5) < 0.005 < 0.02 < 0.5 - probability["free"]
+        names = ("discriminator_good_probability", "discriminator_policy_probability")
+        probability[name] = np.array([metrics[x][-1] for x in names])
+    assert np.abs(probability["held"] - 0.5).max() < 0.005
+    assert 0.5 - probability["free"][0] > 0.02
 
 
 def test_a_trial_trains_with_all_that_it_says(tmp_path):
@@ -531,6 +536,7 @@ PUBLISHED = (
     stochastic_walker2d,
     hyperparameters,
     wider_search,
+    normalized_rewards,
     constant_bonus,
 )
 

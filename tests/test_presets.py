@@ -28,7 +28,7 @@ def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
 @pytest.mark.parametrize("env", trials.TASKS)
 def test_the_tuned_rows_are_what_the_search_found(env, reward_delay):
     normalized = env in normalized_rewards.TASKS
-    best = dict(normalized_rewards.TUNED)[normalized]
+    best = normalized_rewards.TUNED[normalized]
     for agent in trials.AGENTS:
         trial = random_search.search(env, agent, reward_delay)
         changes = {"num_envs": trial.num_envs, "normalize_rewards": normalized}
