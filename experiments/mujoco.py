@@ -24,7 +24,8 @@ without the value's part it still had 98 ± 10 (mean and standard error of five 
 each, `swimmer_self_imitation.csv`), while PPO that looks further had 50 ± 5 (lambda 1)
 and 55 ± 10 (gamma 0.999), and with larger steps 36 ± 11 (learning rate 1e-3) and
 26 ± 6 (3e-4, not annealed). On humanoid all four are alike after 1M steps, a third of
-the paper's, and nobody walks yet.""",
+the paper's, and nobody walks yet; over [all 3M](humanoid.md) PPO+BC and PPO+SIL come
+further, PPO+GASIL does not.""",
 )
 
 

@@ -538,6 +538,7 @@ PUBLISHED = (
     wider_search,
     normalized_rewards,
     constant_bonus,
+    humanoid,
 )
 
 
