@@ -269,6 +269,8 @@ def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
             threads = max(1, available_cores() // processes)
             arguments = (gymnasium_id, num_envs, steps, threads, there)
             context.Process(target=_baseline, args=arguments, daemon=True).start()
+            # Else nobody would be told of the end of a process that failed.
+            there.close()
             pipes.append(here)
         for act in (lambda pipe: pipe.recv(), lambda pipe: pipe.send("go")):
             for pipe in pipes:

@@ -11,11 +11,11 @@ it.)
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
-from experiments import command, normalized_rewards, random_search
+from experiments import command, normalized_rewards, random_search, report
 from experiments.report import Figure
-from experiments.trials import PAIR, Trial
+from experiments.trials import PAIR, Results, Trial
 
 #: Where falls end episodes and PPO+GASIL is ahead.
 TASKS = ("hopper", "walker2d")
@@ -28,17 +28,42 @@ _HELD = {
 }
 
 
+def _conclude(shown: Mapping[str, Mapping[str, Results]]) -> str:
+    """What the bonus and imitation add on each task, Markdown."""
+    lines = []
+    for panel, curves in shown.items():
+        if not {*PAIR, CONSTANT} <= set(curves):
+            continue
+        ppo, bonus, gasil = (
+            curves[name].final[0] for name in (PAIR[0], CONSTANT, PAIR[1])
+        )
+        of_bonus = report.difference(bonus, ppo)
+        of_imitation = report.difference(gasil, bonus)
+        more = report.contrast(((1, gasil), (-2, bonus), (1, ppo)))
+        lines.append(
+            f"- {panel}: the bonus adds {report.said(*of_bonus)} to PPO, "
+            f"{report.verdict(*of_bonus[1:])}; imitation "
+            f"{report.said(*of_imitation)} to that, "
+            f"{report.verdict(*of_imitation[1:])}; more than the bonus does: "
+            f"{report.verdict(*more[1:])} ({report.said(*more)})."
+        )
+    return "\n".join(lines)
+
+
 FIGURE = Figure(
     name="constant_bonus",
     title="Delayed rewards and a bonus that knows nothing",
     claim="The discriminator's reward, learned from good trajectories, acts as a "
     "useful reward shaping that makes learning easier.",
+    conclude=_conclude,
     more="""The control, "constant bonus", is PPO+GASIL with a discriminator that an
 entropy bonus holds at 1/2 everywhere: alpha log 2 for each step, with no imitation.
 
-**What it says.** A part is the bonus, more is imitation. On walker2d the bonus alone
-more than doubles PPO's return; PPO+GASIL is clearly ahead of it. On hopper six of its
-ten seeds stand still for the whole episode, which returns about 1000, and three run.
+**What it says.** On walker2d the bonus alone more than doubles PPO's return, and
+PPO+GASIL is clearly ahead of it; which of the two adds more is not clear. On hopper
+neither step is clear by itself, only both together: six of the control's ten seeds end
+with a return of about 1000, which standing still for a whole episode has, and three
+run. The control ran on other physics than the other two (below).
 The bonus has PPO+GASIL's alpha and learning rate and was not tuned for itself; it pays
 more than a trained discriminator, which is above 1/2 on what the policy does.""",
 )

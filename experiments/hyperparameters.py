@@ -39,16 +39,15 @@ FIGURE = Figure(
     "large (5000 steps), and with too few or too many discriminator updates.",
     favourite=None,
     more="""**What it says.** With the dense reward the search chose an alpha with
-which the discriminator's reward has no weight ([figure 5](mujoco.md)): there the curves
-show how far ten seeds differ by chance, and that one "yes" in many is little. With the
-delayed reward the number of updates has the paper's shape, most in the middle and
-least at 20, but ten seeds are too few to say so. With normalized dense rewards it has
-that shape clearly: 10 updates do better than one and than 20. With normalized and
-delayed ones 20 have least again, not clearly, and one as much as any: the search chose
-it with the largest learning rate, 3e-4, the others were tuned with 2e-5 or less. The
-buffer's size has no order in any of the four, from 500 steps to 10,000: an episode of
-walker2d is at most 1,000 steps, and a buffer of 500 holds the first half of the best
-one.""",
+which the discriminator's reward has no weight ([figure 5](mujoco.md)), and with
+normalized ones one with which it has little: there the curves show mostly how far ten
+seeds differ by chance. In all four panels 20 updates have least, and in three the most
+is in the middle, as the paper says; that 20 do worse than ten is clear with normalized
+dense rewards alone, and that one is too few nowhere. (With normalized and delayed
+rewards one has as much as any: the search chose it with the largest learning rate,
+3e-4, the others were tuned with 2e-5 or less.) The buffer's size has no order in any of
+the four, from 500 steps to 10,000: an episode of walker2d is at most 1,000 steps, and a
+buffer of 500 holds the first half of the best one.""",
     conclude=lambda shown: report.optimum(shown, _PANELS),
 )
 
@@ -66,7 +65,7 @@ def make() -> list[Trial]:
         )
         for normalized, best in normalized_rewards.TUNED.items()
         for delay in (1, random_search.DELAY)
-        for tuned in [best("walker2d", "ppo+gasil", delay) or {}]
+        if (tuned := best("walker2d", "ppo+gasil", delay)) is not None
         for name, values in VALUES.items()
         for value in values
     ]

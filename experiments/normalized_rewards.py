@@ -82,10 +82,10 @@ agent gains by the unit: PPO+SIL's return on delayed walker2d is half of what it
 rewards as they are.
 
 With dense rewards nothing tells PPO+GASIL and PPO apart, and over the four tasks it is
-behind PPO+SIL. On all but hopper the search chose alpha 0.02 and five updates at 2e-5,
-with which the discriminator hardly moves from 1/2: PPO with a small bonus. Hopper's
-returns are higher than with rewards as they are, of all agents but PPO clearly.
-""",
+behind PPO+SIL, by swimmer's doing alone. On all but hopper the search chose alpha 0.02
+and five updates at 2e-5, with which the discriminator hardly moves from 1/2: PPO with a
+small bonus. Hopper's returns are higher than with rewards as they are, of all agents
+but PPO clearly.""",
     gather=_gather,
 )
 
@@ -105,13 +105,9 @@ def search(
 def best(
     env: str, agent: str, reward_delay: int = 1, obs_noise: float = 0.0
 ) -> Point | None:
-    """The best point so far; None where the first stage is not complete.
-
-    While the second is not, the first's best.
-    """
+    """What the search that tunes an agent on a task has chosen; None before that."""
     trial = search(env, agent, reward_delay, obs_noise)
-    found = two_stage.read(trial, trials.RESULTS / FIGURE.name)
-    return found and found.best
+    return two_stage.best(trial, trials.RESULTS / FIGURE.name)
 
 
 #: Whether rewards are normalized -> what the search with such rewards has found.

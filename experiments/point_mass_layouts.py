@@ -294,7 +294,10 @@ def _main(arguments: Sequence[str] | None) -> None:
         if not path.exists():
             new = evaluate(chunk, options, programs)
             # Whole or not: what is there counts as done.
-            with output_file.whole(path) as partial, partial.open("w") as file:
+            with (
+                output_file.whole(path) as partial,
+                partial.open("w", newline="") as file,
+            ):
                 writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
                 writer.writeheader()
                 writer.writerows(new)

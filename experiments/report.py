@@ -67,16 +67,37 @@ def complete(
     }
 
 
-def difference(ours: np.ndarray, other: np.ndarray) -> tuple[float, float, float]:
+def difference(
+    ours: np.ndarray, other: np.ndarray, comparisons: int = 1
+) -> tuple[float, float, float]:
     """Of the interquartile means of two sets of seeds: it and its 95% interval.
 
-    Percentile bootstrap; each side's seeds, (seeds,), are drawn for themselves.
+    Args:
+      ours: (seeds,).
+      other: (seeds,).
+      comparisons: of how many this is one: the intervals of all of them hold together
+        with 95% (Bonferroni).
+    """
+    return contrast(((1, ours), (-1, other)), comparisons)
+
+
+def contrast(
+    terms: Sequence[tuple[float, np.ndarray]], comparisons: int = 1
+) -> tuple[float, float, float]:
+    """A weighted sum of interquartile means, and its 95% interval.
+
+    Percentile bootstrap; each term's seeds, (seeds,), are drawn for themselves.
+
+    Args:
+      terms: weight and scores of each.
+      comparisons: as in `difference`.
     """
     rng = np.random.default_rng(0)
-    drawn = _resampled(ours, rng) - _resampled(other, rng)
-    low, high = np.percentile(drawn, [2.5, 97.5])
+    drawn = sum(weight * _resampled(scores, rng) for weight, scores in terms)
+    tail = 2.5 / comparisons
+    low, high = np.percentile(drawn, [tail, 100.0 - tail])
     mean = statistics.interquartile_mean
-    return float(mean(ours) - mean(other)), float(low), float(high)
+    return float(sum(x * mean(scores) for x, scores in terms)), float(low), float(high)
 
 
 def _resampled(scores: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -128,13 +149,24 @@ def _number(value: float) -> str:
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
+#: An interval of fewer seeds than this covers far less than it says.
+_FEWEST_SEEDS = 5
+
+
 def interval(scores: np.ndarray) -> str:
-    """Interquartile mean and interval of (seeds,); NaN if a seed ended no episode."""
+    """Interquartile mean and interval of (seeds,); NaN if a seed ended no episode.
+
+    Of fewer than five seeds the mean alone.
+    """
+    middle = float(statistics.interquartile_mean(scores))
+    if len(scores) < _FEWEST_SEEDS:
+        return _number(middle)
     low, high = statistics.bootstrap_interval(scores)
-    return _said(float(statistics.interquartile_mean(scores)), float(low), float(high))
+    return said(middle, float(low), float(high))
 
 
-def _said(middle: float, low: float, high: float) -> str:
+def said(middle: float, low: float, high: float) -> str:
+    """A number and its interval."""
     return f"{_number(middle)} [{_number(low)}, {_number(high)}]"
 
 
@@ -158,7 +190,7 @@ def table(shown: Mapping[str, Mapping[str, Results]], favourite: str | None) -> 
                 both = ours is not None and ours.complete and known.complete
                 if curve != favourite and ours is not None and both:
                     gap = difference(ours.final[0], scores)
-                    cells[-2:] = [_said(*gap), verdict(*gap[1:])]
+                    cells[-2:] = [said(*gap), verdict(*gap[1:])]
             lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
@@ -170,12 +202,12 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
         curve for curves in shown.values() for curve in curves if curve != favourite
     )
     for other in others:
-        pairs = [
-            (curves[favourite].final[0], curves[other].final[0])
-            for curves in shown.values()
+        pairs = {
+            panel: (curves[favourite].final[0], curves[other].final[0])
+            for panel, curves in shown.items()
             if favourite in curves and other in curves
-        ]
-        said = [verdict(*difference(*pair)[1:]) for pair in pairs]
+        }
+        said = [verdict(*difference(*pair)[1:]) for pair in pairs.values()]
         counts = ", ".join(
             f"{word} on {said.count(word)}"
             for word in ("yes", "not clear", "no, it is lower", "unknown")
@@ -185,18 +217,38 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
             continue
         line = f"- {favourite} better than {other}: {counts} of {len(said)}"
         # A ratio has no meaning where a seed learned nothing or lost.
-        positive = [x for x in pairs if all((scores > 0).all() for scores in x)]
+        positive = {
+            panel: pair
+            for panel, pair in pairs.items()
+            if all((scores > 0).all() for scores in pair)
+        }
         if len(positive) > 1:
-            middle, low, high = together(positive)
             which = "all of them"
             if len(positive) < len(pairs):
                 which = f"the {len(positive)} where every seed's return is above 0"
-            line += (
-                f"; over {which} {100 * middle:+.0f}% [{100 * low:.0f}, "
-                f"{100 * high:.0f}], {verdict(low, high)}"
-            )
+            line += f"; over {which} {_said_together(list(positive.values()))}"
+        if len(positive) > 2:
+            # One task may make all of it.
+            most = max(positive, key=lambda panel: _weight(positive, panel))
+            rest = [pair for panel, pair in positive.items() if panel != most]
+            line += f" (without {most} {_said_together(rest)})"
         lines.append(f"{line}.")
     return "\n".join(lines)
+
+
+def _weight(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], panel: str) -> float:
+    """How far leaving a panel out moves the mean of the logarithms of the ratios."""
+    mean = statistics.interquartile_mean
+    logs = {name: float(np.log(mean(x) / mean(y))) for name, (x, y) in pairs.items()}
+    return abs(logs[panel] - float(np.mean(list(logs.values()))))
+
+
+def _said_together(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> str:
+    middle, low, high = together(pairs)
+    return (
+        f"{100 * middle:+.0f}% [{100 * low:.0f}, {100 * high:.0f}], "
+        f"{verdict(low, high)}"
+    )
 
 
 def tallies(
@@ -230,11 +282,11 @@ def gaps(
     found = {panel: difference(*pair) for panel, pair in both.items()}
     lines = []
     for panel, gap in found.items():
-        line = f"- {panel}: {favourite} ahead of {other} by {_said(*gap)}"
+        line = f"- {panel}: {favourite} ahead of {other} by {said(*gap)}"
         if panel != first and first in both:
             more = gap[0] - found[first][0]
             low, high = np.percentile(drawn[panel] - drawn[first], [2.5, 97.5])
-            line += f"; by {_said(more, low, high)} more than at {first}: "
+            line += f"; by {said(more, low, high)} more than at {first}: "
             line += verdict(low, high)
         lines.append(f"{line}.")
     return "\n".join(lines)
@@ -244,6 +296,9 @@ def optimum(
     shown: Mapping[str, Mapping[str, Results]], values: Mapping[str, Sequence[str]]
 ) -> str:
     """The best of values in order, against each other one.
+
+    Which is best is seen first, so any pair could have been compared: the intervals
+    are those of as many comparisons as there are pairs.
 
     Args:
       shown: panel -> value -> results.
@@ -255,8 +310,9 @@ def optimum(
         if set(names) - set(scores):
             continue
         best = max(names, key=lambda x: float(statistics.interquartile_mean(scores[x])))
+        pairs = math.comb(len(names), 2)
         against = ", ".join(
-            f"{name} {verdict(*difference(scores[best], scores[name])[1:])}"
+            f"{name} {verdict(*difference(scores[best], scores[name], pairs)[1:])}"
             for name in names
             if name != best
         )
@@ -385,4 +441,4 @@ def write(figure: Figure, wanted: Sequence[Trial], results: pathlib.Path) -> Non
     if not shown:
         return
     draw(shown, wanted, results / f"{figure.name}.png")
-    (results / f"{figure.name}.md").write_text(page(figure, shown))
+    trials.write_whole(results / f"{figure.name}.md", page(figure, shown))

@@ -1,8 +1,8 @@
 """Noise on Walker2d (paper, figure 6): ``python -m experiments.stochastic_walker2d``.
 
 Without noise both agents have what the search found best for them there; with noise, of
-any strength, what it found best at 0.1, once there is such a search. So they have with
-normalized rewards, whose searches are those of ``experiments.normalized_rewards``.
+any strength, what it found best at 0.1. So they have with normalized rewards, whose
+searches are those of ``experiments.normalized_rewards``.
 """
 
 import sys
@@ -41,34 +41,28 @@ five updates at 3e-4, for PPO the same learning rate as without. In that search
 PPO+GASIL was well ahead of PPO, as the best of sixteen points on few seeds is; on ten
 new seeds it is not. A seed learns to walk or it does not, so that the intervals are
 wide, and at 0.1 and above nearly none does in 1M steps. With the points that were
-chosen without noise (`first_search/`) there was no gap either.""",
+chosen without noise (`first_search/`) there was no clear gap either.""",
     conclude=_conclude,
 )
 
 
 def make() -> list[Trial]:
     """Both agents at every noise, with rewards as they are and normalized."""
-    wanted = []
-    for normalized, best in normalized_rewards.TUNED.items():
-        without, under = (
-            {agent: best("walker2d", agent, obs_noise=noise) for agent in PAIR}
-            for noise in (0.0, random_search.NOISE)
+    return [
+        Trial(
+            name=f"{_panel(noise, normalized)}/{agent}",
+            env="walker2d",
+            agent=agent,
+            obs_noise=noise,
+            points=(found,),
+            normalize_rewards=normalized,
         )
-        for noise in NOISES:
-            # Both are tuned under noise, or neither.
-            found = under if noise and None not in under.values() else without
-            wanted += [
-                Trial(
-                    name=f"{_panel(noise, normalized)}/{agent}",
-                    env="walker2d",
-                    agent=agent,
-                    obs_noise=noise,
-                    points=(found[agent] or {},),
-                    normalize_rewards=normalized,
-                )
-                for agent in PAIR
-            ]
-    return wanted
+        for normalized, best in normalized_rewards.TUNED.items()
+        for noise in NOISES
+        for tuned_at in [random_search.NOISE if noise else 0.0]
+        for agent in PAIR
+        if (found := best("walker2d", agent, obs_noise=tuned_at)) is not None
+    ]
 
 
 def quick(wanted: list[Trial]) -> list[Trial]:

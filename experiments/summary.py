@@ -148,7 +148,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     command_line.parse(Options, arguments, "experiments.summary")
     path = trials.RESULTS / "README.md"
-    path.write_text(page())
+    trials.write_whole(path, page())
     print(f"in {path}")
 
 

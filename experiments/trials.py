@@ -110,8 +110,9 @@ def train(
     place.parent.mkdir(parents=True, exist_ok=True)
     _check_runs(trial, place)
     if not listed.exists():
-        _write_whole(listed, points)
-        _write_whole(_claim(place), json.dumps(_identity(trial)))
+        # The points last: where they are, it is said what the runs are of.
+        write_whole(_claim(place), json.dumps(_identity(trial)))
+        write_whole(listed, points)
     elif json.loads(listed.read_text()) != json.loads(points):
         raise InputError(f"{place} is of other hyperparameters: move it away")
     if (place / "summary.json").exists():
@@ -188,7 +189,7 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         in_order = sorted(rows, key=lambda key: tuple(map(int, key)))
         content = {"settings": trial.settings(), "made": made}
         # The CSV file last: where it is, its settings are.
-        _write_whole(described, json.dumps(content, indent=2) + "\n")
+        write_whole(described, json.dumps(content, indent=2) + "\n")
         _write_rows(target, [row for key in in_order for row in rows[key]])
 
 
@@ -199,7 +200,8 @@ def _write_rows(target: pathlib.Path, rows: Iterable[Mapping[str, Any]]) -> None
         writer.writerows(rows)
 
 
-def _write_whole(path: pathlib.Path, text: str) -> None:
+def write_whole(path: pathlib.Path, text: str) -> None:
+    """Write a file that others may be reading or writing."""
     with output_file.whole(path) as partial:
         partial.write_text(text)
 
@@ -233,12 +235,11 @@ def adopt(trial: Trial, results: pathlib.Path) -> None:
         other = dataclasses.replace(
             trial, name=str(described.relative_to(results.parent).with_suffix(""))
         )
-        known = read(other, results.parent)
         seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
-        if known is not None and set(seeds) <= set(known.seeds.tolist()):
+        if read_whole(other, results.parent) is not None:
             rows = _read(described.with_suffix(".csv"))
             target.parent.mkdir(parents=True, exist_ok=True)
-            _write_whole(target.with_suffix(".json"), described.read_text())
+            write_whole(target.with_suffix(".json"), described.read_text())
             _write_rows(target, [row for row in rows if int(row["seed"]) in seeds])
             return
 
@@ -308,7 +309,7 @@ class Results:
 
     Attributes:
       trial: which.
-      seeds: their numbers, (seeds,): those that every point has.
+      seeds: their numbers, (seeds,): those of the trial's that every point has.
       env_steps: (rows,), at the end of each part of training.
       returns: (points, seeds, rows), NaN where no episode ended.
       made: by what.
@@ -348,12 +349,15 @@ class Results:
 
 def read_whole(trial: Trial, results: pathlib.Path) -> Results | None:
     """`read`, where all seeds of the trial are complete; None elsewhere."""
-    known = read(trial, results)
-    return known if known is not None and known.complete else None
+    found = read(trial, results)
+    return found if found is not None and found.complete else None
 
 
 def read(trial: Trial, results: pathlib.Path) -> Results | None:
-    """The results of a trial; None where no seed is complete, or of other settings."""
+    """The results of a trial's seeds; None where none is complete, or other settings.
+
+    A file may have more seeds than the trial, whose own are read.
+    """
     target = results / f"{trial.name}.csv"
     rows = _read(target)
     if rows and not _is_of(trial, target.with_suffix(".json")):
@@ -363,7 +367,8 @@ def read(trial: Trial, results: pathlib.Path) -> Results | None:
         seeds_of.setdefault(int(row["point"]), set()).add(int(row["seed"]))
     if set(seeds_of) != set(range(len(trial.points))):
         return None
-    seeds = sorted(set.intersection(*seeds_of.values()))
+    wanted = set(range(trial.first_seed, trial.first_seed + trial.seeds))
+    seeds = sorted(wanted.intersection(*seeds_of.values()))
     if not seeds:
         return None
     steps = sorted({int(row["env_steps"]) for row in rows})

@@ -69,6 +69,12 @@ def read(search: Trial, folder: pathlib.Path) -> Stages | None:
     return Stages(first, again, trials.read_whole(again, folder))
 
 
+def best(search: Trial, folder: pathlib.Path) -> Point | None:
+    """What a search has chosen, by its results in a folder; None before it is whole."""
+    found = read(search, folder)
+    return found.best if found is not None and found.is_whole else None
+
+
 def is_search(trial: Trial) -> bool:
     """Whether a figure's trial is of one of its searches."""
     return trial.name.split("/")[0].endswith(PANEL_SUFFIX)
@@ -131,7 +137,7 @@ def write(
         report.write(dataclasses.replace(figure, more=more), wanted, results)
     elif searches:
         page = results / f"{figure.name}.md"
-        page.write_text(f"# {figure.title}\n\n{searches}\n")
+        trials.write_whole(page, f"# {figure.title}\n\n{searches}\n")
 
 
 def scores(known: Results) -> np.ndarray:

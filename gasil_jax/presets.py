@@ -85,7 +85,7 @@ _STRONG_DISCRIMINATOR = {
     "discriminator_updates": 20,
     "discriminator_learning_rate": 3e-4,
 }
-# On the locomotion tasks measured with delayed rewards, 4 to 10 seeds each
+# On the locomotion tasks measured with delayed rewards, 4 to 8 seeds each
 # (experiments/results/delayed_agents.csv).
 _STRONG = {
     ("point_mass", "gasil"): _STRONG_DISCRIMINATOR,

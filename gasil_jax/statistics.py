@@ -6,9 +6,9 @@ import numpy as np
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
     """The mean of the middle half of `scores` along an axis.
 
-    Half a quarter of fewer than four scores is a fraction of a score: the outermost
-    ones that are left count in part, so that the result is continuous in the scores.
-    The package rliable drops whole scores: the same where four divides their number.
+    Where four does not divide their number, a quarter of it has a fraction of a score:
+    the outermost that are left count in part, where the package rliable drops whole
+    scores. The same where four divides it.
     """
     ordered = np.moveaxis(np.sort(scores, axis=axis), axis, -1)
     count = ordered.shape[-1]

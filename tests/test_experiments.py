@@ -224,6 +224,11 @@ def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
     trials.adopt(fewer, here)
     assert trials.known(fewer, here) == {(0, 0)}
     assert trials.read(fewer, here).final.tolist() == [[1.5]]
+    # So are those that are read; others of the same number are no substitute.
+    assert trials.read(dataclasses.replace(same, seeds=1), here).final.item() == 1.5
+    later = trials.read(dataclasses.replace(same, first_seed=1), here)
+    assert later.seeds.tolist() == [1] and not later.complete
+    assert trials.read(dataclasses.replace(same, first_seed=2), here) is None
     # Results of other settings are no results, and are not written over.
     other = dataclasses.replace(same, obs_noise=0.1)
     assert trials.read(other, here) is None
@@ -255,9 +260,9 @@ def test_the_search_is_put_together_from_its_parts(toy, tmp_path, monkeypatch):
         (point, seed) for point in "01" for seed in ("1000", "1001")
     }
     better = max(final, key=lambda point: np.mean(final[point]))
-    chosen = random_search.best("point_mass", "ppo", 1)
-    assert chosen == {"learning_rate": (1e-3, 1e-4)[better]}
-    assert random_search.best("hopper", "ppo", 1) is None
+    found = random_search.stages("point_mass", "ppo", 1)
+    assert found.best == {"learning_rate": (1e-3, 1e-4)[better]}
+    assert random_search.stages("hopper", "ppo", 1) is None
 
 
 def test_runs_side_by_side_are_those_of_one_process(tmp_path):
@@ -346,7 +351,9 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
 
     assert random_search.confirmation(*arguments) is None
     write(random_search.search(*arguments), (1.0, 9.0, 3.0, 8.0, 7.0))
-    assert random_search.best(*arguments) == {"learning_rate": 4e-4}
+    # The second stage may choose another: no figure has the first's best.
+    assert random_search.best(*arguments) is None
+    assert not comparison.make(1)
     second = random_search.confirmation(*arguments)
     kept = [point["learning_rate"] for point in second.points]
     assert kept == [4e-4, 2e-4, 1e-4, 3e-4]
@@ -355,6 +362,8 @@ def test_the_best_points_are_compared_again(tmp_path, monkeypatch):
     # 2 seeds with 9 and 4 with 2; 8 and 7: 8 x 2 + 7 x 4 is more.
     write(second, (2.0, 7.0, 6.0, 3.0))
     assert random_search.best(*arguments) == {"learning_rate": 2e-4}
+    (trial,) = comparison.make(1)
+    assert trial.name == "hopper/ppo" and trial.points == ({"learning_rate": 2e-4},)
 
 
 def test_a_wider_search_covers_what_the_first_leaves_open(tmp_path, monkeypatch):
@@ -589,7 +598,8 @@ def _means(name, **only):
 def test_what_is_said_of_swimmer_is_in_the_csv_file():
     means = list(_means("swimmer_self_imitation.csv"))
     assert [seeds for _, seeds in means] == [5] * 5
-    assert all(mean in mujoco.FIGURE.more for mean, _ in means)
+    said = " ".join(mujoco.FIGURE.more.split())
+    assert all(mean in said for mean, _ in means)
 
 
 @pytest.mark.parametrize(
@@ -643,6 +653,15 @@ def test_runs_of_other_settings_are_neither_gone_on_with_nor_taken(tmp_path):
                 action()
 
 
+def test_what_runs_are_of_is_written_before_their_points(tmp_path, monkeypatch):
+    """Stopped in between, nothing is there that another trial could go on with."""
+    written = []
+    monkeypatch.setattr(trials, "write_whole", lambda path, _: written.append(path))
+    monkeypatch.setattr(trials.sweep, "main", lambda _: 0)
+    assert trials.train(trials.Trial("x/y", "hopper", "ppo"), tmp_path, 1, 1) == 0
+    assert [path.name for path in written] == ["y.settings.json", "y.json"]
+
+
 def results(mean, seeds=4):
     returns = np.full((1, 4, 10), mean) + np.arange(4)[None, :, None] * 0.01
     trial = trials.Trial("x/y", "hopper", "ppo", seeds=seeds)
@@ -659,12 +678,25 @@ def test_a_task_without_a_ratio_is_left_out_of_them():
     assert with_loss.split("above 0 ")[1] == said.split("of them ")[1]
 
 
+def test_a_tally_says_what_it_is_without_the_task_that_makes_it():
+    task = lambda ours, other: {"ours": results(ours), "other": results(other)}
+    shown = {"a": task(2.0, 2.0), "b": task(9.0, 1.0), "c": task(2.0, 2.0)}
+    said = report.tally(shown, "ours")
+    without = report.tally({name: shown[name] for name in "ac"}, "ours")
+    assert "; over all of them +1" in said and "], yes (without b " in said
+    assert said.split("without b ")[1] == without.split("of them ")[1][:-1] + ")."
+    # Of two tasks one is what the table says.
+    assert "(without" not in without
+
+
 def test_nothing_is_concluded_from_some_of_the_seeds():
     figure = report.Figure("x", "title", "claim", favourite="ours")
     shown = {"task": {"ours": results(2.0), "other": results(1.0, seeds=5)}}
     assert figure.conclusions(shown) == ""
     table = report.table(shown, "ours")
-    assert "| task | other | 4 of 5 | 1.0 [1.0, 1.0] |  |  |" in table
+    # Four seeds are too few for an interval.
+    assert "| task | other | 4 of 5 | 1.0 |  |  |" in table
+    assert report.interval(np.arange(5.0)).startswith("2.0 [")
     shown["task"]["other"] = results(1.0)
     assert "ours better than other: yes on 1 of 1" in figure.conclusions(shown)
 
@@ -695,6 +727,31 @@ def test_an_optimum_is_named_by_where_it_is():
     said = report.optimum(shown, {"a": ("1", "2")})
     assert said == "- a: 1 is best, at an end; better than 2 yes."
     assert report.optimum(shown, {"a": ("1", "2", "3")}) == ""
+
+
+def test_the_best_of_many_values_is_not_told_apart_as_easily_as_that_of_two():
+    known = lambda mean: dataclasses.replace(
+        results(0.0),
+        returns=mean + np.array([0.0, 1.0, 2.0, 3.0])[None, :, None] * np.ones(10),
+    )
+    two, many = ("1", "2"), ("1", "2", "3", "4", "5")
+    shown = {"a": {value: known(0.0) for value in many} | {"1": known(2.4)}}
+    assert "better than 2 yes." in report.optimum(shown, {"a": two})
+    assert "better than 2 not clear, 3 not" in report.optimum(shown, {"a": many})
+
+
+def test_a_contrast_is_a_weighted_sum_of_interquartile_means():
+    ours, other = np.array([4.0, 5.0, 6.0, 7.0]), np.array([1.0, 2.0, 3.0, 5.0])
+    rng = np.random.default_rng(0)
+    drawn = np.zeros(10_000)
+    for weight, scores in ((2, ours), (-1, other)):
+        rows = np.sort(scores[rng.integers(4, size=(10_000, 4))], axis=1)
+        drawn += weight * rows[:, 1:3].mean(axis=1)
+    middle, low, high = report.contrast(((2, ours), (-1, other)))
+    assert middle == 2 * 5.5 - 2.5
+    assert (low, high) == pytest.approx(tuple(np.percentile(drawn, [2.5, 97.5])))
+    wide = report.contrast(((2, ours), (-1, other)), comparisons=5)[1:]
+    assert wide == pytest.approx(tuple(np.percentile(drawn, [0.5, 99.5])))
 
 
 @pytest.mark.parametrize("number", [0, 1])
