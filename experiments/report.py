@@ -353,6 +353,16 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     return "\n".join(lines)
 
 
+def mixed_physics(shown: Mapping[str, Mapping[str, Results]]) -> str:
+    """Which panels have runs of more than one physics; empty for none."""
+    of = {
+        panel: {made["physics"] for known in curves.values() for made in known.made}
+        for panel, curves in shown.items()
+    }
+    mixed = [panel for panel, physics in of.items() if len(physics) > 1]
+    return f"Runs of more than one physics are in: {', '.join(mixed)}." if mixed else ""
+
+
 def draw(
     shown: Mapping[str, Mapping[str, Results]],
     wanted: Sequence[Trial],
@@ -431,6 +441,7 @@ def page(figure: Figure, shown: Mapping[str, Mapping[str, Results]]) -> str:
         f"CSV files under `{figure.name}/`, and `python -m experiments.{figure.name} "
         "--report` makes this page from them.",
         settings_table(shown),
+        mixed_physics(shown),
     ]
     return "\n\n".join(part for part in parts if part) + "\n"
 

@@ -701,6 +701,20 @@ def test_nothing_is_concluded_from_some_of_the_seeds():
     assert "ours better than other: yes on 1 of 1" in figure.conclusions(shown)
 
 
+def test_panels_of_more_than_one_physics_are_named():
+    of = lambda *physics: dataclasses.replace(
+        results(1.0), made=[{"physics": name} for name in physics]
+    )
+    shown = {
+        "a": {"x": of("mjx"), "y": of("mujoco")},
+        "b": {"x": of("mjx"), "y": of("mjx")},
+        "c": {"x": of("mjx", "mujoco")},
+    }
+    said = report.mixed_physics(shown)
+    assert said == "Runs of more than one physics are in: a, c."
+    assert report.mixed_physics({"b": shown["b"]}) == ""
+
+
 def test_a_gap_is_compared_with_that_of_the_first_panel():
     shown = {
         "calm": {"ours": results(7.0), "other": results(5.0)},
