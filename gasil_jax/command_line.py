@@ -48,21 +48,29 @@ def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
+def whole_number(word: str) -> int:
+    """A whole number in words: step counts are written as 1e6, too.
+
+    Raises:
+      ValueError: it is none.
+    """
+    try:
+        return int(word)
+    except ValueError:
+        with contextlib.suppress(ValueError):
+            if (number := float(word)).is_integer():
+                return int(number)
+        raise
+
+
 @_REGISTRY.primitive_rule
 def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    # Step counts are written as 1e6, too.
     if info.type is not int:
         return None
 
     def from_words(words: list[str]) -> int:
         (word,) = words
-        try:
-            return int(word)
-        except ValueError:
-            with contextlib.suppress(ValueError):
-                if (number := float(word)).is_integer():
-                    return int(number)
-            raise
+        return whole_number(word)
 
     return PrimitiveConstructorSpec(
         nargs=1,

@@ -210,7 +210,9 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
         raise ValueError(unknown("agent", config.agent, agents))
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if field.name in _NOT_A_COUNT or value is None:
+        if field.name in _NOT_A_COUNT:
+            continue
+        if value is None and field.name == "max_episode_steps":
             continue
         sizes = field.name in _SIZES
         if sizes and not isinstance(value, tuple):
@@ -230,7 +232,8 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
     for whole, part in (("batch_steps", "num_envs"), ("batch_steps", "minibatch_size")):
         total, size = getattr(config, whole), getattr(config, part)
         if total % size:
-            divisors = [n for n in range(1, total + 1) if total % n == 0]
+            small = [n for n in range(1, math.isqrt(total) + 1) if total % n == 0]
+            divisors = small + [total // n for n in reversed(small)]
             closest = min(divisors, key=lambda n: abs(n - size))
             raise ValueError(
                 f"{part} is {size}, which does not divide {whole} {total}: "

@@ -18,6 +18,7 @@ import numpy as np
 
 from gasil_jax import checkpoint, logging
 from gasil_jax.batch import Batch
+from gasil_jax.command_line import InputError
 from gasil_jax.interruption import Interrupted, Interruption
 from gasil_jax.progress import Progress
 from gasil_jax.trackers import Tracker, log
@@ -84,7 +85,7 @@ def drive(
 
     Raises:
       Interrupted: after the checkpoint that an interruption asks for.
-      ValueError: the checkpoint is of another state, or metrics.csv is damaged.
+      InputError: the checkpoint is of another state, or metrics.csv is damaged.
       OSError: the folder can't be written, or the disk is full.
     """
     config, root = runs.config, folder / "checkpoints"
@@ -100,11 +101,18 @@ def drive(
     if found is not None:
         with progress.aside(f"restoring {found.folder.name}"):
             like = jax.eval_shape(lambda: runs.trim(runs.init()))
-            first, states = found.iteration, found.restore(like)
+            first = found.iteration
+            try:
+                states = found.restore(like)
+            except ValueError as error:
+                raise InputError(str(error)) from None
         size = found.record["metrics_size"]
     elif (folder / "metrics.csv").exists():
         size = 0
-    writer = logging.MetricsWriter(folder / "metrics.csv", labels, size)
+    try:
+        writer = logging.MetricsWriter(folder / "metrics.csv", labels, size)
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
     progress.phase("compiling", steps_before + steps_of(first))
     started = time.monotonic()

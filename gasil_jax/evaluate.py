@@ -25,7 +25,8 @@ from gasil_jax import (
     train,
 )
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config
+from gasil_jax.config import Config, validate
+from gasil_jax.imitation import AGENTS
 from gasil_jax.networks import Policy
 from gasil_jax.progress import announced
 
@@ -76,7 +77,8 @@ def evaluate(
         # As in training a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running
-        running = running & ~(states.done > 0) & sound
+        ended = (states.done > 0) | (states.info.get("truncation", states.done) > 0)
+        running = running & ~ended & sound
         return (states, running, return_, length), None
 
     start = (
@@ -200,6 +202,7 @@ def load(
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     try:
+        validate(config, tuple(AGENTS))
         env = environments.make_env(described["env"], **settings)
         # All members have leaves of the same names.
         init = lambda seed: train.init(

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from gasil_jax import output_file
+from gasil_jax.command_line import InputError
 
 #: Metrics that every metrics.csv has, in this order; an agent's own follow.
 COLUMNS = (
@@ -161,11 +162,17 @@ def read_metrics(
       path: of the file.
       labels: names of the columns that are not metrics.
       num_members: rows of an iteration.
+
+    Raises:
+      InputError: it is damaged.
     """
-    with path.open(newline="") as file:
-        header, *rows = csv.reader(file)
     first = len(labels)
-    values = np.array(
-        [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
-    ).reshape(-1, num_members, len(header) - first)
+    try:
+        with path.open(newline="") as file:
+            header, *rows = csv.reader(file)
+        values = np.array(
+            [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
+        ).reshape(-1, num_members, len(header) - first)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {error}") from None
     return {name: values[:, :, i].T for i, name in enumerate(header[first:])}

@@ -30,8 +30,9 @@ class Normalizer(struct.PyTreeNode):
 
 def init(observation_size: int) -> Normalizer:
     """A normalizer that has seen nothing and changes nothing but the clip."""
-    zeros = jnp.zeros(observation_size, jnp.float32)
-    return Normalizer(jnp.float32(0), zeros, zeros)
+    # An array for each: one in two places could not be donated.
+    zeros = lambda: jnp.zeros(observation_size, jnp.float32)
+    return Normalizer(jnp.float32(0), zeros(), zeros())
 
 
 def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax.command_line import InputError
+from gasil_jax.command_line import InputError, whole_number
 from gasil_jax.config import Config, Hyperparameters, nearest
 
 Point = Mapping[str, Any]
@@ -49,7 +49,8 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
         if name in values:
             raise InputError(f"grid has {name} twice: all its values must be in one")
         try:
-            found = [kinds[name](value) for value in listed.split(",")]
+            read = float if kinds[name] is float else whole_number
+            found = [read(value) for value in listed.split(",")]
             values[name] = tuple(dict.fromkeys(found))
         except ValueError:
             kind = "numbers" if kinds[name] is float else "whole numbers"

@@ -30,6 +30,7 @@ from gasil_jax import (
     evaluate,
     output_file,
     policy,
+    train,
 )
 from gasil_jax.command_line import InputError
 from gasil_jax.progress import announced
@@ -91,7 +92,7 @@ def episode(
         state = step(state, step_key)
         states.append(jax.device_get(state.pipeline_state))
         total += float(state.info.get("true_reward", state.reward))
-        if state.done > 0:
+        if state.done > 0 or state.info.get("truncation", state.done) > 0:
             break
     return states, total
 
@@ -259,7 +260,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     evaluate.check_key(options.key)
     # A film's encoder takes no odd number of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
-    env, _, seeds, states = evaluate.load(
+    env, config, seeds, states = evaluate.load(
         options.run, options.checkpoint, options.point, options.seed
     )
     locomotion = environments.is_locomotion(env)
@@ -273,8 +274,9 @@ def _main(arguments: Sequence[str] | None) -> None:
     output_file.make_parent(options.out)
     drawn = policy.from_state(batch.member(states, 0), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
+    steps = min(options.steps, train.max_episode_steps(env, config))
     with announced("render", "compiling and running the episode"):
-        path, total = episode(env, act, jax.random.key(options.key), options.steps)
+        path, total = episode(env, act, jax.random.key(options.key), steps)
     try:
         with (
             announced("render", f"drawing {options.out}"),

@@ -65,19 +65,25 @@ class EnvironmentStates(struct.PyTreeNode):
     episode_length: jax.Array
 
 
+def _cast(x: Any, dtype: Any) -> jax.Array:
+    x = jnp.asarray(x)
+    # Outside of jit an array of keys has no `astype`.
+    return x if jnp.issubdtype(dtype, jax.dtypes.prng_key) else x.astype(dtype)
+
+
 def _strip_weak_types(tree: Any) -> Any:
     # A weak type in the first state only would compile everything twice.
-    return jax.tree.map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), tree)
+    return jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), tree)
 
 
 def init(env: Any, key: jax.Array, num_envs: int) -> EnvironmentStates:
     """Start an episode in each of `num_envs` environments. The key is consumed."""
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
-    zeros = jnp.zeros(num_envs, jnp.float32)
+    # An array for each: one in two places could not be donated.
     return EnvironmentStates(
         state=_strip_weak_types(state),
-        episode_return=zeros,
-        discounted_return=zeros,
+        episode_return=jnp.zeros(num_envs, jnp.float32),
+        discounted_return=jnp.zeros(num_envs, jnp.float32),
         discount=jnp.ones(num_envs, jnp.float32),
         episode_length=jnp.zeros(num_envs, jnp.int32),
     )
@@ -110,10 +116,10 @@ def collect(
       max_episode_steps: longer episodes are truncated.
       gamma: discount of the episodes' return.
 
-    Physics that diverges (an observation or reward that `normalization.is_sound`
-    refuses) terminates the episode with reward 0 and is reported in ``faulty``. An
-    episode that is truncated here gets the reward that the environment still holds
-    back, ``info["held_reward"]``.
+    Physics that diverges (an observation, or a reward, given or held back, that
+    `normalization.is_sound` refuses) terminates the episode with reward 0 and is
+    reported in ``faulty``. An episode that is truncated here gets the reward that the
+    environment still holds back, ``info["held_reward"]``.
     """
     num_envs = environments.episode_length.shape[0]
     low, high = getattr(env, "action_range", (-1.0, 1.0))
@@ -131,19 +137,19 @@ def collect(
         reset_keys = jax.random.split(reset_key, num_envs)
         stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
 
+        nothing = jnp.zeros(num_envs, jnp.float32)
+        true_reward = stepped.info.get("true_reward", stepped.reward)
+        held = stepped.info.get("held_reward", nothing)
         sound = normalization.is_sound(stepped.obs).all(axis=-1)
-        sound &= normalization.is_sound(stepped.reward)
+        for number in (stepped.reward, true_reward, held):
+            sound &= normalization.is_sound(number)
         length = carry.episode_length + 1
-        true_reward = jnp.where(
-            sound, stepped.info.get("true_reward", stepped.reward), 0.0
-        )
-        nothing = jnp.zeros(num_envs)
+        true_reward = jnp.where(sound, true_reward, 0.0)
         cut_off = stepped.info.get("truncation", nothing) > 0
         done = stepped.done > 0
         terminated = (done & ~cut_off) | ~sound
         truncated = ~terminated & (cut_off | (length >= max_episode_steps))
         ended = terminated | truncated
-        held = stepped.info.get("held_reward", nothing)
         reward = stepped.reward + jnp.where(truncated, held, 0.0)
         reward = jnp.where(sound, reward, 0.0)
 
@@ -170,7 +176,7 @@ def collect(
         )
         carry = EnvironmentStates(
             state=jax.tree.map(
-                lambda a, b: select(a, b).astype(b.dtype), fresh, stepped
+                lambda a, b: _cast(select(a, b), b.dtype), fresh, stepped
             ),
             episode_return=jnp.where(ended, 0.0, episode_return),
             discounted_return=jnp.where(ended, 0.0, discounted_return),

@@ -180,6 +180,8 @@ def check(options: Options) -> None:
         options, seeds=1, devices=1, checkpoint_every=1, keep_checkpoints=1
     )
     last = 2**32 - options.seeds
+    if last < 0:
+        raise InputError(f"seeds is {options.seeds}: it must be from 1 to {2**32}")
     if not 0 <= options.first_seed <= last:
         raise InputError(
             f"first_seed is {options.first_seed}: it must be from 0 to {last}"

@@ -27,8 +27,10 @@ def at(
     """What an iteration trains with: the learning rate annealed, schedules applied."""
     # In float32: as int32 it ends at 2^31 steps.
     env_steps = iteration.astype(jnp.float32) * config.batch_steps
-    left = 1.0 - hyperparameters.learning_rate_decay * (
-        iteration / config.num_iterations
+    # A loop of one's own may go on for longer than it was annealed for.
+    left = jnp.maximum(
+        1.0 - hyperparameters.learning_rate_decay * (iteration / config.num_iterations),
+        0.0,
     )
     return hyperparameters.replace(
         learning_rate=hyperparameters.learning_rate

@@ -281,6 +281,8 @@ def check(env: Any, config: Config) -> None:
         raise ValueError(
             f"env is {env!r}: it must be an environment, as gasil_jax.make_env gives"
         )
+    if jax.config.read("jax_enable_x64"):
+        raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
     validate(config, tuple(AGENTS))
     limit = getattr(env, "episode_length", math.inf)
     if (config.max_episode_steps or 0) > limit:

@@ -168,3 +168,30 @@ def test_point_mass_layout_is_data():
 def test_an_unknown_name_is_refused_with_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'walker2d'"):
         gasil_envs.make("walker")
+
+
+@pytest.mark.parametrize(
+    ("module", "message"),
+    [
+        ("1 / 0", "can't be imported: ZeroDivisionError: division by zero (.*line 1"),
+        ("Env = ", "can't be imported: SyntaxError: invalid syntax .*line 1"),
+        (
+            "def Env():\n    raise OSError('no licence')",
+            "built: OSError: no licence .*2",
+        ),
+        (
+            "class Env:\n    reset = step = observation_size = action_size = 1\n"
+            "    episode_length = 0",
+            "has episode_length 0: it must be a whole number",
+        ),
+    ],
+)
+def test_a_fault_of_one_s_own_environment_is_a_line(
+    module, message, tmp_path, monkeypatch
+):
+    name = f"own_{abs(hash(module))}"
+    (tmp_path / f"{name}.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ValueError, match=message.replace("(.", r"\(.")) as refused:
+        gasil_envs.make(f"{name}:Env")
+    assert "\n" not in str(refused.value)

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs import Wrapper
 
 import gasil_jax
 from gasil_jax import checkpoint, evaluate, numpy_policy, policy, run
@@ -105,3 +106,30 @@ def test_one_seed_scores_as_among_all_and_every_episode_is_written(tmp_path, cap
         assert evaluate.main([folder, *arguments]) == 2
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
+
+
+def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
+    """As in training; `done` need not be set beside `truncation`."""
+    env, config, states = trained_point_mass
+
+    class CutOff(Wrapper):
+        def reset(self, rng):
+            state = self.env.reset(rng)
+            info = {"time": jnp.int32(0), "truncation": jnp.float32(0)}
+            return state.replace(info={**state.info, **info})
+
+        def step(self, state, action):
+            time = state.info["time"] + 1
+            stepped = self.env.step(state, action)
+            cut_off = jnp.where(time == 7, 1.0, 0.0)
+            info = {**stepped.info, "time": time, "truncation": cut_off}
+            return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
+
+    scores = evaluate.evaluate(
+        CutOff(env),
+        config,
+        gasil_jax.member(states, 0),
+        jax.random.key(0),
+        num_episodes=3,
+    )
+    assert scores["episode_length"].tolist() == [7, 7, 7]

@@ -105,6 +105,17 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
         expert_module.check("minari:test/expert-v0", 4, 3)
 
 
+def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
+    path = str(tmp_path / "expert.npz")
+    for length in (4, 7):
+        arrays = {name: np.ones((length, 2)) for name in ("observation", "action")}
+        np.savez(path, **arrays)
+        observation, action = expert_module.load(path)
+        assert len(observation) == len(action) == length
+        with pytest.raises(ValueError, match="read-only"):
+            action[0] = 0.0
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -5,8 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import test_batch
+from brax.envs import State
 
 import gasil_jax
+from gasil_envs import wrappers
 from gasil_jax import batch, config, run
 
 SMALL = test_batch.SMALL.replace(total_steps=4 * 128, buffer_steps=300)
@@ -109,3 +111,29 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
     assert (
         '"unhealthy_seeds": [\n    0,\n    1\n  ]' in (out / "summary.json").read_text()
     )
+
+
+class Fragile:
+    """A line whose reward, and nothing else, is NaN beyond a place."""
+
+    observation_size, action_size, episode_length = 1, 1, 20
+
+    def reset(self, key):
+        place = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
+        return State(place, place, jnp.float32(0), jnp.float32(0))
+
+    def step(self, state, action):
+        place = state.pipeline_state + 0.1 * action
+        reward = jnp.where(place[0] > 0.6, jnp.nan, -(place[0] ** 2))
+        return state.replace(pipeline_state=place, obs=place, reward=reward)
+
+
+@pytest.mark.parametrize("limit", [20, 15])
+def test_a_reward_that_is_held_back_is_looked_at_too(limit):
+    env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), 20), 10)
+    small = SMALL.replace(max_episode_steps=limit)
+    _, metrics = jax.jit(gasil_jax.make_train(env, small))(jax.random.key(0))
+    assert metrics["faulty_steps"].sum() > 0
+    assert metrics["skipped_updates"].sum() == 0
+    ended = metrics["episodes"] > 0
+    assert ended.any() and np.isfinite(metrics["episode_return"][ended]).all()

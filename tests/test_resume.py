@@ -154,6 +154,23 @@ def test_resume_needs_a_folder(capsys):
     assert "resume needs --out" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "lacks rows that the checkpoint has seen"),
+        (
+            lambda path: path.write_text(path.read_text().replace(",0.", ",z.")),
+            "metrics.csv",
+        ),
+    ],
+)
+def test_a_damaged_table_is_told_in_one_line(damage, message, whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    damage(out / "metrics.csv")
+    assert run.main(["--resume", "--out", str(out)]) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
 def test_total_steps_may_grow(whole, tmp_path):
     out = copy(whole, tmp_path)
     more = str((ITERATIONS + 5) * 128)

@@ -100,6 +100,8 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'?"),
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
         ("--env hopper --seeds 0", "seeds is 0: it must be 1 or more"),
+        ("--env hopper --seeds 1e30", f"must be from 1 to {2**32}"),
+        ("--env hopper --batch-steps 1000000007", "nearest that does is 1"),
         ("--env hopper --seeds two", "seeds is 'two': it must be a whole number"),
         ("--env hopper --devices 1.5", "devices is '1.5': it must be a whole number"),
         ("--env hopper --alpha big", "alpha is 'big': it must be a number"),

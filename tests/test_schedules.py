@@ -82,3 +82,10 @@ def test_a_bad_schedule_is_refused(points):
     env = gasil_jax.make_env("point_mass")
     with pytest.raises(ValueError, match="alpha_schedule is"):
         gasil_jax.make_train(env, gasil_jax.Config(alpha_schedule=points))
+
+
+def test_a_longer_loop_does_not_anneal_below_0():
+    config = gasil_jax.Config(total_steps=4 * 2048)
+    for iteration in (4, 5, 9):
+        at = schedules.at(config, config.hyperparameters, jnp.int32(iteration))
+        assert at.learning_rate == 0.0

@@ -63,6 +63,18 @@ def test_sampling_follows_the_priorities():
     np.testing.assert_allclose(weight, importance, rtol=1e-4)
 
 
+def test_an_empty_place_is_never_drawn(monkeypatch):
+    """Though rounding may put the whole mass beyond the last place that is filled."""
+    priority = jnp.array([1.0, 2.0, 0.0, 0.0])
+    replay = self_imitation.init_replay(4, 1, 1).replace(priority=priority)
+    rounded = lambda mass: jnp.array([1.0, 2.5, 2.5, 2.5000002], jnp.float32)
+    monkeypatch.setattr(self_imitation.jnp, "cumsum", rounded)
+    highest = lambda key, shape: jnp.full(shape, 0.99999994, jnp.float32)
+    monkeypatch.setattr(self_imitation.jax.random, "uniform", highest)
+    place, weight = self_imitation.sample(jax.random.key(0), replay, 3)
+    assert place.tolist() == [1, 1, 1] and np.isfinite(weight).all()
+
+
 def test_scale_is_the_standard_deviation_of_what_is_stored():
     returns = np.array([3.0, -1.0, 7.0, 1e6], np.float32)
     replay = self_imitation.init_replay(4, 1, 1).replace(

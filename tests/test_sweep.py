@@ -30,6 +30,9 @@ def points_of(*arguments):
 
 
 def test_a_grid_is_every_combination():
+    assert points_of("--grid", "buffer_steps=1e3") == points_of(
+        "--grid", "buffer_steps=1000"
+    )
     points = points_of("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
     assert points == [
         {"alpha": 0.1, "discriminator_updates": 1},

@@ -145,3 +145,24 @@ def test_a_bad_configuration_is_refused(change, message):
 def test_a_name_is_not_an_environment():
     with pytest.raises(ValueError, match=r"env is 'hopper': .*make_env"):
         gasil_jax.make_train("hopper", SMALL)
+
+
+def test_a_state_may_begin_outside_of_jit_and_be_donated():
+    """With noise the environment's state holds keys."""
+    env = gasil_jax.make_env("point_mass", obs_noise=0.1)
+    config = SMALL.replace(agent="ppo")
+    key = jax.random.key(0)
+    state = gasil_jax.init(env, config, key)
+    step = jax.jit(lambda state: gasil_jax.iterate(env, config, state)[0])
+    wanted = step(jax.jit(lambda key: gasil_jax.init(env, config, key))(key))
+    found = jax.jit(step, donate_argnums=0)(state)
+    # A program of its own may round in another way.
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7)
+    jax.tree.map(close, found.params, wanted.params)
+
+
+def test_double_precision_is_refused():
+    env = gasil_jax.make_env("point_mass")
+    with jax.enable_x64(True):
+        with pytest.raises(ValueError, match="jax_enable_x64 is True"):
+            gasil_jax.make_train(env, SMALL)

@@ -111,6 +111,7 @@ def _sample_good(
 def _sample_expert(
     key: jax.Array, context: Context, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
+    assert context.config.expert is not None  # `check` refuses it.
     observation, action = expert.load(context.config.expert)
     rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
     return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]

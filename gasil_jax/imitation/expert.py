@@ -1,7 +1,9 @@
 """Expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
 
+import contextlib
 import functools
 import pathlib
+from typing import Any
 
 import numpy as np
 
@@ -10,7 +12,6 @@ from gasil_jax import npz
 _MINARI = "minari:"
 
 
-@functools.cache
 def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     """Observations (steps, obs) and actions (steps, action), float32.
 
@@ -22,6 +23,17 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       ValueError: it can't be read, or is not that.
     """
+    written = None
+    if not source.startswith(_MINARI):
+        with contextlib.suppress(OSError):
+            found = pathlib.Path(source).stat()
+            written = (found.st_mtime_ns, found.st_size)
+    return _load(source, written)
+
+
+@functools.lru_cache(maxsize=4)
+def _load(source: str, written: Any) -> tuple[np.ndarray, np.ndarray]:
+    """`load`, once for each content: `written` says when a file was."""
     if source.startswith(_MINARI):
         observation, action = _load_minari(source.removeprefix(_MINARI))
     else:
@@ -39,6 +51,8 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError(
             f"expert {source!r} is empty or has numbers that aren't finite"
         )
+    for array in (observation, action):
+        array.setflags(write=False)
     return observation, action
 
 

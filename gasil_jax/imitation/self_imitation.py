@@ -151,7 +151,10 @@ def sample(
     place = jnp.searchsorted(
         cumulative, jax.random.uniform(key, (num_samples,)) * total, side="right"
     )
-    place = jnp.minimum(place, mass.shape[0] - 1)
+    # In float32 the sum over all may come out higher than that up to the last place
+    # with anything in it.
+    last = jnp.max(jnp.where(mass > 0, jnp.arange(mass.shape[0]), 0))
+    place = jnp.minimum(place, last)
     size = jnp.sum(replay.priority > 0)
     weight = lambda mass: (mass / total * size) ** -_IMPORTANCE_EXPONENT
     least = jnp.min(jnp.where(mass > 0, mass, jnp.inf))
