@@ -229,18 +229,19 @@ def tally(shown: Mapping[str, Mapping[str, Results]], favourite: str) -> str:
             line += f"; over {which} {_said_together(list(positive.values()))}"
         if len(positive) > 2:
             # One task may make all of it.
-            most = max(positive, key=lambda panel: _weight(positive, panel))
+            most = _most_telling(positive)
             rest = [pair for panel, pair in positive.items() if panel != most]
             line += f" (without {most} {_said_together(rest)})"
         lines.append(f"{line}.")
     return "\n".join(lines)
 
 
-def _weight(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], panel: str) -> float:
-    """How far leaving a panel out moves the mean of the logarithms of the ratios."""
+def _most_telling(pairs: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> str:
+    """The panel that moves the mean of the logarithms of the ratios most."""
     mean = statistics.interquartile_mean
-    logs = {name: float(np.log(mean(x) / mean(y))) for name, (x, y) in pairs.items()}
-    return abs(logs[panel] - float(np.mean(list(logs.values()))))
+    logs = {panel: np.log(mean(x) / mean(y)) for panel, (x, y) in pairs.items()}
+    middle = np.mean(list(logs.values()))
+    return max(logs, key=lambda panel: abs(logs[panel] - middle))
 
 
 def _said_together(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> str:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
+from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     batch,
@@ -77,7 +78,7 @@ def evaluate(
         # As in training a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running
-        ended = (states.done > 0) | (states.info.get("truncation", states.done) > 0)
+        ended = (states.done > 0) | wrappers.truncated(states)
         running = running & ~ended & sound
         return (states, running, return_, length), None
 

@@ -23,6 +23,7 @@ import jax
 import numpy as np
 import tyro
 
+from gasil_envs import wrappers
 from gasil_jax import (
     batch,
     command_line,
@@ -92,7 +93,7 @@ def episode(
         state = step(state, step_key)
         states.append(jax.device_get(state.pipeline_state))
         total += float(state.info.get("true_reward", state.reward))
-        if state.done > 0 or state.info.get("truncation", state.done) > 0:
+        if state.done > 0 or wrappers.truncated(state):
             break
     return states, total
 

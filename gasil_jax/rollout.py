@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_envs import wrappers
 from gasil_jax import normalization
 from gasil_jax.networks import gaussian_log_prob
 
@@ -137,15 +138,14 @@ def collect(
         reset_keys = jax.random.split(reset_key, num_envs)
         stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
 
-        nothing = jnp.zeros(num_envs, jnp.float32)
         true_reward = stepped.info.get("true_reward", stepped.reward)
-        held = stepped.info.get("held_reward", nothing)
+        held = stepped.info.get("held_reward", jnp.zeros_like(stepped.reward))
         sound = normalization.is_sound(stepped.obs).all(axis=-1)
         for number in (stepped.reward, true_reward, held):
             sound &= normalization.is_sound(number)
         length = carry.episode_length + 1
         true_reward = jnp.where(sound, true_reward, 0.0)
-        cut_off = stepped.info.get("truncation", nothing) > 0
+        cut_off = wrappers.truncated(stepped)
         done = stepped.done > 0
         terminated = (done & ~cut_off) | ~sound
         truncated = ~terminated & (cut_off | (length >= max_episode_steps))

@@ -173,7 +173,7 @@ def test_an_unknown_name_is_refused_with_the_nearest():
 @pytest.mark.parametrize(
     ("module", "message"),
     [
-        ("1 / 0", "can't be imported: ZeroDivisionError: division by zero (.*line 1"),
+        ("1 / 0", r"can't be imported: ZeroDivisionError: division by zero \(.*line 1"),
         ("Env = ", "can't be imported: SyntaxError: invalid syntax .*line 1"),
         (
             "def Env():\n    raise OSError('no licence')",
@@ -192,6 +192,6 @@ def test_a_fault_of_one_s_own_environment_is_a_line(
     name = f"own_{abs(hash(module))}"
     (tmp_path / f"{name}.py").write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(ValueError, match=message.replace("(.", r"\(.")) as refused:
+    with pytest.raises(ValueError, match=message) as refused:
         gasil_envs.make(f"{name}:Env")
     assert "\n" not in str(refused.value)

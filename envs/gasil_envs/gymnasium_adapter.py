@@ -17,7 +17,7 @@ import numpy as np
 from brax.envs import Env
 from gymnasium.vector import AutoresetMode
 
-from gasil_envs import registry
+from gasil_envs import registry, wrappers
 
 _NAMESPACE = "gasil_envs"
 
@@ -35,10 +35,6 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 
 def _key(generator: np.random.Generator) -> jax.Array:
     return jax.random.key(int(generator.integers(2**32)))
-
-
-def _truncated(state: Any) -> jax.Array:
-    return state.info.get("truncation", jnp.zeros_like(state.done)) > 0
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -73,7 +69,7 @@ class GymnasiumEnv(gymnasium.Env):
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Observation, reward, terminated, truncated, and the true reward as info."""
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
-        truncated = bool(_truncated(state))
+        truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
         info = {"true_reward": float(state.info.get("true_reward", state.reward))}
         return np.asarray(state.obs), float(state.reward), terminated, truncated, info
@@ -132,7 +128,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Observation (num_envs, obs), reward, terminated and truncated (num_envs,)."""
         given = jnp.asarray(actions, jnp.float32)
         self._state = state = self._step(self._state, given, _key(self.np_random))
-        truncated = np.array(_truncated(state))
+        truncated = np.array(wrappers.truncated(state))
         terminated = np.array(state.done > 0) & ~truncated
         reward = np.array(state.reward, np.float64)
         true_reward = np.array(state.info.get("true_reward", state.reward))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from brax.envs import State
 from flax import struct
 
-from gasil_envs import registry
+from gasil_envs import registry, wrappers
 
 Transition = tuple[jax.Array, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]
 
@@ -67,7 +67,7 @@ class GymnaxEnv:
         """
         stepped, fresh = self._env.step(state, action), self._env.reset(key)
         ended = stepped.done > 0
-        truncated = stepped.info.get("truncation", jnp.zeros_like(stepped.done)) > 0
+        truncated = wrappers.truncated(stepped)
         state = jax.tree.map(lambda a, b: jnp.where(ended, a, b), fresh, stepped)
         info = {
             "final_observation": stepped.obs,

@@ -10,6 +10,14 @@ import jax.numpy as jnp
 from brax.envs import Env, State, Wrapper
 
 
+def truncated(state: State) -> jax.Array:
+    """Whether the episode was cut off with this step, bool of the shape of ``done``.
+
+    False of an environment that says nothing of it.
+    """
+    return state.info.get("truncation", jnp.zeros_like(state.done)) > 0
+
+
 class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
