@@ -114,9 +114,10 @@ def drive(
     except ValueError as error:
         raise InputError(str(error)) from None
 
-    progress.phase("compiling", steps_before + steps_of(first))
     started = time.monotonic()
-    states, advance = runs.compile(states)
+    if first < last:
+        progress.phase("compiling", steps_before + steps_of(first))
+        states, advance = runs.compile(states)
     compile_seconds = time.monotonic() - started
 
     progress.phase("training", steps_before + steps_of(first))

@@ -7,6 +7,7 @@ import argparse
 import contextlib
 import dataclasses
 import hashlib
+import json
 import os
 import pathlib
 import platform
@@ -373,6 +374,16 @@ def _write_results(
         for seed, value in zip(seeds, values, strict=True)
         if np.isfinite(value)
     }
+    trained = {
+        "compile_seconds": outcome.compile_seconds,
+        "train_seconds": outcome.train_seconds,
+        "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
+        "device": runs.device_kind,
+        "device_count": len(runs.devices),
+        "versions": logging.versions(),
+    }
+    if not outcome.new_steps:
+        trained = _on_record(folder / "summary.json", trained)
     summary = {
         "env": options.env,
         "agent": config.agent,
@@ -386,15 +397,19 @@ def _write_results(
         "unhealthy_seeds": [
             seed for seed, bad in zip(seeds, (faulty > 0) | (skipped > 0)) if bad
         ],
-        "compile_seconds": outcome.compile_seconds,
-        "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
-        "device": runs.device_kind,
-        "device_count": len(runs.devices),
-        "versions": logging.versions(),
+        **trained,
     }
     logging.write_json(folder / "summary.json", summary)
     return summary
+
+
+def _on_record(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
+    """The same fields from the summary that is there, if it has them."""
+    try:
+        before = json.loads(path.read_text())
+        return {name: before[name] for name in trained}
+    except (OSError, ValueError, KeyError, TypeError):
+        return trained
 
 
 def final_returns(returns: np.ndarray) -> np.ndarray:

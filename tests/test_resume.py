@@ -171,6 +171,18 @@ def test_a_damaged_table_is_told_in_one_line(damage, message, whole, tmp_path, c
     assert message in capsys.readouterr().err.splitlines()[-1]
 
 
+def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert "compiling" not in capsys.readouterr().err
+    for name in ("summary.json", "metrics.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    with np.load(out / "policy.npz") as ours, np.load(whole / "policy.npz") as theirs:
+        for name in theirs:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+    assert checkpoints(out) == checkpoints(whole)
+
+
 def test_total_steps_may_grow(whole, tmp_path):
     out = copy(whole, tmp_path)
     more = str((ITERATIONS + 5) * 128)
