@@ -82,6 +82,20 @@ def test_an_environments_own_truncation_stays():
     np.testing.assert_array_equal(cut.info["truncation"], [0, 0, 0, 1])
 
 
+class OnlyTruncating(Truncating):
+    """Says that its episode was cut off, and not that it is over."""
+
+    def step(self, state, action):
+        return super().step(state, action).replace(done=jnp.float32(0))
+
+
+def test_a_truncation_alone_ends_the_episode_and_gives_what_is_held():
+    env = wrappers.EpisodeLimit(OnlyTruncating(4), 7)
+    _, cut = roll(wrappers.RewardDelay(env, 3), 4)
+    np.testing.assert_array_equal(cut.done, [0, 0, 0, 1])
+    np.testing.assert_array_equal(cut.reward, [0, 0, 1 + 2 + 3, 4])
+
+
 def test_noise_is_fresh_gaussian_and_only_on_the_observation():
     _, plain = roll(Scripted(10_000), 4000)
     _, noisy = roll(wrappers.ObservationNoise(Scripted(10_000), 0.5), 4000)

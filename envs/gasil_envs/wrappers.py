@@ -51,7 +51,9 @@ class EpisodeLimit(Wrapper):
             state.info["truncation"], at_limit * (1.0 - state.done)
         )
         info = {**state.info, "steps": steps, "truncation": truncation}
-        return state.replace(done=jnp.maximum(state.done, at_limit), info=info)
+        # Truncation alone ends an episode too.
+        ended = jnp.maximum(at_limit, (truncation > 0).astype(jnp.float32))
+        return state.replace(done=jnp.maximum(state.done, ended), info=info)
 
 
 class RewardDelay(Wrapper):
