@@ -5,7 +5,7 @@ import dataclasses
 import io
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar, get_type_hints
 
 import tyro
@@ -25,6 +25,15 @@ _REGISTRY = ConstructorRegistry()
 
 class InputError(ValueError):
     """Bad input, in one line that names the value and what is allowed."""
+
+
+@contextlib.contextmanager
+def input_checked() -> Iterator[None]:
+    """Raise a `ValueError` that is raised inside as an `InputError`."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(str(error)) from None
 
 
 @_REGISTRY.primitive_rule

@@ -16,9 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from gasil_jax import checkpoint, logging
+from gasil_jax import checkpoint, command_line, logging
 from gasil_jax.batch import Batch
-from gasil_jax.command_line import InputError
 from gasil_jax.interruption import Interrupted, Interruption
 from gasil_jax.progress import Progress
 from gasil_jax.trackers import Tracker, log
@@ -102,17 +101,13 @@ def drive(
         with progress.aside(f"restoring {found.folder.name}"):
             like = jax.eval_shape(lambda: runs.trim(runs.init()))
             first = found.iteration
-            try:
+            with command_line.input_checked():
                 states = found.restore(like)
-            except ValueError as error:
-                raise InputError(str(error)) from None
         size = found.record["metrics_size"]
     elif (folder / "metrics.csv").exists():
         size = 0
-    try:
+    with command_line.input_checked():
         writer = logging.MetricsWriter(folder / "metrics.csv", labels, size)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
     started = time.monotonic()
     if first < last:

@@ -202,7 +202,7 @@ def load(
         scored = " in whose time an episode ended" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
-    try:
+    with command_line.input_checked():
         validate(config, tuple(AGENTS))
         env = environments.make_env(described["env"], **settings)
         # All members have leaves of the same names.
@@ -211,8 +211,6 @@ def load(
         )
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
         states = found.restore(like)
-    except ValueError as error:
-        raise InputError(str(error)) from None
     seeds, places = saved.seeds, np.array(saved.places)
     if seed is not None:
         if seed not in seeds:

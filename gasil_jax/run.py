@@ -122,12 +122,10 @@ def parse(
             )
         return options
     given = command_line.parse(kind, arguments, program)
-    try:
+    with command_line.input_checked():
         config = presets.preset(
             given.env, given.config.agent, given.preset, given.settings.reward_delay
         )
-    except ValueError as error:
-        raise InputError(str(error)) from None
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)
 
@@ -171,12 +169,10 @@ def check(options: Options) -> None:
     Raises:
       InputError: the value and what is allowed.
     """
-    try:
+    with command_line.input_checked():
         environments.check(options.env, options.settings)
         validate(options.config, tuple(AGENTS))
         trackers.check(options.log)
-    except ValueError as error:
-        raise InputError(str(error)) from None
     command_line.check_least(
         options, seeds=1, devices=1, checkpoint_every=1, keep_checkpoints=1
     )
@@ -220,14 +216,12 @@ def check_resources(
 
     with announced(options.env, "starting the devices"):
         devices = jax.devices()
-    try:
+    with command_line.input_checked():
         for config, num_members in at_once:
             resources.check_memory(env, config, num_members, devices)
         folder = options.out or pathlib.Path("runs")
         # The best one too.
         resources.check_disk(env, saved, folder, options.keep_checkpoints + 1)
-    except ValueError as error:
-        raise InputError(str(error)) from None
 
 
 @contextlib.contextmanager
@@ -304,12 +298,10 @@ def make_env(options: Options) -> Any:
       InputError: it can't be built, or the agent can't run in it.
     """
     settings = dataclasses.asdict(options.settings)
-    try:
+    with command_line.input_checked():
         with announced(options.env, "building the environment"):
             env = environments.make_env(options.env, **settings)
         training.check(env, options.config)
-    except ValueError as error:
-        raise InputError(str(error)) from None
     return env
 
 
