@@ -170,6 +170,27 @@ def test_an_unknown_name_is_refused_with_the_nearest():
         gasil_envs.make("walker")
 
 
+_OWN = """
+import jax.numpy as jnp
+from brax.envs import Env, State
+class Env(Env):
+    observation_size, action_size, backend = 2, 1, "none"
+    def reset(self, rng):
+        return State(jnp.int32(0), jnp.zeros(2), jnp.float32(0), jnp.float32(0))
+    def step(self, state, action):
+        then, a = state.pipeline_state + 1, jnp.zeros(2)
+        reward = action[0]
+        return state.replace(pipeline_state=then, obs=a, reward=reward, info={})
+"""
+
+
+def test_one_s_own_environment_is_built(tmp_path, monkeypatch):
+    (tmp_path / "own_that_is_whole.py").write_text(_OWN)
+    monkeypatch.syspath_prepend(tmp_path)
+    env = gasil_envs.make("own_that_is_whole:Env", reward_delay=3)
+    assert env.step(env.reset(jax.random.key(0)), jnp.zeros(1)).pipeline_state == 1
+
+
 @pytest.mark.parametrize(
     ("module", "message"),
     [
@@ -179,11 +200,21 @@ def test_an_unknown_name_is_refused_with_the_nearest():
             "def Env():\n    raise OSError('no licence')",
             "built: OSError: no licence .*2",
         ),
+        ("class Env:\n    reset = step = 1", "it has no observation_size"),
         (
-            "class Env:\n    reset = step = observation_size = action_size = 1\n"
-            "    episode_length = 0",
-            "has episode_length 0: it must be a whole number",
+            _OWN.replace("2, 1, ", "2.5, 1, "),
+            "size 2.5: it must be a whole",
         ),
+        (_OWN.replace("2, 1, ", "3, 1, "), r"obs of its reset .*\(2,\), .* \(3,\)"),
+        (_OWN.replace("action[0]", "action"), r"reward of its step .*\(1,\), .* \(\)"),
+        (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
+        (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
+        (
+            _OWN.replace("pipeline_state + 1", "pipeline_state + 0.5"),
+            r"state.pipeline_state is int32\[\] in its reset and float32\[\] in",
+        ),
+        (_OWN.replace("info={}", "info={'x': a}"), r"info\['x'\] is missing in its r"),
+        (_OWN + "    episode_length = 0\n", "has episode_length 0: it must be a whole"),
     ],
 )
 def test_a_fault_of_one_s_own_environment_is_a_line(

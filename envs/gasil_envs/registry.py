@@ -2,18 +2,14 @@
 
 import dataclasses
 import difflib
-import importlib
-import inspect
 import math
-import numbers
-import traceback
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import brax.envs
 from brax.envs import Env
 
-from gasil_envs import locomotion, point_mass, wrappers
+from gasil_envs import locomotion, own_environment, point_mass, wrappers
 from gasil_envs.physics import native
 from gasil_envs.physics.mjx import SOLVERS
 
@@ -76,40 +72,12 @@ def names() -> tuple[str, ...]:
     return tuple(_constructors())
 
 
-def _of_user(name: str) -> Callable[[], Env]:
-    """What MODULE:NAME names: a class, or a function that builds an environment."""
-    module, attribute = name.split(":", 1)
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"env {name!r} can't be imported: {error}") from None
-    except Exception as error:
-        why = _in_a_line(error)
-        raise ValueError(f"env {name!r} can't be imported: {why}") from None
-    try:
-        inspect.signature(found).bind()
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"env {name!r} must build an environment without arguments: {error}"
-        ) from None
-    return found
-
-
-def _in_a_line(error: Exception) -> str:
-    """What an error of the user's own code says, and where it was raised."""
-    said = f"{type(error).__name__}: {error}".partition("\n")[0]
-    if isinstance(error, SyntaxError):
-        return said  # With its place.
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{said} ({place.filename}, line {place.lineno})"
-
-
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
     if name.startswith(BRAX):
         _refuse_unknown("env", name, [BRAX + known for known in brax.envs._envs])
     elif ":" in name:
-        _of_user(name)
+        own_environment.find(name)
     else:
         _refuse_unknown("env", name, names())
     if ":" in name:
@@ -155,24 +123,11 @@ def make(name: str, **settings: Any) -> Env:
     if name.startswith(BRAX):
         env = brax.envs.get_environment(name.removeprefix(BRAX))
     elif ":" in name:
-        build = _of_user(name)
-        try:
-            env = build()
-        except Exception as error:
-            why = _in_a_line(error)
-            raise ValueError(f"env {name!r} can't be built: {why}") from None
-        for needed in ("reset", "step", "observation_size", "action_size"):
-            if not hasattr(env, needed):
-                raise ValueError(f"env {name!r} is no environment: it has no {needed}")
+        env = own_environment.build(name)
     else:
         env = _constructors()[name](chosen)
-    limit = getattr(env, "episode_length", _EPISODE_LENGTH)
-    if not isinstance(limit, numbers.Integral) or limit < 1:
-        raise ValueError(
-            f"env {name!r} has episode_length {limit!r}: it must be a whole number, 1 "
-            "or more"
-        )
-    env = wrappers.EpisodeLimit(env, int(limit))
+    limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
+    env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)
     if chosen.obs_noise > 0:

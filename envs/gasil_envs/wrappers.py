@@ -47,12 +47,11 @@ class EpisodeLimit(Wrapper):
         info = {**state.info, "truncation": jnp.float32(0)}
         state = self.env.step(state.replace(info=info), action)
         at_limit = (steps >= self.episode_length).astype(jnp.float32)
-        truncation = jnp.maximum(
-            state.info["truncation"], at_limit * (1.0 - state.done)
-        )
-        info = {**state.info, "steps": steps, "truncation": truncation}
         # Truncation alone ends an episode too.
-        ended = jnp.maximum(at_limit, (truncation > 0).astype(jnp.float32))
+        ended = jnp.maximum(at_limit, truncated(state).astype(jnp.float32))
+        own = state.info.get("truncation", jnp.float32(0))
+        truncation = jnp.maximum(own, at_limit * (1.0 - state.done))
+        info = {**state.info, "steps": steps, "truncation": truncation}
         return state.replace(done=jnp.maximum(state.done, ended), info=info)
 
 
