@@ -32,12 +32,12 @@ FIGURE = Figure(
     title="Humanoid over 3M steps (paper, figures 5 and 7)",
     claim="PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large "
     "margin where the reward is delayed.",
-    more="""**What it says.** Nobody walks after 3M steps either. With dense rewards PPO
-hardly gains after the first million; PPO+BC and PPO+SIL go on learning and are clearly
-ahead of PPO+GASIL at the end, which ten seeds don't tell from PPO. The search that
-tuned them had a third of a million steps a run, in which the agents' best points were
-alike (450 to 464), so that another alpha may do better; the paper's schedule has too
-few seeds to say.""",
+    more="""**What it says.** Nobody walks after 3M steps either. With delayed rewards
+the four agents are alike to the end. With dense rewards PPO hardly gains after the
+first million; PPO+BC and PPO+SIL go on learning and are clearly ahead of PPO+GASIL at
+the end, which ten seeds don't tell from PPO. The search that tuned them had a third of
+a million steps a run, in which the agents' best points were alike (450 to 464), so that
+another alpha may do better; the paper's schedule has too few seeds to say.""",
     conclude=_conclude,
 )
 

@@ -276,19 +276,15 @@ def gaps(
         for panel, curves in shown.items()
         if favourite in curves and other in curves
     }
-    rng = np.random.default_rng(0)
-    drawn = {
-        name: _resampled(x, rng) - _resampled(y, rng) for name, (x, y) in both.items()
-    }
-    found = {panel: difference(*pair) for panel, pair in both.items()}
     lines = []
-    for panel, gap in found.items():
+    for panel, (ours, theirs) in both.items():
+        gap = difference(ours, theirs)
         line = f"- {panel}: {favourite} ahead of {other} by {said(*gap)}"
         if panel != first and first in both:
-            more = gap[0] - found[first][0]
-            low, high = np.percentile(drawn[panel] - drawn[first], [2.5, 97.5])
-            line += f"; by {said(more, low, high)} more than at {first}: "
-            line += verdict(low, high)
+            before, behind = both[first]
+            terms = ((1, ours), (-1, theirs), (-1, before), (1, behind))
+            more = contrast(terms)
+            line += f"; by {said(*more)} more than at {first}: {verdict(*more[1:])}"
         lines.append(f"{line}.")
     return "\n".join(lines)
 

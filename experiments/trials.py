@@ -225,22 +225,30 @@ def known(trial: Trial, results: pathlib.Path) -> frozenset[tuple[int, int]]:
 
 
 def adopt(trial: Trial, results: pathlib.Path) -> None:
-    """Take over what another figure beside `results` has of the very same runs."""
+    """Take over what another figure beside `results` has of the very same runs.
+
+    Runs that are there already stay: it must have those too, to the digit.
+    """
     target = results / f"{trial.name}.csv"
-    if target.exists():
+    described = target.with_suffix(".json")
+    if target.exists() and not _is_of(trial, described):
         return
-    for described in sorted(results.parent.glob("*/*/[!.]*.json")):
-        if not _is_of(trial, described):
+    if read_whole(trial, results) is not None:
+        return
+    here = {tuple(row.items()) for row in _read(target)}
+    seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
+    for there in sorted(results.parent.glob("*/*/[!.]*.json")):
+        if not _is_of(trial, there):
             continue
-        other = dataclasses.replace(
-            trial, name=str(described.relative_to(results.parent).with_suffix(""))
-        )
-        seeds = range(trial.first_seed, trial.first_seed + trial.seeds)
-        if read_whole(other, results.parent) is not None:
-            rows = _read(described.with_suffix(".csv"))
+        name = str(there.relative_to(results.parent).with_suffix(""))
+        if read_whole(dataclasses.replace(trial, name=name), results.parent) is None:
+            continue
+        rows = _read(there.with_suffix(".csv"))
+        rows = [row for row in rows if int(row["seed"]) in seeds]
+        if here <= {tuple(row.items()) for row in rows}:
             target.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(target.with_suffix(".json"), described.read_text())
-            _write_rows(target, [row for row in rows if int(row["seed"]) in seeds])
+            write_whole(described, there.read_text())
+            _write_rows(target, rows)
             return
 
 
@@ -325,6 +333,12 @@ class Results:
     def complete(self) -> bool:
         """Whether all seeds of the trial are there."""
         return len(self.seeds) >= self.trial.seeds
+
+    def after(self, seeds: int) -> "Results":
+        """The seeds that come after the first so many, alone."""
+        return dataclasses.replace(
+            self, seeds=self.seeds[seeds:], returns=self.returns[:, seeds:]
+        )
 
     @property
     def final(self) -> np.ndarray:

@@ -80,12 +80,15 @@ def is_search(trial: Trial) -> bool:
     return trial.name.split("/")[0].endswith(PANEL_SUFFIX)
 
 
-def trials_of(search: Trial, folder: pathlib.Path) -> list[Trial]:
-    """A search's stages so far and, once it is whole, ten seeds of its best point.
+def trials_of(
+    search: Trial, folder: pathlib.Path, seeds: int = Trial.seeds
+) -> list[Trial]:
+    """A search's stages so far and, once it is whole, seeds of its best point.
 
     Args:
       search: PANEL-search/CURVE.
       folder: of the results.
+      seeds: of the best point.
 
     Returns:
       Up to three trials, the last of the name PANEL/CURVE.
@@ -103,6 +106,7 @@ def trials_of(search: Trial, folder: pathlib.Path) -> list[Trial]:
             points=(known.best,),
             reward_delay=search.reward_delay,
             obs_noise=search.obs_noise,
+            seeds=seeds,
             alpha_schedule=search.alpha_schedule,
             normalize_rewards=search.normalize_rewards,
         )

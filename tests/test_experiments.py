@@ -224,6 +224,14 @@ def test_the_same_runs_are_not_trained_for_another_figure(tmp_path):
     trials.adopt(fewer, here)
     assert trials.known(fewer, here) == {(0, 0)}
     assert trials.read(fewer, here).final.tolist() == [[1.5]]
+    # One that is there already is completed, if the others have it to the digit.
+    for first, known in (("1.5", {(0, 0), (0, 1)}), ("1.6", {(0, 0)})):
+        begun = dataclasses.replace(trial, name=f"0/begun-{first}")
+        place = here / f"{begun.name}.csv"
+        place.write_text(f"{lines[0]}\n0,0,100,{first}\n")
+        place.with_suffix(".json").write_text(described)
+        trials.adopt(begun, here)
+        assert trials.known(begun, here) == known
     # So are those that are read; others of the same number are no substitute.
     assert trials.read(dataclasses.replace(same, seeds=1), here).final.item() == 1.5
     later = trials.read(dataclasses.replace(same, first_seed=1), here)
@@ -413,36 +421,44 @@ def test_what_a_search_beside_curves_finds_is_trained_alike(tmp_path, monkeypatc
     write_results(tmp_path / "normalized_rewards", search, (1.0, 3.0, 2.0, 0.0))
     (final,) = (t for t in normalized_rewards.make() if t.name == "hopper-delayed/ppo")
     assert final.points == search.points[1:2] and final.normalize_rewards
-    assert (final.first_seed, final.seeds) == (0, 10)
+    assert (final.first_seed, final.seeds) == (0, 20)  # As in figure 7.
     shown = normalized_rewards.FIGURE.shown(normalized_rewards.make(), tmp_path)
     assert not shown
     write_results(tmp_path / "normalized_rewards", final, (77.0,))
     wanted = normalized_rewards.make()
     normalized_rewards.write(normalized_rewards.FIGURE, wanted, tmp_path)
     page = (tmp_path / "normalized_rewards.md").read_text()
-    assert "| hopper-delayed | ppo | 10 | 77.0 [77.0, 77.0] |" in page
+    assert "| hopper-delayed | ppo | 20 | 77.0 [77.0, 77.0] |" in page
     row = "| hopper-delayed-search | ppo | 4 x 8 |  | learning_rate 0.0001 | 3 | 8 |"
     assert row in page
-    # The two rewards are counted apart.
+    # The two rewards are counted apart, and so are the seeds after the tenth.
     agents = ("ppo", "ppo+gasil")
+    scores_of = {
+        "hopper-delayed": ((1.0, 3.0), (99.0, 2.0)),
+        "hopper": ((2.0,), (1.0,)),
+    }
     shown = {
         panel: {
             agent: trials.Results(
                 dataclasses.replace(final, agent=agent),
-                np.arange(10),
+                np.arange(20),
                 np.array([100]),
-                np.full((1, 10, 1), score),
+                np.repeat(np.array(those, float), 20 // len(those))[None, :, None],
                 (),
             )
-            for agent, score in zip(agents, scores, strict=True)
+            for agent, those in zip(agents, scores, strict=True)
         }
-        for panel, scores in (("hopper-delayed", (1.0, 2.0)), ("hopper", (2.0, 1.0)))
+        for panel, scores in scores_of.items()
     }
-    delayed, dense = normalized_rewards.FIGURE.conclusions(shown).split(
-        "rewards normalized"
-    )[1:]
+    delayed, dense, added = normalized_rewards.FIGURE.conclusions(shown).split(":\n\n")[
+        1:
+    ]
     assert "ppo+gasil better than ppo: yes on 1 of 1" in delayed
     assert "ppo+gasil better than ppo: no, it is lower on 1 of 1" in dense
+    assert "Of delayed hopper the seeds added" in dense
+    assert "ppo+gasil better than ppo: no, it is lower on 1 of 1" in added
+    raw = {"hopper": shown["hopper-delayed"]}
+    assert delayed_mujoco.FIGURE.conclusions(raw).endswith(added)
 
 
 def test_every_pair_of_values_is_drawn_equally_often():
