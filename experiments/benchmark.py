@@ -380,6 +380,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     jax.config.update("jax_num_cpu_devices", count)
     jax.config.update("jax_default_matmul_precision", "highest")
     devices = jax.devices()
+    tables: dict[str, list[Any]] = {name: [] for name in options.tables}
     result = {
         "device": f"{len(devices)} x {devices[0].device_kind}",
         "cores": available_cores(),
@@ -387,14 +388,14 @@ def _main(arguments: Sequence[str] | None) -> None:
             name: str(value) for name, value in dataclasses.asdict(options).items()
         },
         "versions": logging.versions(),
-        "tables": {name: [] for name in options.tables},
+        "tables": tables,
     }
     print(f"{result['device']}, {result['cores']} cores")
     for table in options.tables:
         print(f"{table:51}{_HEAD}", flush=True)
         for rows in TABLES[table](options):
             time_in_turn(rows, options.repeats)
-            result["tables"][table] += show(rows)
+            tables[table] += show(rows)
             # After every task: a benchmark that is cut off has its first figures.
             logging.write_json(out, result)
     print(f"in {out}")

@@ -3,6 +3,7 @@
 import dataclasses
 import pathlib
 from collections.abc import Callable, Sequence
+from typing import Any
 
 from experiments import processes, report, trials
 from experiments.report import Figure
@@ -51,7 +52,7 @@ class Options:
 
 
 #: Seeds and steps of the quick version.
-_QUICK = {"seeds": 3, "total_steps": 100_000, "rows": 20}
+_QUICK: dict[str, Any] = {"seeds": 3, "total_steps": 100_000, "rows": 20}
 
 
 def main(

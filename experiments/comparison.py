@@ -1,6 +1,6 @@
 """The four agents on the six tasks, each with what the search found best for it."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from experiments import random_search, report
 from experiments.trials import AGENTS, TASKS, Results, Trial
@@ -60,6 +60,6 @@ def said_of_added(shown: Mapping[str, Mapping[str, Results]]) -> str:
     return report.tallies({name: added}, AGENTS[-1])
 
 
-def quick(wanted: list[Trial]) -> list[Trial]:
+def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """Hopper's."""
     return [trial for trial in wanted if trial.env == "hopper"]

@@ -49,8 +49,8 @@ def make() -> list[Trial]:
         for trial in comparison.make(delay):
             task, curve = trial.name.split("/")
             if task == "humanoid":
-                change = {"name": f"{panel}/{curve}", "total_steps": STEPS}
-                wanted.append(dataclasses.replace(trial, **change))
+                name = f"{panel}/{curve}"
+                wanted.append(dataclasses.replace(trial, name=name, total_steps=STEPS))
     scheduled = [
         dataclasses.replace(
             trial,

@@ -71,7 +71,7 @@ def make() -> list[Trial]:
     ]
 
 
-def quick(wanted: list[Trial]) -> list[Trial]:
+def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """The ends and one value in the middle."""
     values = [(name, x) for name, of in VALUES.items() for x in (of[0], of[1], of[-1])]
     names = [f"{name}/{value}" for name, value in values]

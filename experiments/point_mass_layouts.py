@@ -193,7 +193,7 @@ def evaluate(
         alphas = options.alphas if agent == "ppo+gasil" else (0.0,)
         seeds = options.seeds * len(options.alphas) // len(alphas)
         tuned = configuration(agent, options).hyperparameters
-        runs = [
+        runs: list[dict[str, Any]] = [
             {
                 "layout": number,
                 "agent": agent,
@@ -237,10 +237,10 @@ def rank(rows: Sequence[dict[str, Any]]) -> list[tuple[float, str]]:
                     point = (float(row["learning_rate"]), float(row["alpha"]))
                     scores = (float(row["early"]), float(row["final"]))
                     by_point.setdefault(point, []).append(scores)
-            point, scores = max(
+            chosen, all_scores = max(
                 by_point.items(), key=lambda item: np.mean([x[1] for x in item[1]])
             )
-            best[agent] = (point, np.array(scores))
+            best[agent] = (chosen, np.array(all_scores))
         (ppo_point, ppo), (point, gasil) = (best[agent] for agent in PAIR)
         error = np.sqrt(sum(x[:, 1].var(ddof=1) / len(x) for x in (ppo, gasil)))
         ahead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + _MARGIN)

@@ -105,7 +105,7 @@ def reward_field(
         state.normalizer, jnp.asarray(np.concatenate([places, there], axis=1))
     )
     network = Discriminator(config.discriminator_hidden_sizes)
-    logit = jax.vmap(
+    logit: Any = jax.vmap(
         lambda action: network.apply(
             state.imitation.params,
             observation,
@@ -124,9 +124,7 @@ def _columns(agent: str) -> tuple[str, ...]:
     return _COLUMNS if agent == "ppo+gasil" else _COLUMNS[:2]
 
 
-def draw_moment(
-    panels: Sequence[Any], env: Any, config: gasil_jax.Config, state: Any
-) -> None:
+def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> None:
     """One moment of an agent: its policy, its buffer, and its discriminator if any."""
     layout = env.unwrapped.layout
     for panel in panels:
@@ -147,7 +145,7 @@ def draw_moment(
 Moments = Mapping[str, tuple[gasil_jax.Config, Sequence[Any]]]
 
 
-def _draw_row(panels: Sequence[Any], env: Any, moments: Moments, number: int) -> str:
+def _draw_row(panels: Any, env: Any, moments: Moments, number: int) -> str:
     """Every agent at one moment; returns how far training is."""
     steps = 0
     for agent, (config, states) in moments.items():
@@ -223,7 +221,8 @@ def _main(arguments: Sequence[str] | None) -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     matplotlib.use("Agg")
     env = gasil_jax.make_env("point_mass")
-    shares = np.linspace(0, 1, options.animate) if options.animate else SHARES
+    evenly = np.linspace(0, 1, options.animate).tolist()
+    shares = evenly if options.animate else SHARES
     moments = {}
     for agent in point_mass.AGENTS:
         config = point_mass.config(agent).replace(total_steps=options.total_steps)

@@ -80,7 +80,7 @@ def train(
     waiting = [run for trial, done in todo for run in _runs(trial, done)]
     total, ended, failed = len(waiting), 0, []
     free = list(range(processes))
-    running: dict[int, tuple[_Run, int, Any, float]] = {}
+    running: dict[Any, tuple[_Run, int, Any, float]] = {}
     with Interruption() as interruption:
         try:
             while waiting or running:

@@ -329,7 +329,7 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     for panel, curves in shown.items():
         for curve, known in curves.items():
             trial = known.trial
-            values = [said] if (said := point(trial.points[0])) else []
+            values = [words] if (words := point(trial.points[0])) else []
             values += [
                 f"alpha x {factor:g} at {steps:g} steps"
                 for steps, factor in trial.alpha_schedule

@@ -77,7 +77,7 @@ def make() -> list[Trial]:
     return wanted
 
 
-def quick(wanted: list[Trial]) -> list[Trial]:
+def quick(wanted: Sequence[Trial]) -> list[Trial]:
     """Without noise, and with some."""
     return [
         trial

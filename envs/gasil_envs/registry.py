@@ -72,14 +72,21 @@ def names() -> tuple[str, ...]:
     return tuple(_constructors())
 
 
-def check(name: str, settings: Settings) -> None:
-    """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
+def _constructor(name: str) -> Callable[[Settings], Env]:
+    """What builds the environment of a name; a `ValueError` of an unknown one."""
     if name.startswith(BRAX):
         _refuse_unknown("env", name, [BRAX + known for known in brax.envs._envs])
-    elif ":" in name:
+        return lambda settings: brax.envs.get_environment(name.removeprefix(BRAX))
+    if ":" in name:
         own_environment.find(name)
-    else:
-        _refuse_unknown("env", name, names())
+        return lambda settings: own_environment.build(name)
+    _refuse_unknown("env", name, names())
+    return _constructors()[name]
+
+
+def check(name: str, settings: Settings) -> None:
+    """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
+    _constructor(name)
     if ":" in name:
         for field in ("physics", "solver", "integrator"):
             value = getattr(settings, field)
@@ -120,12 +127,7 @@ def make(name: str, **settings: Any) -> Env:
     """
     chosen = Settings(**settings)
     check(name, chosen)
-    if name.startswith(BRAX):
-        env = brax.envs.get_environment(name.removeprefix(BRAX))
-    elif ":" in name:
-        env = own_environment.build(name)
-    else:
-        env = _constructors()[name](chosen)
+    env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
