@@ -323,6 +323,20 @@ def point(of: Point) -> str:
     return ", ".join(f"{name} {value:g}" for name, value in of.items())
 
 
+def _made_by(made: Mapping[str, Any]) -> str:
+    """What made a trial's results, or some of their seeds, in words."""
+    seeds = made.get("seeds", ())
+    # In order and without a gap, most often.
+    if len(seeds) > 2 and len(seeds) == seeds[-1] - seeds[0] + 1:
+        which = f"seeds {seeds[0]} to {seeds[-1]}: "
+    else:
+        which = f"seeds {', '.join(map(str, seeds))}: " if seeds else ""
+    return (
+        f"{which}{made['physics']} physics, jax {made['versions'].get('jax', '?')}, "
+        f"collected at commit {made['commit'] or 'unknown'}"
+    )
+
+
 def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
     """What each curve was trained with, beyond the appendix's defaults."""
     lines = ["| task | agent | hyperparameters | trained with |", "|---|---|---|---|"]
@@ -338,12 +352,7 @@ def settings_table(shown: Mapping[str, Mapping[str, Results]]) -> str:
                 values.append("rewards normalized")
             if trial.num_envs != trials.NUM_ENVS:
                 values.append(f"{trial.num_envs} environments")
-            made = {
-                f"{made['physics']} physics, jax {made['versions'].get('jax', '?')}, "
-                f"collected at commit {made['commit'] or 'unknown'}"
-                for made in known.made
-            }
-            made_by = "; ".join(sorted(made))
+            made_by = "; ".join(sorted({_made_by(made) for made in known.made}))
             lines.append(
                 f"| {panel} | {curve} | {', '.join(values) or 'defaults'} | {made_by} |"
             )

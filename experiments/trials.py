@@ -180,9 +180,8 @@ def collect(trial: Trial, runs: pathlib.Path, results: pathlib.Path) -> None:
         if trained is None:
             continue
         new = dict(_rows(trial, trained))
-        by = _made(trained)
-        if not set(new) <= set(rows) and by not in made:
-            made.append(by)
+        if added := {int(seed) for point, seed in set(new) - set(rows)}:
+            _record(made, _made(trained), added)
         rows = new | rows
     if len(rows) > found:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -290,6 +289,16 @@ def _rows(
         yield (str(point), str(seed)), rows
 
 
+def _record(made: list[dict[str, Any]], by: Mapping[str, Any], seeds: set[int]) -> None:
+    """Add to what made a trial's results: by what and which seeds."""
+    for entry in made:
+        # None of results from before they were recorded.
+        if (before := entry.get("seeds")) and {**entry, **by} == entry:
+            entry["seeds"] = sorted(seeds.union(before))
+            return
+    made.append({**by, "seeds": sorted(seeds)})
+
+
 def _made(trained: sweep_tables.Trained) -> dict[str, Any]:
     described = run_folder.read(trained.folder)
     return {
@@ -320,7 +329,7 @@ class Results:
       seeds: their numbers, (seeds,): those of the trial's that every point has.
       env_steps: (rows,), at the end of each part of training.
       returns: (points, seeds, rows), NaN where no episode ended.
-      made: by what.
+      made: by what, and which seeds, where that is known.
     """
 
     trial: Trial

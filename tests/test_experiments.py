@@ -303,6 +303,10 @@ def test_runs_side_by_side_are_those_of_one_process(tmp_path):
     assert list(processes.train(lacking, tmp_path / "two", 2, flags)) == [trial]
     trials.collect(trial, tmp_path / "two", tmp_path / "other")
     assert trials.known(trial, tmp_path / "other") == {(0, 1)}
+    # What made which seeds is kept.
+    trials.collect(trial, tmp_path / "one", tmp_path / "other")
+    (made,) = trials.read(trial, tmp_path / "other").made
+    assert made["seeds"] == [0, 1] and made["physics"] == "mjx"
 
 
 def test_the_order_of_runs_is_that_in_which_a_sweep_is_cut():
@@ -715,6 +719,19 @@ def test_nothing_is_concluded_from_some_of_the_seeds():
     assert report.interval(np.arange(5.0)).startswith("2.0 [")
     shown["task"]["other"] = results(1.0)
     assert "ours better than other: yes on 1 of 1" in figure.conclusions(shown)
+
+
+def test_which_seeds_another_physics_made_is_said():
+    by = {"versions": {"jax": "1"}, "commit": "c"}
+    made = [
+        {"physics": "mjx", "seeds": [0, 1, 2, 3], **by},
+        {"physics": "mujoco", "seeds": [4, 6, 7], **by},
+        {"physics": "mjx", **by},
+    ]
+    known = dataclasses.replace(results(1.0), made=made)
+    *_, row = report.settings_table({"task": {"curve": known}}).splitlines()
+    rest = " physics, jax 1, collected at commit c"
+    assert f"| mjx{rest}; seeds 0 to 3: mjx{rest}; seeds 4, 6, 7: mujoco{rest} |" in row
 
 
 def test_panels_of_more_than_one_physics_are_named():
