@@ -22,6 +22,7 @@ from gasil_jax import (
     numpy_policy,
     output_file,
     policy,
+    resources,
     run_folder,
     train,
 )
@@ -277,6 +278,9 @@ def _main(arguments: Sequence[str] | None) -> None:
             "gymnasium is on: the run must be of a locomotion task, and stochastic "
             "must be off"
         )
+    if not options.gymnasium:
+        with command_line.input_checked():
+            resources.check_episodes(env, options.episodes, len(seeds), jax.devices())
     if options.out is not None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")

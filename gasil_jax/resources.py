@@ -14,6 +14,9 @@ from gasil_jax.config import Config
 # Measured with XLA's own account of eight programs, agents and shapes that differ: the
 # program needs 7 to 11 times a batch beside the states (tests/test_resources.py).
 _BATCHES = 8
+# By the same account an episode that is scored needs 7 (point mass) or 25 (hopper)
+# times its environment's state.
+_STATES = 7
 
 
 class Need(NamedTuple):
@@ -89,6 +92,30 @@ def check_memory(
             f"{_in_words(wanted)} of memory, {_in_words(one.memory)} each with "
             f"num_envs {config.num_envs} and batch_steps {config.batch_steps}, and "
             f"{_in_words(free)} are free: at most {free // one.memory} fit"
+        )
+
+
+def check_episodes(
+    env: Any, num_episodes: int, num_policies: int, devices: Sequence[jax.Device]
+) -> None:
+    """Refuse more episodes side by side than fit the devices.
+
+    Args:
+      env: one environment.
+      num_episodes: of each policy.
+      num_policies: scored at once.
+      devices: that they run on.
+
+    Raises:
+      ValueError: the numbers.
+    """
+    state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
+    wanted, free = _STATES * state * num_episodes * num_policies, available(devices)
+    if free is not None and wanted > free:
+        raise ValueError(
+            f"episodes is {num_episodes}: of {num_policies} policies side by side they "
+            f"need at least {_in_words(wanted)} of memory, and {_in_words(free)} are "
+            "free"
         )
 
 

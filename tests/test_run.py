@@ -76,8 +76,10 @@ def test_the_final_policies_are_scored(finished, capsys):
     assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "mean"]
     assert main([str(out.parent)]) == 2
     assert "must be the folder of a run" in capsys.readouterr().err
-    assert main([str(out), "--episodes", "0"]) == 2
-    assert "episodes is 0" in capsys.readouterr().err
+    for number, message in (("0", "it must be"), ("1000000000000", "GB of memory")):
+        assert main([str(out), "--episodes", number]) == 2
+        error = capsys.readouterr().err
+        assert f"episodes is {number}: " in error and message in error
 
 
 def test_a_used_folder_is_refused_and_left_alone(finished):
