@@ -2,6 +2,7 @@
 
 import contextlib
 import pathlib
+import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 
@@ -24,9 +25,15 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 
 def make_parent(path: pathlib.Path) -> None:
-    """Make the folder that it goes in; raises `InputError` if that can't be."""
+    """Make the folder that it goes in.
+
+    Raises:
+      InputError: that can't be, or it can't be written in.
+    """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=path.parent):
+            pass
     except OSError as error:
         raise InputError(unwritable(path, error)) from None
 
