@@ -34,6 +34,37 @@ FIGURES = (
     (humanoid.FIGURE, humanoid.make),
     (hyperparameters.FIGURE, hyperparameters.make),
 )
+# Each of the paper's claims, and what the figures say of it.
+_IN_SHORT = (
+    (
+        "Point mass: PPO settles early on a poorer policy, PPO+GASIL is slower at "
+        "first and ends higher",
+        "holds, both clearly, in a layout of 128 that was chosen for it",
+    ),
+    (
+        "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
+        "does not hold: it is clearly ahead of all three on ant alone",
+    ),
+    (
+        "Delayed rewards: it is ahead by a large margin on all tasks",
+        "holds on hopper and walker2d, of all three, with normalized rewards; on no "
+        "other task",
+    ),
+    (
+        "Noise: the gap to PPO is larger with it",
+        "in part, with normalized rewards: no gap is clear without noise, at 0.05 and "
+        "0.1 it is, at 0.5 nobody walks; that it grows is not clear",
+    ),
+    (
+        "Discriminator updates: one is too few, twenty are too many",
+        "twenty have least in all four panels, clearly in one; one is nowhere clearly "
+        "too few",
+    ),
+    (
+        "Buffer: 500 steps are too few, 5,000 too many",
+        "no order, in any of four panels",
+    ),
+)
 # Of all agents on the locomotion tasks, rewards as they are: by the reward's delay.
 _COMPARISONS = {random_search.DELAY: delayed_mujoco.FIGURE, 1: mujoco.FIGURE}
 
@@ -112,6 +143,11 @@ def _cell(known: Results | None) -> str:
     return report.interval(known.final[0]) + partly
 
 
+def _in_short() -> str:
+    rows = [f"| {claim} | {here} |" for claim, here in _IN_SHORT]
+    return "\n".join(["| The paper's claim | Here |", "| --- | --- |", *rows])
+
+
 def page() -> str:
     """Claim by claim, what was measured: Markdown, from the CSV files alone."""
     parts = [
@@ -119,6 +155,7 @@ def page() -> str:
         "Written by `python -m experiments.summary` from the CSV files in this folder. "
         "Numbers are interquartile means over seeds of the return in the last tenth of "
         "training, with 95% bootstrap intervals.",
+        _in_short(),
         "With what the tuned presets have: rewards [normalized]"
         "(normalized_rewards.md), but for ant's and humanoid's:",
         tuned(),
