@@ -208,6 +208,7 @@ def test_one_s_own_environment_is_built(tmp_path, monkeypatch):
         (_OWN.replace("2, 1, ", "3, 1, "), r"obs of its reset .*\(2,\), .* \(3,\)"),
         (_OWN.replace("action[0]", "action"), r"reward of its step .*\(1,\), .* \(\)"),
         (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
+        (_OWN.replace("obs=a", "obs={'x': a}"), r"step has the shape dict, .* \(2,\)"),
         (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
         (
             _OWN.replace("pipeline_state + 1", "pipeline_state + 0.5"),

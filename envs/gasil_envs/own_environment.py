@@ -83,7 +83,8 @@ def _check_states(name: str, env: Env) -> None:
     for state, where in ((first, "reset"), (then, "step")):
         wanted = {"obs": (env.observation_size,), "reward": (), "done": ()}
         for field, shape in wanted.items():
-            given = getattr(state, field).shape
+            value = getattr(state, field)
+            given = getattr(value, "shape", type(value).__name__)
             if given != shape:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} has the shape {given}, "
