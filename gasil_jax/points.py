@@ -4,13 +4,14 @@ import dataclasses
 import itertools
 import json
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gasil_jax.command_line import InputError, whole_number
 from gasil_jax.config import Config, Hyperparameters, nearest
+from gasil_jax.imitation import unused
 
 Point = Mapping[str, Any]
 
@@ -108,8 +109,23 @@ def _unknown_name(name: str) -> str:
     )
 
 
+def _refuse_unused(names: Iterable[str], agent: str) -> None:
+    idle = unused(agent)
+    for name in names:
+        if name in idle:
+            kinds = [x for x in (*_HYPERPARAMETERS, *_CONFIG) if x not in idle]
+            raise InputError(
+                f"{name} can't vary: agent {agent!r} does not look at it (one of "
+                f"{', '.join(kinds)})"
+            )
+
+
 def make_points(
-    grid: Sequence[str], random: int | None, points_file: str | None, seed: int
+    grid: Sequence[str],
+    random: int | None,
+    points_file: str | None,
+    seed: int,
+    agent: str,
 ) -> list[dict[str, Any]]:
     """The points of a sweep, without repetitions.
 
@@ -118,6 +134,8 @@ def make_points(
       random: draw so many of the grid's points, or of `PAPER_RANGES` without a grid.
       points_file: a file that lists them, in place of both.
       seed: of the draws.
+      agent: that is swept. What it does not look at is refused, and left out of
+        `PAPER_RANGES`.
 
     Raises:
       InputError: there is nothing to vary, or it can't.
@@ -125,8 +143,11 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file stands in place of grid and random")
-        return read_points(pathlib.Path(points_file))
+        points = read_points(pathlib.Path(points_file))
+        _refuse_unused((name for point in points for name in point), agent)
+        return points
     values: Mapping[str, tuple[Any, ...]] = parse_grid(grid)
+    _refuse_unused(values, agent)
     if random is None:
         if not values:
             raise InputError(
@@ -139,7 +160,9 @@ def make_points(
         ]
     if random < 1:
         raise InputError(f"random is {random}: it must be 1 or more")
-    values = values or PAPER_RANGES
+    values = values or {
+        name: PAPER_RANGES[name] for name in PAPER_RANGES if name not in unused(agent)
+    }
     every = list(itertools.product(*values.values()))
     if random > len(every):
         raise InputError(

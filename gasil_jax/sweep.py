@@ -176,7 +176,11 @@ def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
     """
     run.check(options)
     points = make_points(
-        options.grid, options.random, options.points_file, options.first_seed
+        options.grid,
+        options.random,
+        options.points_file,
+        options.first_seed,
+        options.config.agent,
     )
     for point in points:
         config = options.config.updated(point)

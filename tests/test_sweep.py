@@ -103,6 +103,9 @@ def test_points_from_a_file(tmp_path):
     ("arguments", "message"),
     [
         ("--grid alhpa=1", "did you mean 'alpha'"),
+        ("--agent ppo --grid alpha=1", "agent 'ppo' does not look at it (one of learn"),
+        ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not look at it"),
+        ("--agent ppo --random 5", "random is 5: it must be at most 4"),
         ("--grid alpha=1,big", "commas between"),
         ("--grid buffer_steps=1.5", "whole numbers"),
         ("--grid alpha=0.1,-1", "alpha is -1.0"),

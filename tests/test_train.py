@@ -10,6 +10,7 @@ import pytest
 
 import gasil_jax
 from gasil_jax import rollout
+from gasil_jax.imitation import AGENTS
 
 SMALL = gasil_jax.Config(
     total_steps=512,
@@ -63,6 +64,23 @@ def test_vmap_over_every_hyperparameter_equals_single_runs():
                 swept[name][i], single[name], rtol=1e-3, atol=1e-5, err_msg=name
             )
     assert np.all(swept["bonus"][0] > swept["bonus"][1])
+
+
+@pytest.mark.parametrize("agent", SELF_TAUGHT)
+def test_an_agent_looks_at_the_fields_that_it_says_and_at_no_others(agent):
+    env = gasil_jax.make_env("point_mass")
+    train = gasil_jax.make_train(env, SMALL.replace(agent=agent, total_steps=768))
+    plain = SMALL.hyperparameters.replace(
+        max_buffer_steps=100.0, max_discriminator_updates=2.0
+    )
+    every = {name for each in AGENTS.values() for name in each.fields}
+    swept = sorted(name for name in every if hasattr(plain, name))
+    changed = [plain.replace(**{name: getattr(plain, name) / 2}) for name in swept]
+    stacked = jax.tree.map(lambda *x: jnp.array(x), plain, *changed)
+    last, _ = jax.jit(jax.vmap(train, in_axes=(None, 0)))(jax.random.key(0), stacked)
+    (first, *_) = [np.asarray(x) for x in jax.tree.leaves(last.params)]
+    seen = {x for x, w in zip(swept, first[1:], strict=True) if (w != first[0]).any()}
+    assert seen == {name for name in AGENTS[agent].fields if name in swept}
 
 
 def test_it_trains_an_environment_of_brax():

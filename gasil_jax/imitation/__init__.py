@@ -22,4 +22,13 @@ def agents() -> tuple[str, ...]:
     return tuple(AGENTS)
 
 
-__all__ = ["AGENTS", "Imitation", "agents"]
+def unused(agent: str) -> frozenset[str]:
+    """Names of what other agents look at and this one does not, if it says so."""
+    mine = AGENTS[agent].fields
+    if mine is None:
+        return frozenset()
+    every = {name for each in AGENTS.values() for name in each.fields or ()}
+    return frozenset(every.difference(mine))
+
+
+__all__ = ["AGENTS", "Imitation", "agents", "unused"]

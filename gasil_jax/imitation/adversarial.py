@@ -216,15 +216,32 @@ def _check_expert(config: Config, observation_size: int, action_size: int) -> No
 _reward_and_bonus = lambda reward, bonus: reward + bonus
 _bonus_alone = lambda reward, bonus: bonus
 
+_FIELDS = (
+    *("alpha", "discriminator_learning_rate", "discriminator_entropy_coefficient"),
+    *("discriminator_updates", "max_discriminator_updates"),
+    "discriminator_minibatch_size",
+)
+_FIELDS_OF_BUFFER = (*_FIELDS, "buffer_steps", "max_buffer_steps")
+
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(
-    _init, _update_and_reward(_GOOD_TRAJECTORIES, _reward_and_bonus), leave_policy
+    _init,
+    _update_and_reward(_GOOD_TRAJECTORIES, _reward_and_bonus),
+    leave_policy,
+    fields=_FIELDS_OF_BUFFER,
 )
 #: -alpha log D alone (Algorithm 1).
 GASIL = Imitation(
-    _init, _update_and_reward(_GOOD_TRAJECTORIES, _bonus_alone), leave_policy
+    _init,
+    _update_and_reward(_GOOD_TRAJECTORIES, _bonus_alone),
+    leave_policy,
+    fields=_FIELDS_OF_BUFFER,
 )
 #: -alpha log D alone, D against expert trajectories (section 3.2).
 GAIL = Imitation(
-    _init, _update_and_reward(_EXPERT, _bonus_alone), leave_policy, _check_expert
+    _init,
+    _update_and_reward(_EXPERT, _bonus_alone),
+    leave_policy,
+    _check_expert,
+    _FIELDS,
 )

@@ -66,4 +66,12 @@ def _update_policy(
     return state, params, optimizer_state, {"behavior_cloning_loss": cloning_loss}
 
 
-PPO_BC = Imitation(no_state, plain_reward, _update_policy)
+PPO_BC = Imitation(
+    no_state,
+    plain_reward,
+    _update_policy,
+    fields=(
+        *("buffer_steps", "max_buffer_steps", "behavior_cloning_coefficient"),
+        *("behavior_cloning_updates", "behavior_cloning_minibatch_size"),
+    ),
+)

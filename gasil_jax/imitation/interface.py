@@ -69,6 +69,8 @@ class Imitation(NamedTuple):
       check: (config, observation size, action size), raises `ValueError` for what
         the agent can't run with, before anything compiles; default
         `check_without_expert`.
+      fields: of `Config` and `Hyperparameters` those that it looks at, PPO's apart:
+        a sweep of the others would change nothing. None where it does not say.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -80,6 +82,7 @@ class Imitation(NamedTuple):
         tuple[Any, Any, Any, Metrics],
     ]
     check: Callable[[Config, int, int], None] = check_without_expert
+    fields: tuple[str, ...] | None = None
 
 
 def leave_policy(

@@ -20,4 +20,4 @@ def plain_reward(
     return state, context.rollout.reward, {}
 
 
-PPO = Imitation(no_state, plain_reward, leave_policy)
+PPO = Imitation(no_state, plain_reward, leave_policy, fields=())

@@ -270,4 +270,12 @@ def _update_policy(
     return replay.replace(priority=priority), params, optimizer_state, metrics
 
 
-PPO_SIL = Imitation(_init, _update_and_reward, _update_policy)
+PPO_SIL = Imitation(
+    _init,
+    _update_and_reward,
+    _update_policy,
+    fields=(
+        *("sil_coefficient", "sil_value_coefficient", "sil_updates"),
+        *("sil_minibatch_size", "sil_buffer_steps"),
+    ),
+)
