@@ -37,7 +37,8 @@ the four agents are alike to the end. With dense rewards PPO hardly gains after 
 first million; PPO+BC and PPO+SIL go on learning and are clearly ahead of PPO+GASIL at
 the end, which ten seeds don't tell from PPO. The search that tuned them had a third of
 a million steps a run, in which the agents' best points were alike (450 to 464), so that
-another alpha may do better; the paper's schedule has too few seeds to say.""",
+another alpha may do better. The paper's schedule of alpha ends where the fixed one
+does: it begins when PPO has stopped learning.""",
     conclude=_conclude,
 )
 
