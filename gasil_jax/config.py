@@ -95,6 +95,9 @@ class Config:
       normalize_rewards: whether PPO's rewards are divided by the standard deviation of
         their running discounted sum (OpenAI baselines' ppo2). Alpha is in that unit
         then, not in the environment's. Agents gasil and gail have no such reward.
+      stagger_episodes: whether each environment's first episode begins at an age drawn
+        from the whole episode, so that a batch holds steps of all its parts. Without
+        it environments that never end early stay in lock-step for the whole run.
       expert: what GAIL imitates: an .npz file with arrays "observation" and
         "action", or "minari:" and the name of a data set.
       max_episode_steps: an episode is truncated after so many steps; None takes
@@ -122,6 +125,7 @@ class Config:
     clip_epsilon_schedule: Schedule = ()
     alpha_schedule: Schedule = ()
     normalize_rewards: bool = False
+    stagger_episodes: bool = True
     expert: str | None = None
     max_episode_steps: int | None = None
     hyperparameters: Hyperparameters = dataclasses.field(
@@ -192,8 +196,9 @@ _HYPERPARAMETER_RANGES = {
 
 _SCHEDULES = ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule")
 _SIZES = ("hidden_sizes", "discriminator_hidden_sizes")
+_SWITCHES = ("normalize_rewards", "stagger_episodes")
 _NOT_A_COUNT = (
-    *("agent", "normalize_rewards", "expert", "hyperparameters"),
+    *("agent", *_SWITCHES, "expert", "hyperparameters"),
     *_SCHEDULES,
 )
 
@@ -224,11 +229,9 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
                 raise ValueError(
                     f"{field.name} is {value}: it must be a whole number, 1 or more"
                 )
-    if not isinstance(config.normalize_rewards, bool):
-        raise ValueError(
-            f"normalize_rewards is {config.normalize_rewards!r}: it must be True or "
-            "False"
-        )
+    for name in _SWITCHES:
+        if not isinstance(value := getattr(config, name), bool):
+            raise ValueError(f"{name} is {value!r}: it must be True or False")
     for whole, part in (("batch_steps", "num_envs"), ("batch_steps", "minibatch_size")):
         total, size = getattr(config, whole), getattr(config, part)
         if total % size:

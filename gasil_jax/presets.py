@@ -5,10 +5,12 @@ A row overrides `Config`'s and `Hyperparameters`' defaults; a flag overrides a r
 the environments that it ran with. Four have normalized rewards
 (experiments/results/normalized_rewards.md), ant and humanoid rewards as they are
 (random_search.md): an alpha is of the unit that it was tuned in, so that another is
-wanted where a flag changes that. "paper" has what the appendix names for a task, with
-the defaults, which are the appendix's, for the rest.
+wanted where a flag changes that. "paper" has the paper's batch, one environment x 2,048
+steps, what the appendix names for a task, and the defaults, which are the appendix's,
+for the rest. One environment is slow: the cost of a step is shared by the seeds alone.
 """
 
+import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -99,10 +101,17 @@ _STRONG = {
 
 
 class Preset(NamedTuple):
-    """Rows for rewards that are given at every step, and for delayed ones."""
+    """Overrides by environment and agent, and those of every one.
+
+    Attributes:
+      dense: rows for rewards that are given at every step.
+      delayed: rows for delayed rewards.
+      every: what all tasks and agents have; a row overrides it.
+    """
 
     dense: Rows
     delayed: Rows
+    every: Overrides = types.MappingProxyType({})
 
 
 PRESETS: Mapping[str, Preset] = {
@@ -127,6 +136,8 @@ PRESETS: Mapping[str, Preset] = {
             },
         },
         {},
+        # The paper's horizon is 2,048 steps of one environment.
+        every={"num_envs": 1},
     ),
 }
 
@@ -140,7 +151,8 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
     """The configuration that runs of `agent` in `env` start from.
 
     Args:
-      env: environment's name; of one that has no row it is the defaults.
+      env: environment's name; of one that has no row it is the defaults and what the
+        preset gives to every task.
       agent: agent's name.
       name: one of `names()`.
       reward_delay: of the environment.
@@ -152,5 +164,6 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
         raise ValueError(unknown("preset", name, names()))
     if agent not in agents():
         raise ValueError(unknown("agent", agent, agents()))
-    rows = PRESETS[name].delayed if reward_delay > 1 else PRESETS[name].dense
-    return Config(agent=agent).updated(rows.get((env, agent), {}))
+    chosen = PRESETS[name]
+    rows = chosen.delayed if reward_delay > 1 else chosen.dense
+    return Config(agent=agent).updated({**chosen.every, **rows.get((env, agent), {})})

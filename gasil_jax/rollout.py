@@ -25,9 +25,11 @@ class Rollout(struct.PyTreeNode):
       truncated: bool (time, env), it was cut off and its value is bootstrapped.
       episode_return: float32 (time, env), sum of the true rewards up to here.
       discounted_return: float32 (time, env), sum of gamma^t reward up to here;
-        NaN from the first faulty step on.
+        NaN from the first faulty step on, and where the episode was cut short.
       episode_length: int32 (time, env), steps up to here.
       faulty: bool (time, env), the step gave a number that physics does not give.
+      cut_short: bool (time, env), the episode was truncated before it was as long as
+        an episode can be, because it began at a later age than 0.
     """
 
     observation: jax.Array
@@ -41,11 +43,20 @@ class Rollout(struct.PyTreeNode):
     discounted_return: jax.Array
     episode_length: jax.Array
     faulty: jax.Array
+    cut_short: jax.Array
 
     @property
     def ended(self) -> jax.Array:
         """The episode ended with this step, bool (time, env)."""
         return self.terminated | self.truncated
+
+    @property
+    def completed(self) -> jax.Array:
+        """A whole episode ended with this step, bool (time, env).
+
+        Its return is an episode's; that of one that was cut short is not.
+        """
+        return self.ended & ~self.cut_short
 
 
 class EnvironmentStates(struct.PyTreeNode):
@@ -57,6 +68,8 @@ class EnvironmentStates(struct.PyTreeNode):
       discounted_return: float32 (env,), sum of gamma^t reward so far.
       discount: float32 (env,), gamma^t.
       episode_length: int32 (env,), steps so far.
+      starting_age: int32 (env,), the age at which the running episode began: it is
+        truncated when this and its length make the limit. 0 but for first episodes.
     """
 
     state: Any
@@ -64,6 +77,7 @@ class EnvironmentStates(struct.PyTreeNode):
     discounted_return: jax.Array
     discount: jax.Array
     episode_length: jax.Array
+    starting_age: jax.Array
 
 
 def _cast(x: Any, dtype: Any) -> jax.Array:
@@ -77,9 +91,26 @@ def _strip_weak_types(tree: Any) -> Any:
     return jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), tree)
 
 
-def init(env: Any, key: jax.Array, num_envs: int) -> EnvironmentStates:
-    """Start an episode in each of `num_envs` environments. The key is consumed."""
+def init(
+    env: Any, key: jax.Array, num_envs: int, age_limit: int | None = None
+) -> EnvironmentStates:
+    """Start an episode in each of `num_envs` environments. The key is consumed.
+
+    Args:
+      env: a single environment with Brax's interface, not wrapped to reset itself.
+      key: draws the starts and the ages.
+      num_envs: how many environments.
+      age_limit: each first episode begins at an age drawn uniformly from
+        [0, age_limit); None begins all at age 0. Environments that begin together
+        stay together in a task that never ends early: each batch is then one thin
+        slice of the episode (Staggered Environment Resets, arXiv 2511.21011).
+    """
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    starting_age = jnp.zeros(num_envs, jnp.int32)
+    if age_limit is not None:
+        # The last of so many keys is the one that no environment is reset with.
+        age_key = jax.random.split(key, num_envs + 1)[-1]
+        starting_age = jax.random.randint(age_key, (num_envs,), 0, age_limit)
     # An array for each: one in two places could not be donated.
     return EnvironmentStates(
         state=_strip_weak_types(state),
@@ -87,6 +118,7 @@ def init(env: Any, key: jax.Array, num_envs: int) -> EnvironmentStates:
         discounted_return=jnp.zeros(num_envs, jnp.float32),
         discount=jnp.ones(num_envs, jnp.float32),
         episode_length=jnp.zeros(num_envs, jnp.int32),
+        starting_age=starting_age,
     )
 
 
@@ -121,6 +153,10 @@ def collect(
     `normalization.is_sound` refuses) terminates the episode with reward 0 and is
     reported in ``faulty``. An episode that is truncated here gets the reward that the
     environment still holds back, ``info["held_reward"]``.
+
+    A first episode that began at a later age than 0 is truncated like any other when
+    it reaches the limit, and marked in ``cut_short``: PPO learns from its steps, but
+    its return is not an episode's.
     """
     num_envs = environments.episode_length.shape[0]
     low, high = getattr(env, "action_range", (-1.0, 1.0))
@@ -148,8 +184,10 @@ def collect(
         cut_off = wrappers.truncated(stepped)
         done = stepped.done > 0
         terminated = (done & ~cut_off) | ~sound
-        truncated = ~terminated & (cut_off | (length >= max_episode_steps))
+        age = carry.starting_age + length
+        truncated = ~terminated & (cut_off | (age >= max_episode_steps))
         ended = terminated | truncated
+        cut_short = truncated & ~cut_off & (length < max_episode_steps)
         reward = stepped.reward + jnp.where(truncated, held, 0.0)
         reward = jnp.where(sound, reward, 0.0)
 
@@ -167,9 +205,10 @@ def collect(
             terminated=terminated,
             truncated=truncated,
             episode_return=episode_return,
-            discounted_return=discounted_return,
+            discounted_return=jnp.where(cut_short, jnp.nan, discounted_return),
             episode_length=length,
             faulty=~sound,
+            cut_short=cut_short,
         )
         select = lambda a, b: jnp.where(
             ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b
@@ -182,6 +221,7 @@ def collect(
             discounted_return=jnp.where(ended, 0.0, discounted_return),
             discount=jnp.where(ended, 1.0, carry.discount * gamma),
             episode_length=jnp.where(ended, 0, length),
+            starting_age=jnp.where(ended, 0, carry.starting_age),
         )
         return carry, transition
 

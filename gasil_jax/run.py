@@ -55,7 +55,8 @@ class Options:
         with the best returns.
       log: also to these, besides metrics.csv: tensorboard, wandb.
       preset: where the hyperparameters start from: tuned, by environment and agent,
-        or paper; flags override it.
+        or paper, with the paper's one environment a seed, which is several times
+        slower; flags override it.
       devices: host devices that the seeds are sharded over; default the cores.
       settings: of the environment.
       config: the algorithm.

@@ -84,6 +84,7 @@ def init(
     key, policy_key, value_key, env_key, imitation_key = jax.random.split(key, 5)
     observation_size, action_size = env.observation_size, env.action_size
     observation = jnp.zeros(observation_size)
+    episode_steps = max_episode_steps(env, config)
     policy, value = _networks(env, config)
     params = {
         "policy": policy.init(policy_key, observation),
@@ -99,11 +100,16 @@ def init(
             if config.normalize_rewards
             else None
         ),
-        environments=rollout.init(env, env_key, config.num_envs),
+        environments=rollout.init(
+            env,
+            env_key,
+            config.num_envs,
+            age_limit=episode_steps if config.stagger_episodes else None,
+        ),
         history=good_trajectories.init_history(
             config.num_envs,
             config.num_steps,
-            max_episode_steps(env, config),
+            episode_steps,
             observation_size,
             action_size,
         ),
@@ -123,7 +129,7 @@ def init(
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """One iteration of Algorithm 1: a batch of experience and the updates from it.
 
-    Returns the next state and a dict of float32 scalars. Means over the episodes
+    Returns the next state and a dict of float32 scalars. Means over the whole episodes
     that ended in the batch are NaN if none did.
     """
     imitate = AGENTS[config.agent]
@@ -149,8 +155,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         state.history,
         batch.observation,
         batch.action,
-        # No return of an episode with a faulty step is one.
-        jnp.where(batch.faulty, jnp.nan, batch.reward),
+        # No return of an episode with a faulty step, or of one cut short, is one.
+        jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
         batch.ended,
     )
     episodes = good_trajectories.ended_episodes(
@@ -247,14 +253,15 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         key=key,
         iteration=state.iteration + 1,
     )
-    mean_of_ended = lambda x: (
-        jnp.sum(jnp.where(batch.ended, x, 0)) / jnp.sum(batch.ended)
+    completed = batch.completed
+    mean_of_completed = lambda x: (
+        jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
     )
     metrics = {
         "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
-        "episode_return": mean_of_ended(batch.episode_return),
-        "episode_length": mean_of_ended(batch.episode_length),
-        "episodes": jnp.sum(batch.ended),
+        "episode_return": mean_of_completed(batch.episode_return),
+        "episode_length": mean_of_completed(batch.episode_length),
+        "episodes": jnp.sum(completed),
         "faulty_steps": jnp.sum(batch.faulty),
         "skipped_updates": ~healthy,
         "good_return": good_trajectories.mean_return(buffer),

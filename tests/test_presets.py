@@ -53,6 +53,13 @@ def test_flags_override_the_preset():
     assert config.discriminator_updates == 20
 
 
+@pytest.mark.parametrize("env", ["walker2d", "point_mass"])
+def test_the_papers_batch_is_of_one_environment(env):
+    config = parse(env, "--preset", "paper")
+    assert (config.num_envs, config.num_steps) == (1, 2048)
+    assert parse(env, "--preset", "paper", "--num-envs", "8").num_envs == 8
+
+
 def test_the_papers_rule_for_humanoid():
     config = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper")
     assert config.hyperparameters.alpha == 0.02

@@ -1,0 +1,167 @@
+"""First episodes that begin at a drawn age, so that environments are out of step."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import Env, State
+
+import gasil_jax
+from gasil_envs import wrappers
+from gasil_jax import rollout
+
+LIMIT = 10
+
+
+class Clock(Env):
+    """Observes the steps of the episode; each costs 1, so a short episode is better.
+
+    Args:
+      last: the episode terminates by itself after so many steps.
+    """
+
+    observation_size, action_size, backend = 1, 1, "none"
+
+    def __init__(self, last=10**6):
+        self.last = last
+
+    def reset(self, rng):
+        return State(None, jnp.zeros(1), jnp.float32(0), jnp.float32(0))
+
+    def step(self, state, action):
+        obs = state.obs + 1
+        done = (obs[0] >= self.last).astype(jnp.float32)
+        return state.replace(obs=obs, reward=jnp.float32(-1), done=done)
+
+
+def make(limit=LIMIT, delay=1, **arguments):
+    env = wrappers.EpisodeLimit(Clock(**arguments), limit)
+    return env if delay == 1 else wrappers.RewardDelay(env, delay)
+
+
+def collect(env, num_envs, num_steps, limit=LIMIT, stagger=True):
+    environments = rollout.init(
+        env, jax.random.key(1), num_envs, age_limit=limit if stagger else None
+    )
+    policy = lambda observation: (jnp.zeros((num_envs, 1)), jnp.zeros(1))
+    batch = rollout.collect(
+        env,
+        policy,
+        environments,
+        jax.random.key(2),
+        num_steps=num_steps,
+        max_episode_steps=limit,
+        gamma=1.0,
+    )[1]
+    return np.asarray(environments.starting_age), batch
+
+
+def test_ages_are_uniform_over_the_episode_and_of_the_seeds_own_key():
+    env = make()
+    init = functools.partial(rollout.init, env, num_envs=8192, age_limit=1000)
+    keys = jax.vmap(jax.random.key)(jnp.arange(3))
+    ages = np.asarray(jax.vmap(lambda key: init(key).starting_age)(keys))
+    assert ages.min() >= 0 and ages.max() < 1000
+    # Each tenth has a tenth of them, to within five standard deviations.
+    share = np.array([np.bincount(row // 100, minlength=10) for row in ages]) / 8192
+    np.testing.assert_allclose(share, 0.1, atol=5 * np.sqrt(0.09 / 8192))
+    np.testing.assert_array_equal(ages[2], init(keys[2]).starting_age)
+    assert (ages[0] != ages[1]).any()
+
+
+def test_ages_leave_the_starts_as_they_are():
+    env = gasil_jax.make_env("point_mass", obs_noise=0.1)
+    key = jax.random.key(0)
+    plain, staggered = rollout.init(env, key, 5), rollout.init(env, key, 5, 50)
+    np.testing.assert_array_equal(plain.state.obs, staggered.state.obs)
+    assert not plain.starting_age.any() and staggered.starting_age.any()
+
+
+def test_a_first_episode_is_cut_at_the_limit_and_bootstrapped():
+    ages, batch = collect(make(), num_envs=16, num_steps=3 * LIMIT)
+    for env, age in enumerate(ages):
+        (ends,) = np.nonzero(np.asarray(batch.ended[:, env]))
+        first = LIMIT - age - 1
+        np.testing.assert_array_equal(ends, np.arange(first, 3 * LIMIT, LIMIT))
+        cut = np.asarray(batch.cut_short[:, env])
+        assert cut[first] == (age > 0) and cut.sum() == (age > 0)
+        assert batch.truncated[first, env] and not batch.terminated[first, env]
+        # The next episode begins afresh and is whole.
+        if age > 0:
+            assert batch.episode_length[first + LIMIT, env] == LIMIT
+            assert batch.observation[first + 1, env, 0] == 0
+    assert len(set(ages.tolist())) > 5
+
+
+def test_an_episode_that_ends_by_itself_before_it_is_cut_is_whole():
+    ages, batch = collect(make(last=4), num_envs=32, num_steps=4)
+    early = np.asarray(batch.completed[-1])
+    np.testing.assert_array_equal(early, LIMIT - ages >= 4)
+    assert early.any() and not early.all()
+    np.testing.assert_array_equal(batch.terminated[-1], early)
+    assert (np.asarray(batch.episode_length[-1])[early] == 4).all()
+
+
+@pytest.mark.parametrize("agent", ["ppo+gasil", "ppo+sil"])
+def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
+    """Each would prefer it: its return is higher than that of a whole episode."""
+    env = make()
+    config = gasil_jax.Config(
+        agent=agent,
+        total_steps=3 * 64,
+        num_envs=8,
+        batch_steps=64,
+        num_epochs=1,
+        hidden_sizes=(4,),
+        discriminator_hidden_sizes=(4,),
+        buffer_steps=30,
+        sil_buffer_steps=300,
+        sil_minibatch_size=8,
+        hyperparameters=gasil_jax.Hyperparameters(gamma=1.0),
+    )
+    train = lambda config: jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    state, metrics = train(config)
+    assert np.nansum(metrics["episodes"]) > 0
+    ended = np.asarray(metrics["episodes"]) > 0
+    assert (np.asarray(metrics["episode_length"])[ended] == LIMIT).all()
+    assert (np.asarray(metrics["episode_return"])[ended] == -LIMIT).all()
+    size = int(state.good_trajectories.size)
+    assert size == 30
+    np.testing.assert_array_equal(state.good_trajectories.return_[:size], -LIMIT)
+    if agent == "ppo+sil":
+        # A whole episode's steps have the returns -1 to -LIMIT, each as often.
+        replay = state.imitation
+        returns = -np.asarray(replay.return_)[np.asarray(replay.priority) > 0]
+        counts = np.bincount(returns.astype(int), minlength=LIMIT + 1)[1:]
+        assert (counts == counts[0]).all() and counts[0] > 0
+        assert counts[0] == np.nansum(metrics["episodes"])
+    # All began together: more whole episodes, none cut.
+    _, together = train(config.replace(stagger_episodes=False))
+    assert np.nansum(together["episodes"]) == 8 * (24 // LIMIT)
+
+
+@pytest.mark.parametrize("delay", [4, 100])
+def test_a_delayed_reward_is_paid_once_where_the_episode_is_cut(delay):
+    _, batch = collect(make(delay=delay), num_envs=16, num_steps=LIMIT)
+    reward, ended = np.asarray(batch.reward), np.asarray(batch.ended)
+    for env in range(16):
+        (first, *_) = np.flatnonzero(ended[:, env])
+        given = reward[: first + 1, env]
+        assert given.sum() == -(first + 1)
+        assert np.count_nonzero(given) == -(-(first + 1) // delay)
+
+
+def test_each_batch_holds_nearly_all_parts_of_an_episode():
+    limit, num_envs, num_steps = 1000, 32, 64
+    env = make(limit)
+    for stagger, low, high in ((True, 0.9, 1.0), (False, 0.0, 0.1)):
+        ages, batch = collect(env, num_envs, 30 * num_steps, limit, stagger)
+        # The environment's own clock does not know at which age it began.
+        length = np.asarray(batch.episode_length)
+        first = np.cumsum(np.asarray(batch.ended), axis=0) - batch.ended == 0
+        age = length - 1 + np.where(first, ages, 0)
+        for part in np.split(age, 30):
+            share = len(np.unique(part // 25)) / (limit // 25)
+            assert low <= share <= high
