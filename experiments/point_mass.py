@@ -77,8 +77,8 @@ def config(agent: str) -> gasil_jax.Config:
     """The configuration of an agent's trial."""
     (trial,) = (trial for trial in make() if trial.agent == agent)
     base = presets.preset("point_mass", agent, "paper")
-    return base.replace(total_steps=STEPS, num_envs=trials.NUM_ENVS).updated(
-        trial.points[0]
+    return base.replace(total_steps=STEPS, num_envs=trials.NUM_ENVS).replace(
+        **trial.points[0]
     )
 
 

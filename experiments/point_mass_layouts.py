@@ -168,8 +168,8 @@ def _stack(trees: Sequence[Any]) -> Any:
 
 def configuration(agent: str, options: Options) -> Config:
     """What an agent's runs have in common."""
-    return presets.preset("point_mass", agent, "tuned").updated(
-        {
+    return presets.preset("point_mass", agent, "tuned").replace(
+        **{
             "total_steps": options.total_steps,
             "discriminator_updates": options.discriminator_updates,
         }

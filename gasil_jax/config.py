@@ -1,15 +1,15 @@
 """What a run is: `Config` (static, decides shapes) and `Hyperparameters` (traced).
 
 Defaults are the paper's appendix where it gives a value, else OpenAI baselines', on
-which the paper's code was built.
+which the paper's code was built. Each field stands beside the values that it may have.
 """
 
 import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from flax import struct
 
@@ -19,118 +19,158 @@ from flax import struct
 Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
-class Hyperparameters(struct.PyTreeNode):
-    """Every float of the algorithms: a pytree, so a sweep is a `vmap` over leaves.
+class Range(NamedTuple):
+    """The finite numbers that a field may have.
 
     Attributes:
-      learning_rate: Adam's step size for policy and value.
-      learning_rate_decay: the share of the learning rate that is gone, linearly,
-        at the end of training: 1 anneals to 0, 0 keeps it constant.
-      gamma: discount factor.
-      gae_lambda: the lambda of generalized advantage estimation.
-      clip_epsilon: PPO's clip range of the probability ratio.
-      entropy_coefficient: the paper's lambda, weight of the policy's entropy.
-      value_coefficient: weight of the squared error of the value. The value has a
-        network, gradient clip and Adam of its own, so it hardly matters.
-      max_grad_norm: gradients are scaled down to this global norm, the policy's
-        and the value's each for itself.
-      alpha: scale of the discriminator's reward (paper, section 4.3).
-      discriminator_learning_rate: Adam's step size for the discriminator.
-      discriminator_entropy_coefficient: weight of the entropy of D's output.
-      behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
-      sil_coefficient: weight of the loss of PPO+SIL.
-      sil_value_coefficient: weight of the value's part in it.
-      max_buffer_steps: of `Config.buffer_steps` so many are filled at most; None is
-        all of them. Traced, so that one program sweeps what else decides shapes.
-      max_discriminator_updates: the same of `Config.discriminator_updates`; the
-        others are computed too, and not used.
+      low: the lowest.
+      high: the highest.
+      excludes_low: whether the lowest itself is not allowed.
+      whole: whether only whole numbers are.
     """
 
-    learning_rate: float = 3e-4
-    learning_rate_decay: float = 1.0
-    gamma: float = 0.99
-    gae_lambda: float = 0.95
-    clip_epsilon: float = 0.2
-    entropy_coefficient: float = 0.0
-    value_coefficient: float = 1.0
-    max_grad_norm: float = 0.5
-    alpha: float = 0.1
-    discriminator_learning_rate: float = 1e-4
-    discriminator_entropy_coefficient: float = 1e-3
-    behavior_cloning_coefficient: float = 0.1
-    sil_coefficient: float = 0.1
-    sil_value_coefficient: float = 0.01
-    max_buffer_steps: float | None = None
-    max_discriminator_updates: float | None = None
+    low: float
+    high: float = math.inf
+    excludes_low: bool = False
+    whole: bool = False
+
+    def __contains__(self, value: object) -> bool:
+        """Whether a number, no bool, is in the range."""
+        # NumPy's whole numbers are no int, and a bool is one.
+        kind = numbers.Integral if self.whole else numbers.Real
+        if not isinstance(value, kind) or isinstance(value, bool):
+            return False
+        number = float(value)
+        above = number > self.low if self.excludes_low else number >= self.low
+        return above and number <= self.high and math.isfinite(number)
+
+    def __str__(self) -> str:
+        if self.whole:
+            return f"a whole number, {self.low:g} or more"
+        least = f"{'more than ' * self.excludes_low}{self.low:g}"
+        least += "" if self.excludes_low else " or more"
+        most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"
+        return f"{least} and {most}"
+
+
+def _number(
+    default: float, low: float, high: float = math.inf, excludes_low: bool = False
+) -> Any:
+    return _field(default, Range(low, high, excludes_low))
+
+
+def _count(default: Any) -> Any:
+    return _field(default, Range(1, whole=True))
+
+
+def _field(default: Any, allowed: Range) -> Any:
+    return dataclasses.field(default=default, metadata={"range": allowed})
+
+
+class Hyperparameters(struct.PyTreeNode):
+    """Every number that can be swept: a pytree, so a sweep is a `vmap` over leaves.
+
+    Two counts are among them. The configuration's own value of these decides shapes and
+    is the most that a run can have; a member of a sweep may have less.
+    """
+
+    learning_rate: float = _number(3e-4, 0.0, excludes_low=True)
+    """Adam's step size for policy and value."""
+    learning_rate_decay: float = _number(1.0, 0.0, 1.0)
+    """Share of the learning rate that is gone, linearly, at the end of training: 1
+    anneals to 0, 0 keeps it constant."""
+    gamma: float = _number(0.99, 0.0, 1.0)
+    """Discount factor."""
+    gae_lambda: float = _number(0.95, 0.0, 1.0)
+    """The lambda of generalized advantage estimation."""
+    clip_epsilon: float = _number(0.2, 0.0, excludes_low=True)
+    """PPO's clip range of the probability ratio."""
+    entropy_coefficient: float = _number(0.0, 0.0)
+    """The paper's lambda, weight of the policy's entropy."""
+    value_coefficient: float = _number(1.0, 0.0)
+    """Weight of the squared error of the value. The value has a network, gradient clip
+    and Adam of its own, so it hardly matters."""
+    max_grad_norm: float = _number(0.5, 0.0, excludes_low=True)
+    """Gradients are scaled down to this global norm, the policy's and the value's each
+    for itself."""
+    alpha: float = _number(0.1, 0.0)
+    """Scale of the discriminator's reward (paper, section 4.3)."""
+    discriminator_learning_rate: float = _number(1e-4, 0.0, excludes_low=True)
+    """Adam's step size for the discriminator."""
+    discriminator_updates: int = _count(5)
+    """Gradient steps of the discriminator an iteration."""
+    discriminator_entropy_coefficient: float = _number(1e-3, 0.0)
+    """Weight of the entropy of D's output."""
+    buffer_steps: int = _count(1000)
+    """Steps that the good-trajectory buffer keeps."""
+    behavior_cloning_coefficient: float = _number(0.1, 0.0)
+    """Weight of the cloning loss of PPO+BC."""
+    sil_coefficient: float = _number(0.1, 0.0)
+    """Weight of the loss of PPO+SIL."""
+    sil_value_coefficient: float = _number(0.01, 0.0)
+    """Weight of the value's part in it."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that changes shapes, loop counts or the program; hashable.
-
-    Attributes:
-      agent: name of the agent, see `gasil_jax.agents()`.
-      total_steps: environment steps a seed; rounded up to whole batches.
-      num_envs: environments a seed steps at once.
-      batch_steps: environment steps in an iteration, over all environments
-        (the paper's horizon).
-      num_epochs: passes of PPO over a batch.
-      minibatch_size: steps in one gradient step of PPO.
-      hidden_sizes: widths of the tanh layers of the policy and of the value.
-      buffer_steps: capacity of the good-trajectory buffer, in steps.
-      discriminator_updates: gradient steps of the discriminator an iteration.
-      discriminator_minibatch_size: policy steps, and as many good steps, in each.
-      discriminator_hidden_sizes: widths of the discriminator's tanh layers.
-      behavior_cloning_updates: gradient steps of PPO+BC's own an iteration.
-      behavior_cloning_minibatch_size: good steps in each.
-      sil_updates: gradient steps of PPO+SIL's own an iteration.
-      sil_minibatch_size: replayed steps in each.
-      sil_buffer_steps: capacity of PPO+SIL's replay, in steps.
-      learning_rate_schedule: a factor over env steps that the learning rate is
-        multiplied by: STEPS FACTOR pairs, linear between them (from Python also any
-        Optax schedule).
-      clip_epsilon_schedule: the same for PPO's clip range.
-      alpha_schedule: the same for alpha. The paper's rule for Humanoid, 0 for 2M
-        steps and then up to alpha until 3M, is ((2e6, 0), (3e6, 1)).
-      normalize_rewards: whether PPO's rewards are divided by the standard deviation of
-        their running discounted sum (OpenAI baselines' ppo2). Alpha is in that unit
-        then, not in the environment's. Agents gasil and gail have no such reward.
-      stagger_episodes: whether each environment's first episode begins at an age drawn
-        from the whole episode, so that a batch holds steps of all its parts. Without
-        it environments that never end early stay in lock-step for the whole run.
-      expert: what GAIL imitates: an .npz file with arrays "observation" and
-        "action", or "minari:" and the name of a data set.
-      max_episode_steps: an episode is truncated after so many steps; None takes
-        the environment's own limit, or 1000 if it has none.
-      hyperparameters: the floats; `make_train` can replace them under a trace.
-    """
+    """Everything that changes shapes, loop counts or the program; hashable."""
 
     agent: str = "ppo+gasil"
-    total_steps: int = 1_000_000
-    num_envs: int = 16
-    batch_steps: int = 2048
-    num_epochs: int = 10
-    minibatch_size: int = 64
-    hidden_sizes: tuple[int, ...] = (64, 64)
-    buffer_steps: int = 1000
-    discriminator_updates: int = 5
-    discriminator_minibatch_size: int = 128
-    discriminator_hidden_sizes: tuple[int, ...] = (100, 100)
-    behavior_cloning_updates: int = 10
-    behavior_cloning_minibatch_size: int = 64
-    sil_updates: int = 10
-    sil_minibatch_size: int = 512
-    sil_buffer_steps: int = 50_000
+    """Name of the agent, see `gasil_jax.agents()`."""
+    total_steps: int = _count(1_000_000)
+    """Environment steps of a seed; rounded up to whole batches."""
+    num_envs: int = _count(16)
+    """Environments that a seed steps at once."""
+    batch_steps: int = _count(2048)
+    """Environment steps in an iteration, over all environments (the paper's
+    horizon)."""
+    num_epochs: int = _count(10)
+    """Passes of PPO over a batch."""
+    minibatch_size: int = _count(64)
+    """Steps in one gradient step of PPO."""
+    hidden_sizes: tuple[int, ...] = _count((64, 64))
+    """Widths of the tanh layers of the policy and of the value."""
+    discriminator_minibatch_size: int = _count(128)
+    """Policy steps, and as many good steps, in a gradient step of the
+    discriminator."""
+    discriminator_hidden_sizes: tuple[int, ...] = _count((100, 100))
+    """Widths of the discriminator's tanh layers."""
+    behavior_cloning_updates: int = _count(10)
+    """Gradient steps of PPO+BC's own an iteration."""
+    behavior_cloning_minibatch_size: int = _count(64)
+    """Good steps in each."""
+    sil_updates: int = _count(10)
+    """Gradient steps of PPO+SIL's own an iteration."""
+    sil_minibatch_size: int = _count(512)
+    """Replayed steps in each."""
+    sil_buffer_steps: int = _count(50_000)
+    """Capacity of PPO+SIL's replay, in steps."""
     learning_rate_schedule: Schedule = ()
+    """Factor over environment steps that the learning rate is multiplied by: STEPS
+    FACTOR pairs, linear between them (from Python also any Optax schedule)."""
     clip_epsilon_schedule: Schedule = ()
+    """The same for PPO's clip range."""
     alpha_schedule: Schedule = ()
+    """The same for alpha. The paper's rule for Humanoid, 0 for 2M steps and then up to
+    alpha until 3M, is ((2e6, 0), (3e6, 1))."""
     normalize_rewards: bool = False
+    """Whether PPO's rewards are divided by the standard deviation of their running
+    discounted sum (OpenAI baselines' ppo2). Alpha is in that unit then, not in the
+    environment's. Agents gasil and gail have no such reward."""
     stagger_episodes: bool = True
+    """Whether each environment's first episode begins at an age drawn from the whole
+    episode, so that a batch holds steps of all its parts. Without it environments that
+    never end early stay in lock-step for the whole run."""
     expert: str | None = None
-    max_episode_steps: int | None = None
+    """What GAIL imitates: an .npz file with arrays "observation" and "action", or
+    "minari:" and the name of a data set."""
+    max_episode_steps: int | None = _count(None)
+    """An episode is truncated after so many steps; None takes the environment's own
+    limit, or 1000 if it has none."""
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
     )
+    """The numbers that can be swept; `make_train` can replace them under a trace."""
 
     @property
     def num_steps(self) -> int:
@@ -148,62 +188,38 @@ class Config:
         return math.ceil(self.total_steps / self.batch_steps)
 
     def replace(self, **changes: Any) -> "Config":
-        """A copy with some fields changed."""
+        """A copy with some fields changed, of its own or of its hyperparameters."""
+        own = {field.name for field in dataclasses.fields(self)}
+        swept = {name: changes.pop(name) for name in set(changes) - own}
+        if swept:
+            hyperparameters = changes.get("hyperparameters", self.hyperparameters)
+            changes["hyperparameters"] = hyperparameters.replace(**swept)
         return dataclasses.replace(self, **changes)
 
-    def updated(self, values: Mapping[str, Any]) -> "Config":
-        """A copy with some values changed, of its own fields or of hyperparameters."""
-        own = {field.name for field in dataclasses.fields(self)}
-        floats = {name: x for name, x in values.items() if name not in own}
-        changes = {name: x for name, x in values.items() if name in own}
-        hyperparameters = self.hyperparameters.replace(**floats)
-        return self.replace(hyperparameters=hyperparameters, **changes)
 
-
-def nearest(name: str, allowed: tuple[str, ...]) -> str:
+def nearest(name: str, allowed: Sequence[str]) -> str:
     """The allowed name that is most like `name`."""
     return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
 
 
-def unknown(kind: str, name: str, allowed: tuple[str, ...]) -> str:
-    """What to say of a name that is none of the allowed ones."""
+def unknown(kind: str, name: str, allowed: Sequence[str]) -> str:
+    """The error message for a name that is none of the allowed ones."""
     return (
         f"{kind} {name!r} is unknown: did you mean {nearest(name, allowed)!r}? "
         f"(one of {', '.join(allowed)})"
     )
 
 
-# name -> (lowest, highest, whether the lowest itself is allowed)
-_HYPERPARAMETER_RANGES = {
-    "learning_rate": (0.0, math.inf, False),
-    "learning_rate_decay": (0.0, 1.0, True),
-    "gamma": (0.0, 1.0, True),
-    "gae_lambda": (0.0, 1.0, True),
-    "clip_epsilon": (0.0, math.inf, False),
-    "entropy_coefficient": (0.0, math.inf, True),
-    "value_coefficient": (0.0, math.inf, True),
-    "max_grad_norm": (0.0, math.inf, False),
-    "alpha": (0.0, math.inf, True),
-    "discriminator_learning_rate": (0.0, math.inf, False),
-    "discriminator_entropy_coefficient": (0.0, math.inf, True),
-    "behavior_cloning_coefficient": (0.0, math.inf, True),
-    "sil_coefficient": (0.0, math.inf, True),
-    "sil_value_coefficient": (0.0, math.inf, True),
-    "max_buffer_steps": (1.0, math.inf, True),
-    "max_discriminator_updates": (1.0, math.inf, True),
-}
+def ranges(kind: type) -> Mapping[str, Range]:
+    """Which numbers each field of `Config` or `Hyperparameters` may have, by name."""
+    return {
+        field.name: field.metadata["range"]
+        for field in dataclasses.fields(kind)
+        if "range" in field.metadata
+    }
 
 
-_SCHEDULES = ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule")
-_SIZES = ("hidden_sizes", "discriminator_hidden_sizes")
-_SWITCHES = ("normalize_rewards", "stagger_episodes")
-_NOT_A_COUNT = (
-    *("agent", *_SWITCHES, "expert", "hyperparameters"),
-    *_SCHEDULES,
-)
-
-
-def validate(config: Config, agents: tuple[str, ...]) -> None:
+def validate(config: Config, agents: Sequence[str]) -> None:
     """Raise `ValueError`, naming the value and what is allowed, for a bad config.
 
     Args:
@@ -213,59 +229,58 @@ def validate(config: Config, agents: tuple[str, ...]) -> None:
     """
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))
-    for field in dataclasses.fields(config):
-        value = getattr(config, field.name)
-        if field.name in _NOT_A_COUNT:
-            continue
-        if value is None and field.name == "max_episode_steps":
-            continue
-        sizes = field.name in _SIZES
-        if sizes and not isinstance(value, tuple):
-            raise ValueError(f"{field.name} is {value!r}: it must be a tuple of sizes")
-        for number in value if sizes else (value,):
-            # A bool is one too, and NumPy's are not int.
-            is_whole = isinstance(number, numbers.Integral) and number is not True
-            if not is_whole or int(number) < 1:
-                raise ValueError(
-                    f"{field.name} is {value}: it must be a whole number, 1 or more"
-                )
-    for name in _SWITCHES:
+    _validate_sizes(config)
+    for name in ("normalize_rewards", "stagger_episodes"):
         if not isinstance(value := getattr(config, name), bool):
             raise ValueError(f"{name} is {value!r}: it must be True or False")
-    for whole, part in (("batch_steps", "num_envs"), ("batch_steps", "minibatch_size")):
-        total, size = getattr(config, whole), getattr(config, part)
-        if total % size:
-            small = [n for n in range(1, math.isqrt(total) + 1) if total % n == 0]
-            divisors = small + [total // n for n in reversed(small)]
-            closest = min(divisors, key=lambda n: abs(n - size))
-            raise ValueError(
-                f"{part} is {size}, which does not divide {whole} {total}: "
-                f"the nearest that does is {closest}"
-            )
-    for name in _SCHEDULES:
-        points = getattr(config, name)
-        if callable(points):
-            continue
-        if not all(isinstance(point, tuple) and len(point) == 2 for point in points):
-            raise ValueError(f"{name} is {points}: it must be (steps, factor) points")
-        steps = [point[0] for point in points]
-        factors = [point[1] for point in points]
-        if steps != sorted(set(steps)) or any(
-            not (math.isfinite(number) and number >= 0) for number in steps + factors
-        ):
-            raise ValueError(
-                f"{name} is {points}: it must be (steps, factor) points, all 0 or "
-                "more, steps increasing"
-            )
-    for name, (low, high, closed) in _HYPERPARAMETER_RANGES.items():
+    for name in ("num_envs", "minibatch_size"):
+        _validate_divides(name, getattr(config, name), config.batch_steps)
+    for name in ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule"):
+        _validate_schedule(name, getattr(config, name))
+    for name, allowed in ranges(Hyperparameters).items():
         value = getattr(config.hyperparameters, name)
         if isinstance(value, str):
             raise ValueError(f"{name} is {value!r}: it must be a number")
-        if not isinstance(value, numbers.Real):
+        if isinstance(value, numbers.Real) and value not in allowed:
+            raise ValueError(f"{name} is {value}: it must be {allowed}")
+
+
+def _validate_sizes(config: Config) -> None:
+    for name, allowed in ranges(Config).items():
+        value = getattr(config, name)
+        if value is None and name == "max_episode_steps":
             continue
-        number = float(value)
-        above = number >= low if closed else number > low
-        if not (above and number <= high and math.isfinite(number)):
-            least = f"{low:g} or more" if closed else f"more than {low:g}"
-            most = "finite" if math.isinf(high) else f"at most {high:g}"
-            raise ValueError(f"{name} is {value}: it must be {least} and {most}")
+        is_list = name.endswith("_sizes") or name == "hidden_sizes"
+        if is_list and not isinstance(value, tuple):
+            raise ValueError(f"{name} is {value!r}: it must be a tuple of sizes")
+        if any(number not in allowed for number in (value if is_list else (value,))):
+            raise ValueError(f"{name} is {value}: it must be {allowed}")
+
+
+def _validate_divides(name: str, size: int, batch_steps: int) -> None:
+    if batch_steps % size == 0:
+        return
+    root = math.isqrt(batch_steps)
+    small = [n for n in range(1, root + 1) if batch_steps % n == 0]
+    divisors = [*small, *(batch_steps // n for n in reversed(small))]
+    closest = min(divisors, key=lambda n: abs(n - size))
+    raise ValueError(
+        f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
+        f"the nearest that does is {closest}"
+    )
+
+
+def _validate_schedule(name: str, points: Schedule) -> None:
+    if callable(points):
+        return
+    if not all(isinstance(point, tuple) and len(point) == 2 for point in points):
+        raise ValueError(f"{name} is {points}: it must be (steps, factor) points")
+    steps = [point[0] for point in points]
+    factors = [point[1] for point in points]
+    if steps != sorted(set(steps)) or any(
+        not (math.isfinite(number) and number >= 0) for number in steps + factors
+    ):
+        raise ValueError(
+            f"{name} is {points}: it must be (steps, factor) points, all 0 or "
+            "more, steps increasing"
+        )

@@ -65,7 +65,7 @@ def evaluate(
 
     def act(observation: jax.Array, key: jax.Array) -> jax.Array:
         observation = normalization.normalize(state.normalizer, observation)
-        mean, log_std = network.apply(state.params["policy"], observation)
+        mean, log_std = network.apply(state.actor_critic.policy.params, observation)
         noise = jax.random.normal(key, mean.shape, mean.dtype)
         action = mean if deterministic else mean + jnp.exp(log_std) * noise
         return jnp.clip(action, low, high)

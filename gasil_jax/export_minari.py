@@ -175,7 +175,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         options.run, options.checkpoint, options.point, options.seed
     )
     limit = train.max_episode_steps(env, config)
-    most = states.hyperparameters.max_buffer_steps
+    most = states.hyperparameters.buffer_steps
     buffers = jax.device_get((states.good_trajectories, most))
     members = [batch.member(buffers, place) for place in range(len(seeds))]
     found = [

@@ -1,6 +1,5 @@
 """The points of a sweep: hyperparameters, and counts of `Config`, by name."""
 
-import dataclasses
 import itertools
 import json
 import pathlib
@@ -10,18 +9,18 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.command_line import InputError, whole_number
-from gasil_jax.config import Config, Hyperparameters, nearest
+from gasil_jax.config import Config, Hyperparameters, nearest, ranges
 from gasil_jax.imitation import unused
 
 Point = Mapping[str, Any]
 
-_HYPERPARAMETERS = {
-    f.name: float for f in dataclasses.fields(Hyperparameters) if f.type is float
-}
-_CONFIG = {
-    f.name: int
-    for f in dataclasses.fields(Config)
-    if f.type in (int, "int") and f.name not in ("total_steps", "num_envs")
+_FIXED = ("total_steps", "num_envs", "max_episode_steps")
+#: What a sweep may vary, and what its values are.
+KINDS: Mapping[str, type] = {
+    name: int if allowed.whole else float
+    for kind in (Hyperparameters, Config)
+    for name, allowed in ranges(kind).items()
+    if name not in _FIXED and not name.endswith("hidden_sizes")
 }
 
 #: The ranges of the paper's appendix, from which `--random` draws.
@@ -40,21 +39,20 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
     Raises:
       InputError: no such name, or one twice, or not a number.
     """
-    kinds = {**_HYPERPARAMETERS, **_CONFIG}
     values = {}
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
-        if name not in kinds:
+        if name not in KINDS:
             raise InputError(f"grid: {_unknown_name(name)}")
         if name in values:
             raise InputError(f"grid has {name} twice: all its values must be in one")
         try:
-            read = float if kinds[name] is float else whole_number
+            read = float if KINDS[name] is float else whole_number
             found = [read(value) for value in listed.split(",")]
             values[name] = tuple(dict.fromkeys(found))
         except ValueError:
-            kind = "numbers" if kinds[name] is float else "whole numbers"
+            kind = "numbers" if KINDS[name] is float else "whole numbers"
             raise InputError(
                 f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
             ) from None
@@ -77,14 +75,13 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
         raise InputError(
             f"points_file is {path}: it must hold a list of points, one or more"
         )
-    kinds = {**_HYPERPARAMETERS, **_CONFIG}
     for point in points:
         if not isinstance(point, dict):
             raise InputError(f"points_file is {path}: {point!r} is not a point")
         for name, value in point.items():
-            if name not in kinds:
+            if name not in KINDS:
                 raise InputError(f"points_file is {path}: {_unknown_name(name)}")
-            whole = kinds[name] is int
+            whole = KINDS[name] is int
             if isinstance(value, bool) or not isinstance(
                 value, int if whole else int | float
             ):
@@ -93,7 +90,7 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
                     f"points_file is {path}: {name} is {value!r}, not {kind}"
                 )
     read = [
-        {name: kinds[name](value) for name, value in point.items()} for point in points
+        {name: KINDS[name](value) for name, value in point.items()} for point in points
     ]
     for index, point in enumerate(read):
         if point in read[:index]:
@@ -102,10 +99,9 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
 
 
 def _unknown_name(name: str) -> str:
-    kinds = (*_HYPERPARAMETERS, *_CONFIG)
     return (
-        f"{name!r} can't vary: did you mean {nearest(name, kinds)!r}? "
-        f"(one of {', '.join(kinds)})"
+        f"{name!r} can't vary: did you mean {nearest(name, tuple(KINDS))!r}? "
+        f"(one of {', '.join(KINDS)})"
     )
 
 
@@ -113,7 +109,7 @@ def _refuse_unused(names: Iterable[str], agent: str) -> None:
     idle = unused(agent)
     for name in names:
         if name in idle:
-            kinds = [x for x in (*_HYPERPARAMETERS, *_CONFIG) if x not in idle]
+            kinds = [x for x in KINDS if x not in idle]
             raise InputError(
                 f"{name} can't vary: agent {agent!r} does not look at it (one of "
                 f"{', '.join(kinds)})"

@@ -14,7 +14,7 @@ from gasil_jax import normalization, numpy_policy, output_file
 
 def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
     """The arrays of `numpy_policy` of a `TrainState`, or (seeds, ...) of a batch."""
-    params = jax.tree.map(np.asarray, state.params["policy"]["params"])
+    params = jax.tree.map(np.asarray, state.actor_critic.policy.params["params"])
     layers = params["MLP_0"]
     low, high = getattr(env, "action_range", (-1.0, 1.0))
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))

@@ -9,8 +9,30 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from gasil_jax import learner
 from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.learner import Learner
 from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
+
+
+class ActorCritic(struct.PyTreeNode):
+    """The policy, and a value for each reward stream, each with its optimizer.
+
+    Attributes:
+      policy: of `networks.Policy`.
+      values: of `networks.Value`, (stream) of them.
+    """
+
+    policy: Learner
+    values: tuple[Learner, ...]
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """Parameters of every network: {"policy": ..., "values": (stream)}."""
+        return {
+            "policy": self.policy.params,
+            "values": tuple(value.params for value in self.values),
+        }
 
 
 class Batch(struct.PyTreeNode):
@@ -21,14 +43,14 @@ class Batch(struct.PyTreeNode):
       action: float32 (steps, action).
       log_prob: float32 (steps,), under the policy that acted.
       advantage: float32 (steps,).
-      return_: float32 (steps,), target of the value.
+      returns: float32 (steps, stream), targets of the values.
     """
 
     observation: jax.Array
     action: jax.Array
     log_prob: jax.Array
     advantage: jax.Array
-    return_: jax.Array
+    returns: jax.Array
 
 
 def generalized_advantage_estimation(
@@ -41,19 +63,20 @@ def generalized_advantage_estimation(
     gamma: jax.Array | float,
     gae_lambda: jax.Array | float,
 ) -> jax.Array:
-    """GAE(lambda), Schulman et al. 2016, equation 16: (time, env) -> (time, env).
+    """GAE(lambda), Schulman et al. 2016, equation 16: (time, ...) -> (time, ...).
 
     Args:
-      reward: float32 (time, env).
-      value: float32 (time, env), V of the observation.
-      next_value: float32 (time, env), V of the observation that followed, the
+      reward: float32 (time, ...), of environments, or of environments and streams.
+      value: float32 (time, ...), V of the observation.
+      next_value: float32 (time, ...), V of the observation that followed, the
         final one of an episode that ended: a truncated episode is bootstrapped.
-      terminated: bool (time, env), the future is worth nothing.
-      ended: bool (time, env), terminated or truncated: the sum stops here.
+      terminated: bool, of a shape that broadcasts to it: the future is worth nothing.
+      ended: bool, the same: terminated or truncated, the sum stops here.
       gamma: discount.
       gae_lambda: lambda.
     """
-    chex.assert_equal_shape([reward, value, next_value, terminated, ended])
+    chex.assert_equal_shape([reward, value, next_value])
+    chex.assert_equal_shape([terminated, ended])
     delta = reward + gamma * next_value * (1.0 - terminated) - value
     decay = gamma * gae_lambda * (1.0 - ended)
 
@@ -67,6 +90,55 @@ def generalized_advantage_estimation(
     )[1]
 
 
+def standardize(advantage: jax.Array) -> jax.Array:
+    """Advantages (time, env, stream) at mean 0 and variance 1, each stream for itself.
+
+    Over the whole batch, as OpenAI baselines' ppo1 has it.
+    """
+    mean = jnp.mean(advantage, axis=(0, 1))
+    return (advantage - mean) / (jnp.std(advantage, axis=(0, 1)) + 1e-8)
+
+
+def evaluate_streams(
+    actor_critic: ActorCritic,
+    rewards: jax.Array,
+    observation: jax.Array,
+    next_observation: jax.Array,
+    terminated: jax.Array,
+    ended: jax.Array,
+    *,
+    value: Callable[[Any, jax.Array], jax.Array],
+    hyperparameters: Hyperparameters,
+) -> tuple[jax.Array, jax.Array]:
+    """Values and advantages of every reward stream, (time, env, stream) each.
+
+    Args:
+      actor_critic: with a value for each stream.
+      rewards: float32 (time, env, stream).
+      observation: float32 (time, env, obs), normalized.
+      next_observation: the same of those that followed.
+      terminated: bool (time, env).
+      ended: bool (time, env).
+      value: (params, observation) -> value.
+      hyperparameters: discount and lambda.
+    """
+    chex.assert_equal(rewards.shape, (*terminated.shape, len(actor_critic.values)))
+    of_all = lambda observation: jnp.stack(
+        [value(critic.params, observation) for critic in actor_critic.values], axis=-1
+    )
+    values = of_all(observation)
+    advantage = generalized_advantage_estimation(
+        rewards,
+        values,
+        of_all(next_observation),
+        terminated[..., None],
+        ended[..., None],
+        gamma=hyperparameters.gamma,
+        gae_lambda=hyperparameters.gae_lambda,
+    )
+    return values, advantage
+
+
 def loss(
     params: Any,
     batch: Batch,
@@ -78,7 +150,7 @@ def loss(
     """Clipped surrogate (Schulman et al. 2017, equation 7), value error and entropy.
 
     Args:
-      params: of policy and value.
+      params: {"policy": ..., "values": (stream)}.
       batch: a minibatch.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
@@ -87,9 +159,11 @@ def loss(
     Returns:
       The loss, (), and its parts.
     """
-    chex.assert_equal_shape([batch.log_prob, batch.advantage, batch.return_])
+    chex.assert_equal_shape([batch.log_prob, batch.advantage])
+    chex.assert_equal(
+        batch.returns.shape, (*batch.log_prob.shape, len(params["values"]))
+    )
     mean, log_std = policy(params["policy"], batch.observation)
-    values = value(params["value"], batch.observation)
     log_prob = gaussian_log_prob(mean, log_std, batch.action)
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
@@ -97,7 +171,11 @@ def loss(
     clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -jnp.mean(surrogate)
-    value_loss = 0.5 * jnp.mean((values - batch.return_) ** 2)
+    squared_errors = [
+        (value(critic, batch.observation) - batch.returns[:, i]) ** 2
+        for i, critic in enumerate(params["values"])
+    ]
+    value_loss = jnp.stack([0.5 * jnp.mean(x) for x in squared_errors]).sum()
     entropy = gaussian_entropy(log_std)
     total = (
         policy_loss
@@ -116,7 +194,7 @@ def loss(
 
 
 def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
-    """Adam behind a clip of the gradient's norm, for one network; no step size.
+    """Adam behind a clip of the gradient's norm, for one network, without step size.
 
     On the parameters as one vector: of networks this small an operation costs its
     start, so one for each layer cost a CPU a tenth of the training time.
@@ -129,99 +207,73 @@ def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
 
 
 def descend(
-    params: Any,
-    optimizer_state: Any,
-    gradient: Any,
-    learning_rate: jax.Array | float,
-    hyperparameters: Hyperparameters,
-) -> tuple[Any, Any]:
-    """One step of `optimizer` for one network: its new params and state."""
-    updates, optimizer_state = optimizer(hyperparameters).update(
-        gradient, optimizer_state
+    actor_critic: ActorCritic, gradient: Any, hyperparameters: Hyperparameters
+) -> ActorCritic:
+    """One step of every network, each clipped for itself.
+
+    Args:
+      actor_critic: before it.
+      gradient: {"policy": ..., "values": (stream)}.
+      hyperparameters: the step size and the largest norm of a gradient.
+    """
+    return ActorCritic(
+        policy=descend_one(actor_critic.policy, gradient["policy"], hyperparameters),
+        values=tuple(
+            descend_one(value, own, hyperparameters)
+            for value, own in zip(actor_critic.values, gradient["values"], strict=True)
+        ),
     )
-    params = jax.tree.map(lambda p, u: p - learning_rate * u, params, updates)
-    return params, optimizer_state
 
 
-def descend_each(
-    params: dict[str, Any],
-    optimizer_state: dict[str, Any],
-    gradient: dict[str, Any],
-    learning_rate: jax.Array | float,
-    hyperparameters: Hyperparameters,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """`descend` for every network by name, each clipped and stepped for itself."""
-    stepped = {
-        name: descend(
-            params[name],
-            optimizer_state[name],
-            gradient[name],
-            learning_rate,
-            hyperparameters,
-        )
-        for name in params
-    }
-    return (
-        {name: network for name, (network, _) in stepped.items()},
-        {name: state for name, (_, state) in stepped.items()},
-    )
+def descend_one(
+    network: Learner, gradient: Any, hyperparameters: Hyperparameters
+) -> Learner:
+    """One step of one network, by its gradient."""
+    transform = optimizer(hyperparameters)
+    return learner.descend(network, gradient, transform, hyperparameters.learning_rate)
 
 
 def update(
-    params: Any,
-    optimizer_state: Any,
+    actor_critic: ActorCritic,
     batch: Batch,
     key: jax.Array,
     *,
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     value: Callable[[Any, jax.Array], jax.Array],
-    learning_rate: jax.Array | float,
     config: Config,
     hyperparameters: Hyperparameters,
-) -> tuple[Any, Any, dict[str, jax.Array]]:
+) -> tuple[ActorCritic, dict[str, jax.Array]]:
     """`num_epochs` passes over the batch in shuffled minibatches.
 
     Args:
-      params: {"policy": ..., "value": ...}; each is clipped and stepped for itself.
-      optimizer_state: {"policy": ..., "value": ...}.
-      batch: (steps, ...), advantages already normalized.
+      actor_critic: before it.
+      batch: (steps, ...), advantages already standardized.
       key: consumed.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
-      learning_rate: step size of this iteration.
       config: counts and sizes.
-      hyperparameters: the floats.
+      hyperparameters: the floats of this iteration.
 
     Returns:
-      params, optimizer state, and the metrics' means over all minibatches.
+      the networks, and the metrics' means over all minibatches.
     """
 
-    def minibatch_step(carry: Any, minibatch: Batch) -> Any:
-        params, optimizer_state = carry
+    def minibatch_step(actor_critic: ActorCritic, rows: jax.Array) -> Any:
         gradient, metrics = jax.grad(loss, has_aux=True)(
-            params,
-            minibatch,
+            actor_critic.params,
+            jax.tree.map(lambda x: x[rows], batch),
             policy=policy,
             value=value,
             hyperparameters=hyperparameters,
         )
-        carry = descend_each(
-            params, optimizer_state, gradient, learning_rate, hyperparameters
-        )
-        return carry, metrics
+        return descend(actor_critic, gradient, hyperparameters), metrics
 
-    def epoch(carry: Any, key: jax.Array) -> Any:
+    def epoch(actor_critic: ActorCritic, key: jax.Array) -> Any:
         order = jax.random.permutation(key, config.batch_steps)
         order = order.reshape(config.num_minibatches, config.minibatch_size)
-        return jax.lax.scan(
-            lambda carry, rows: minibatch_step(
-                carry, jax.tree.map(lambda x: x[rows], batch)
-            ),
-            carry,
-            order,
-        )
+        return jax.lax.scan(minibatch_step, actor_critic, order)
 
-    (params, optimizer_state), metrics = jax.lax.scan(
-        epoch, (params, optimizer_state), jax.random.split(key, config.num_epochs)
+    actor_critic, metrics = jax.lax.scan(
+        epoch, actor_critic, jax.random.split(key, config.num_epochs)
     )
-    return params, optimizer_state, jax.tree.map(jnp.mean, metrics)
+    return actor_critic, jax.tree.map(jnp.mean, metrics)

@@ -166,4 +166,4 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
         raise ValueError(unknown("agent", agent, agents()))
     chosen = PRESETS[name]
     rows = chosen.delayed if reward_delay > 1 else chosen.dense
-    return Config(agent=agent).updated({**chosen.every, **rows.get((env, agent), {})})
+    return Config(agent=agent).replace(**{**chosen.every, **rows.get((env, agent), {})})

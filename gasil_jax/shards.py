@@ -1,8 +1,8 @@
 """How a sweep is cut: into programs that compile once, and into shards that run apart.
 
 A member is a point with a seed. The members of a program differ in `Hyperparameters`
-alone, which can stand for two counts of `Config` too, so that these share a program
-where that is asked for. A shard is one of n near-equal parts of all members, which
+alone; two counts are among these, which divide the points unless it is asked that they
+share a program. A shard is one of n near-equal parts of all members, which
 are taken program by program, so that a shard compiles as few programs as may be.
 """
 
@@ -13,14 +13,11 @@ from collections.abc import Sequence
 
 from gasil_jax import run_folder
 from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config, Hyperparameters, ranges
 from gasil_jax.points import Point
 
-# The count of `Config` -> the hyperparameter that limits it.
-_LIMITS = {
-    "buffer_steps": "max_buffer_steps",
-    "discriminator_updates": "max_discriminator_updates",
-}
+#: Hyperparameters that decide shapes: of a program its configuration has the largest.
+COUNTS = tuple(x for x, allowed in ranges(Hyperparameters).items() if allowed.whole)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,13 +64,17 @@ def programs(
       share_counts: whether points that differ in the buffer's steps or the
         discriminator's updates share a program, that of the largest.
     """
-    configs = [config.updated(point) for point in points]
+    configs = [config.replace(**point) for point in points]
+    counts = [
+        {name: getattr(own.hyperparameters, name) for name in COUNTS} for own in configs
+    ]
     if share_counts:
-        configs = _limited(configs)
+        largest = {name: max(own[name] for own in counts) for name in COUNTS}
+        counts = [largest] * len(configs)
     groups: dict[Config, list[int]] = {}
     for index, own in enumerate(configs):
-        shared = own.replace(hyperparameters=config.hyperparameters)
-        groups.setdefault(shared, []).append(index)
+        shared = config.hyperparameters.replace(**counts[index])
+        groups.setdefault(own.replace(hyperparameters=shared), []).append(index)
     return [
         Program(
             number,
@@ -83,23 +84,6 @@ def programs(
         )
         for number, (shared, indices) in enumerate(groups.items())
     ]
-
-
-def _least(config: Config, limit: str, number: int) -> float:
-    given = getattr(config.hyperparameters, limit)
-    return number if given is None else min(given, number)
-
-
-def _limited(configs: Sequence[Config]) -> list[Config]:
-    """The largest counts for all, each limited to its own where they differ."""
-    for count, limit in _LIMITS.items():
-        own = [getattr(config, count) for config in configs]
-        if len(set(own)) > 1:
-            configs = [
-                config.updated({count: max(own), limit: _least(config, limit, number)})
-                for config, number in zip(configs, own, strict=True)
-            ]
-    return list(configs)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -183,7 +183,7 @@ def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
         options.config.agent,
     )
     for point in points:
-        config = options.config.updated(point)
+        config = options.config.replace(**point)
         run.check(dataclasses.replace(options, config=config))
     programs = shards.programs(
         options.config, points, seeds_of(options), options.share_counts

@@ -5,6 +5,7 @@ any leaf of `Hyperparameters`, shard it over devices, call it from other JAX cod
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import jax
@@ -14,6 +15,7 @@ from flax import struct
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     good_trajectories,
+    learner,
     normalization,
     ppo,
     reward_normalization,
@@ -24,6 +26,8 @@ from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.imitation import AGENTS
 from gasil_jax.imitation.interface import Context
 from gasil_jax.networks import Policy, Value
+from gasil_jax.ppo import ActorCritic
+from gasil_jax.rollout import Rollout
 
 Metrics = dict[str, jax.Array]
 
@@ -32,21 +36,19 @@ class TrainState(struct.PyTreeNode):
     """All that a run needs to go on, and nothing that it can do without.
 
     Attributes:
-      params: {"policy": ..., "value": ...}.
-      optimizer_state: of both, the same keys.
+      actor_critic: policy and values, with their optimizers' states.
       normalizer: of observations.
       reward_normalizer: of rewards; None where they are not normalized.
       environments: the running episodes, (env, ...).
       history: the last steps of each environment, (env, steps, ...).
       good_trajectories: the buffer B of the paper.
       imitation: the state of the agent's way of imitating.
-      hyperparameters: the floats that this run trains with.
+      hyperparameters: the numbers that this run trains with.
       key: consumed by the next iteration.
       iteration: int32 (), iterations done.
     """
 
-    params: Any
-    optimizer_state: Any
+    actor_critic: ActorCritic
     normalizer: normalization.Normalizer
     reward_normalizer: reward_normalization.RewardNormalizer | None
     environments: rollout.EnvironmentStates
@@ -63,11 +65,6 @@ def max_episode_steps(env: Any, config: Config) -> int:
     return config.max_episode_steps or int(getattr(env, "episode_length", 1000))
 
 
-def _networks(env: Any, config: Config) -> tuple[Any, Any]:
-    # Flax says of `apply` that it may give changed variables too: Any is narrower.
-    return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
-
-
 @full_precision
 def init(
     env: Any,
@@ -82,19 +79,13 @@ def init(
         lambda x: jnp.asarray(x, jnp.float32), hyperparameters
     )
     key, policy_key, value_key, env_key, imitation_key = jax.random.split(key, 5)
-    observation_size, action_size = env.observation_size, env.action_size
-    observation = jnp.zeros(observation_size)
+    sizes = (env.observation_size, env.action_size)
     episode_steps = max_episode_steps(env, config)
-    policy, value = _networks(env, config)
-    params = {
-        "policy": policy.init(policy_key, observation),
-        "value": value.init(value_key, observation),
-    }
-    transform = ppo.optimizer(hyperparameters)
     return TrainState(
-        params=params,
-        optimizer_state={name: transform.init(params[name]) for name in params},
-        normalizer=normalization.init(observation_size),
+        actor_critic=_init_actor_critic(
+            env, config, hyperparameters, policy_key, value_key
+        ),
+        normalizer=normalization.init(env.observation_size),
         reward_normalizer=(
             reward_normalization.init(config.num_envs)
             if config.normalize_rewards
@@ -107,21 +98,42 @@ def init(
             age_limit=episode_steps if config.stagger_episodes else None,
         ),
         history=good_trajectories.init_history(
-            config.num_envs,
-            config.num_steps,
-            episode_steps,
-            observation_size,
-            action_size,
+            config.num_envs, config.num_steps, episode_steps, *sizes
         ),
+        # The configuration's own number decides the shape, a member's how much of it
+        # is filled.
         good_trajectories=good_trajectories.init(
-            config.buffer_steps, observation_size, action_size
+            int(config.hyperparameters.buffer_steps), *sizes
         ),
-        imitation=AGENTS[config.agent].init(
-            imitation_key, config, observation_size, action_size
-        ),
+        imitation=AGENTS[config.agent].init(imitation_key, config, *sizes),
         hyperparameters=hyperparameters,
         key=key,
         iteration=jnp.int32(0),
+    )
+
+
+def _networks(env: Any, config: Config) -> tuple[Any, Any]:
+    # Flax says of `apply` that it may give changed variables too: Any is narrower.
+    return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
+
+
+def _init_actor_critic(
+    env: Any,
+    config: Config,
+    hyperparameters: Hyperparameters,
+    policy_key: jax.Array,
+    value_key: jax.Array,
+) -> ActorCritic:
+    policy, value = _networks(env, config)
+    observation = jnp.zeros(env.observation_size)
+    transform = ppo.optimizer(hyperparameters)
+    streams = len(AGENTS[config.agent].stream_weights(hyperparameters))
+    value_keys = [value_key, *jax.random.split(value_key, streams)[1:]]
+    return ActorCritic(
+        policy=learner.init(policy.init(policy_key, observation), transform),
+        values=tuple(
+            learner.init(value.init(key, observation), transform) for key in value_keys
+        ),
     )
 
 
@@ -132,27 +144,112 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     Returns the next state and a dict of float32 scalars. Means over the whole episodes
     that ended in the batch are NaN if none did.
     """
-    imitate = AGENTS[config.agent]
-    hp = schedules.at(config, state.hyperparameters, state.iteration)
+    agent = AGENTS[config.agent]
+    hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
-    normalize = lambda observation: normalization.normalize(
-        state.normalizer, observation
-    )
 
     # Sample policy trajectories.
     environments, batch = rollout.collect(
         env,
-        lambda observation: policy(state.params["policy"], normalize(observation)),
+        lambda observation: policy(
+            state.actor_critic.policy.params,
+            normalization.normalize(state.normalizer, observation),
+        ),
         state.environments,
         act_key,
         num_steps=config.num_steps,
         max_episode_steps=max_episode_steps(env, config),
-        gamma=hp.gamma,
+        gamma=hyperparameters.gamma,
     )
     # Update the good trajectory buffer.
+    history, buffer = remember(
+        state.history, state.good_trajectories, batch, hyperparameters.buffer_steps
+    )
+    # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
+    reward_normalizer, reward_scale, batch = scale_rewards(
+        state.reward_normalizer, batch, hyperparameters.gamma
+    )
+    # Sample good trajectories, update the discriminator by equation 8, and shape the
+    # reward with it (section 4.3): what the agent imitates with does so.
+    context = Context(
+        rollout=batch,
+        history=history,
+        good_trajectories=buffer,
+        normalizer=state.normalizer,
+        reward_scale=reward_scale,
+        hyperparameters=hyperparameters,
+        config=config,
+        policy=policy,
+        value=value,
+    )
+    imitation, rewards, imitation_metrics = agent.update_and_reward(
+        state.imitation, context, imitate_key
+    )
+    # Update the policy.
+    experience, explained_variance = advantages(
+        state.actor_critic,
+        rewards,
+        context,
+        stream_weights=agent.stream_weights(hyperparameters),
+    )
+    actor_critic, ppo_metrics = ppo.update(
+        state.actor_critic,
+        experience,
+        ppo_key,
+        policy=policy,
+        value=value,
+        config=config,
+        hyperparameters=hyperparameters,
+    )
+    imitation, actor_critic, policy_metrics = agent.update_policy(
+        imitation, actor_critic, context, policy_key
+    )
+    healthy, (actor_critic, imitation) = keep_if_finite(
+        (actor_critic, imitation), (state.actor_critic, state.imitation)
+    )
+    metrics: Metrics = {
+        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
+        **rollout_metrics(batch, buffer),
+        "skipped_updates": ~healthy,
+        "explained_variance": explained_variance,
+        "learning_rate": jnp.asarray(hyperparameters.learning_rate),
+        **({} if reward_normalizer is None else {"reward_scale": reward_scale}),
+        **ppo_metrics,
+    }
+    state = state.replace(
+        actor_critic=actor_critic,
+        # Only now: within an iteration the policy that acts is the one that learns.
+        normalizer=normalization.update(state.normalizer, batch.observation),
+        reward_normalizer=reward_normalizer,
+        environments=environments,
+        history=history,
+        good_trajectories=buffer,
+        imitation=imitation,
+        key=key,
+        iteration=state.iteration + 1,
+    )
+    return state, merge_metrics(
+        config.agent, metrics, imitation_metrics, policy_metrics
+    )
+
+
+def remember(
+    history: good_trajectories.History,
+    buffer: good_trajectories.GoodTrajectories,
+    batch: Rollout,
+    buffer_steps: jax.Array | float,
+) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
+    """Record a batch, and offer the whole episodes that ended in it to the buffer.
+
+    Args:
+      history: the last steps of each environment, before the batch.
+      buffer: the good trajectories so far.
+      batch: of the environment's own reward.
+      buffer_steps: how many steps the buffer keeps, ().
+    """
     history = good_trajectories.record(
-        state.history,
+        history,
         batch.observation,
         batch.action,
         # No return of an episode with a faulty step, or of one cut short, is one.
@@ -162,124 +259,131 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length
     )
-    buffer = good_trajectories.insert(
-        state.good_trajectories, history, episodes, hp.max_buffer_steps
-    )
+    return history, good_trajectories.insert(buffer, history, episodes, buffer_steps)
 
-    # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
-    reward_normalizer, reward_scale = state.reward_normalizer, jnp.float32(1.0)
-    reward_metrics = {}
-    if reward_normalizer is not None:
-        reward_normalizer = reward_normalization.update(
-            reward_normalizer, batch.reward, batch.ended, hp.gamma
-        )
-        reward_scale = reward_normalization.scale(reward_normalizer)
-        reward_metrics["reward_scale"] = reward_scale
-        reward = reward_normalization.normalize(reward_normalizer, batch.reward)
-        batch = batch.replace(reward=reward)
 
-    # Sample good trajectories, update the discriminator by equation 8, and shape the
-    # reward with it (section 4.3): what the agent imitates with does so.
-    context = Context(
-        rollout=batch,
-        history=history,
-        good_trajectories=buffer,
-        normalizer=state.normalizer,
-        reward_scale=reward_scale,
-        hyperparameters=hp,
-        config=config,
-        policy=policy,
-        value=value,
+def scale_rewards(
+    normalizer: reward_normalization.RewardNormalizer | None,
+    batch: Rollout,
+    gamma: jax.Array | float,
+) -> tuple[reward_normalization.RewardNormalizer | None, jax.Array, Rollout]:
+    """Normalize a batch's rewards, where there is a normalizer.
+
+    Returns:
+      the normalizer with the batch in it, what rewards were divided by, (), and the
+      batch with its rewards in that unit.
+    """
+    if normalizer is None:
+        return None, jnp.float32(1.0), batch
+    normalizer = reward_normalization.update(
+        normalizer, batch.reward, batch.ended, gamma
     )
-    imitation, reward, imitation_metrics = imitate.update_and_reward(
-        state.imitation, context, imitate_key
-    )
-    # Update the policy.
-    observation = normalize(batch.observation)
-    values = value(state.params["value"], observation)
-    next_values = value(state.params["value"], normalize(batch.next_observation))
-    advantage = ppo.generalized_advantage_estimation(
-        reward,
-        values,
-        next_values,
+    reward = reward_normalization.normalize(normalizer, batch.reward)
+    scale = reward_normalization.scale(normalizer)
+    return normalizer, scale, batch.replace(reward=reward)
+
+
+def advantages(
+    actor_critic: ActorCritic,
+    rewards: jax.Array,
+    context: Context,
+    *,
+    stream_weights: Sequence[jax.Array | float],
+) -> tuple[ppo.Batch, jax.Array]:
+    """What PPO learns from: the weighted sum of each stream's standardized advantage.
+
+    Args:
+      actor_critic: with a value for each stream.
+      rewards: float32 (time, env) of one stream, or (time, env, stream).
+      context: of the iteration.
+      stream_weights: (stream) of them, () each.
+
+    Returns:
+      the batch, (steps, ...), and the share of the returns' variance that the values
+      explain, (), the mean over streams.
+    """
+    batch = context.rollout
+    if rewards.ndim == 2:
+        rewards = rewards[..., None]
+    observation = normalization.normalize(context.normalizer, batch.observation)
+    values, advantage = ppo.evaluate_streams(
+        actor_critic,
+        rewards,
+        observation,
+        normalization.normalize(context.normalizer, batch.next_observation),
         batch.terminated,
         batch.ended,
-        gamma=hp.gamma,
-        gae_lambda=hp.gae_lambda,
+        value=context.value,
+        hyperparameters=context.hyperparameters,
     )
-    return_ = advantage + values
-    normalized_advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
+    returns = advantage + values
+    standardized = ppo.standardize(advantage)
+    mixed = sum(
+        weight * standardized[..., i] for i, weight in enumerate(stream_weights)
+    )
     flat = lambda x: x.reshape(-1, *x.shape[2:])
-    params, optimizer_state, ppo_metrics = ppo.update(
-        state.params,
-        state.optimizer_state,
-        ppo.Batch(
-            observation=flat(observation),
-            action=flat(batch.action),
-            log_prob=flat(batch.log_prob),
-            advantage=flat(normalized_advantage),
-            return_=flat(return_),
-        ),
-        ppo_key,
-        policy=policy,
-        value=value,
-        learning_rate=hp.learning_rate,
-        config=config,
-        hyperparameters=hp,
-    )
-    imitation, params, optimizer_state, policy_metrics = imitate.update_policy(
-        imitation, params, optimizer_state, hp.learning_rate, context, policy_key
-    )
+    residual = jnp.var(returns - values, axis=(0, 1))
+    explained = 1.0 - residual / (jnp.var(returns, axis=(0, 1)) + 1e-8)
+    return ppo.Batch(
+        observation=flat(observation),
+        action=flat(batch.action),
+        log_prob=flat(batch.log_prob),
+        advantage=flat(jnp.asarray(mixed)),
+        returns=flat(returns),
+    ), jnp.mean(explained)
 
-    # An update that is not finite is as if it had not been.
-    learned = (params, optimizer_state, imitation)
-    healthy = rollout.is_finite(learned)
-    params, optimizer_state, imitation = jax.tree.map(
-        lambda new, old: jnp.where(healthy, new, old),
-        learned,
-        (state.params, state.optimizer_state, state.imitation),
-    )
-    state = TrainState(
-        params=params,
-        optimizer_state=optimizer_state,
-        # Only now: within an iteration the policy that acts is the one that learns.
-        normalizer=normalization.update(state.normalizer, batch.observation),
-        reward_normalizer=reward_normalizer,
-        environments=environments,
-        history=history,
-        good_trajectories=buffer,
-        imitation=imitation,
-        hyperparameters=state.hyperparameters,
-        key=key,
-        iteration=state.iteration + 1,
-    )
+
+def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
+    """An update that is not finite is as if it had not been.
+
+    Args:
+      new: what was learned, a pytree.
+      old: the same before it.
+
+    Returns:
+      whether every number of `new` is finite, (), and `new` if so, else `old`.
+    """
+    healthy = rollout.is_finite(new)
+    return healthy, jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
+
+
+def rollout_metrics(
+    batch: Rollout, buffer: good_trajectories.GoodTrajectories
+) -> Metrics:
+    """What a batch and the buffer after it are like.
+
+    Means over the whole episodes that ended in the batch are NaN if none did.
+
+    Args:
+      batch: (time, env, ...).
+      buffer: with the batch's episodes in it.
+    """
     completed = batch.completed
-    mean_of_completed = lambda x: (
-        jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
-    )
-    metrics = {
-        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
-        "episode_return": mean_of_completed(batch.episode_return),
-        "episode_length": mean_of_completed(batch.episode_length),
+    mean = lambda x: jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
+    return {
+        "episode_return": mean(batch.episode_return),
+        "episode_length": mean(batch.episode_length),
         "episodes": jnp.sum(completed),
         "faulty_steps": jnp.sum(batch.faulty),
-        "skipped_updates": ~healthy,
         "good_return": good_trajectories.mean_return(buffer),
         "good_steps": buffer.size,
-        "explained_variance": 1.0
-        - jnp.var(return_ - values) / (jnp.var(return_) + 1e-8),
-        "learning_rate": hp.learning_rate,
-        **reward_metrics,
-        **ppo_metrics,
     }
-    for own in (imitation_metrics, policy_metrics):
+
+
+def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
+    """All metrics of an iteration as float32 scalars, by name.
+
+    Raises:
+      ValueError: an agent's metric has a name that another one has.
+    """
+    for own in more:
         if taken := metrics.keys() & own.keys():
             raise ValueError(
-                f"metrics of agent {config.agent!r} have names that others have: "
+                f"metrics of agent {agent!r} have names that others have: "
                 f"{', '.join(sorted(taken))}"
             )
-        metrics |= own
-    return state, {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
+        metrics = {**metrics, **own}
+    return {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
 
 
 def check(env: Any, config: Config) -> None:

@@ -28,7 +28,7 @@ def test_a_seed_does_not_depend_on_the_number_of_devices():
         states, advance = runs.compile()
         last, _ = runs.train(advance, states, 0, 1)
         last, _ = runs.train(advance, last, 1, 1)
-        results.append(jax.tree.map(np.asarray, runs.trim(last).params))
+        results.append(jax.tree.map(np.asarray, runs.trim(last).actor_critic.params))
     alone, two = results
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
     jax.tree.map(lambda a, b: close(a[1], b[0]), two, alone)

@@ -31,9 +31,10 @@ def trained(coefficient):
         agent="ppo+bc",
         total_steps=2048,
         num_epochs=1,
-        buffer_steps=100,  # The best two episodes: they differ from the rest.
         behavior_cloning_updates=100,
     )
+    # The best two episodes: they differ from the rest.
+    config = config.replace(buffer_steps=100)
     hyperparameters = config.hyperparameters.replace(
         behavior_cloning_coefficient=coefficient, learning_rate=1e-3
     )
@@ -58,6 +59,6 @@ def test_without_weight_it_is_ppo():
     # Adam's momentum goes on; only the value, which cloning leaves alone, is equal.
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6),
-        state.params["value"],
-        trained(0.0)[0].params["value"],
+        state.actor_critic.params["values"],
+        trained(0.0)[0].actor_critic.params["values"],
     )

@@ -35,7 +35,7 @@ def filled(untrained_hopper, tmp_path, monkeypatch):
     out = shutil.copytree(untrained_hopper, tmp_path / "run")
     env, config, _, states = evaluate.load(out)
     sizes = (env.observation_size, env.action_size)
-    kept = buffer(LENGTHS, RETURNS, config.buffer_steps, *sizes)
+    kept = buffer(LENGTHS, RETURNS, config.hyperparameters.buffer_steps, *sizes)
     lead = {name: jnp.asarray(value)[None] for name, value in vars(kept).items()}
     states = states.replace(good_trajectories=kept.replace(**lead))
     checkpoint.write(out / "checkpoints", 1, states, {"score": 1.0})

@@ -52,9 +52,8 @@ def test_a_scripted_expert_is_imitated(expert):
         agent="gail",
         expert=path,
         total_steps=60 * 2048,
-        discriminator_updates=20,
         hyperparameters=gasil_jax.Hyperparameters(
-            alpha=1.0, discriminator_learning_rate=3e-4
+            alpha=1.0, discriminator_updates=20, discriminator_learning_rate=3e-4
         ),
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))

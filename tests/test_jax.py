@@ -45,10 +45,9 @@ CONFIG = gasil_jax.Config(
     num_epochs=1,
     hidden_sizes=(4,),
     discriminator_hidden_sizes=(4,),
-    discriminator_updates=1,
     discriminator_minibatch_size=8,
-    buffer_steps=3,
     max_episode_steps=2,
+    hyperparameters=gasil_jax.Hyperparameters(discriminator_updates=1, buffer_steps=3),
 )
 
 

@@ -31,7 +31,7 @@ def test_it_is_the_networks_gaussian(saved, seed):
     observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
     normalized = normalization.normalize(state.normalizer, observation)
     network = Policy(config.hidden_sizes, env.action_size)
-    mean, log_std = network.apply(state.params["policy"], normalized)
+    mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 
     act = gasil_jax.load_policy(folder, seed)
     expected = jnp.clip(mean, -1.0, 1.0)

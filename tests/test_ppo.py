@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from gasil_jax import ppo
+from gasil_jax import learner, ppo
 from gasil_jax.config import Hyperparameters
 
 
@@ -67,10 +67,11 @@ def test_loss_equals_numpy():
     squared = np.mean((value - return_) ** 2)
     expected = -np.mean(surrogate) + 0.7 * 0.5 * squared - 0.01 * entropy
     batch = ppo.Batch(
-        *(jnp.asarray(x, jnp.float32) for x in (mean, action, old, advantage, return_))
+        *(jnp.asarray(x, jnp.float32) for x in (mean, action, old, advantage)),
+        returns=jnp.asarray(return_, jnp.float32)[:, None],
     )
     total, metrics = ppo.loss(
-        {"policy": jnp.asarray(log_std, jnp.float32), "value": None},
+        {"policy": jnp.asarray(log_std, jnp.float32), "values": (None,)},
         batch,
         policy=lambda params, observation: (observation, params),
         value=lambda params, observation: jnp.asarray(value, jnp.float32),
@@ -84,13 +85,14 @@ def test_loss_equals_numpy():
 def test_a_step_clips_the_gradients_norm_and_is_adams():
     params, gradient = {"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([3.0, 4.0])}
     hp = Hyperparameters(max_grad_norm=1.0)
-    state = ppo.optimizer(hp).init(params)
+    hp = hp.replace(learning_rate=0.1)
+    network = learner.init(params, ppo.optimizer(hp))
     mean, square, expected = np.zeros(2), np.zeros(2), np.array([1.0, 2.0])
     for step in range(1, 4):
-        params, state = ppo.descend(params, state, gradient, 0.1, hp)
+        network = ppo.descend_one(network, gradient, hp)
         clipped = np.array([3.0, 4.0]) / 5.0
         mean = 0.9 * mean + 0.1 * clipped
         square = 0.999 * square + 0.001 * clipped**2
         corrected = np.sqrt(square / (1 - 0.999**step)) + 1e-5
         expected = expected - 0.1 * mean / (1 - 0.9**step) / corrected
-        np.testing.assert_allclose(params["w"], expected, rtol=1e-5)
+        np.testing.assert_allclose(network.params["w"], expected, rtol=1e-5)

@@ -33,7 +33,7 @@ def test_the_tuned_rows_are_what_the_search_found(env, reward_delay):
         trial = random_search.search(env, agent, reward_delay)
         changes = {"num_envs": trial.num_envs, "normalize_rewards": normalized}
         found = best(env, agent, reward_delay)
-        expected = Config(agent=agent).updated({**found, **changes})
+        expected = Config(agent=agent).replace(**found, **changes)
         assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
 
 
@@ -50,7 +50,7 @@ def test_the_command_line_starts_from_the_preset():
 def test_flags_override_the_preset():
     config = parse("point_mass", "--agent", "gasil", "--alpha", "0.3")
     assert config.hyperparameters.alpha == 0.3
-    assert config.discriminator_updates == 20
+    assert config.hyperparameters.discriminator_updates == 20
 
 
 @pytest.mark.parametrize("env", ["walker2d", "point_mass"])

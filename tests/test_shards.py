@@ -57,21 +57,18 @@ def test_counts_share_a_program_where_that_is_asked_for():
         {"discriminator_updates": 20, "alpha": 0.1},
         {"num_epochs": 3},
     ]
-    config = Config(buffer_steps=500)
+    config = Config().replace(buffer_steps=500)
     shared = shards.programs(config, points, [7], share_counts=True)
     assert [program.members for program in shared] == [((0, 7), (1, 7)), ((2, 7),)]
     for program in shared:
-        assert program.config.discriminator_updates == 20
-        assert program.config.buffer_steps == 1000
-    limits = [
-        (x.max_discriminator_updates, x.max_buffer_steps, x.alpha)
+        assert program.config.hyperparameters.discriminator_updates == 20
+        assert program.config.hyperparameters.buffer_steps == 1000
+    counts = [
+        (x.discriminator_updates, x.buffer_steps, x.alpha)
         for program in shared
         for x in program.hyperparameters
     ]
-    assert limits == [(5, 1000, 1.0), (20, 500, 0.1), (5, 500, 0.1)]
-    # What does not differ needs no limit.
-    (alone,) = shards.programs(config, points[:1], [7], share_counts=True)
-    assert alone.hyperparameters[0].max_buffer_steps is None
+    assert counts == [(5, 1000, 1.0), (20, 500, 0.1), (5, 500, 0.1)]
     (second,) = shards.share(shared[:1], shards.Shard(2, 2))
     assert second.members == ((1, 7),)
     assert second.hyperparameters == shared[0].hyperparameters[1:]

@@ -116,10 +116,9 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
         num_epochs=1,
         hidden_sizes=(4,),
         discriminator_hidden_sizes=(4,),
-        buffer_steps=30,
         sil_buffer_steps=300,
         sil_minibatch_size=8,
-        hyperparameters=gasil_jax.Hyperparameters(gamma=1.0),
+        hyperparameters=gasil_jax.Hyperparameters(gamma=1.0, buffer_steps=30),
     )
     train = lambda config: jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
     state, metrics = train(config)

@@ -45,7 +45,7 @@ def test_a_grid_is_every_combination():
         ((0, 7), (0, 8), (2, 7), (2, 8)),
         ((1, 7), (1, 8), (3, 7), (3, 8)),
     ]
-    assert [p.config.discriminator_updates for p in programs] == [1, 5]
+    assert [p.config.hyperparameters.discriminator_updates for p in programs] == [1, 5]
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges():
@@ -158,17 +158,17 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     }
     assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
     _, config, seeds, states = evaluate.load(out, point=1)
-    assert config.discriminator_updates == 3 and seeds == [0, 1]
+    assert config.hyperparameters.discriminator_updates == 3 and seeds == [0, 1]
     _, _, _, by_itself = evaluate.load(alone)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
-        states.params,
-        by_itself.params,
+        states.actor_critic.params,
+        by_itself.actor_critic.params,
     )
     with pytest.raises(ValueError, match="it must be 'last'"):
         evaluate.load(out, "best", point=1)
     best = evaluate.load(out)[1]
-    assert best.discriminator_updates == (1, 3)[summary["best_by_mean"]]
+    assert best.hyperparameters.discriminator_updates == (1, 3)[summary["best_by_mean"]]
     assert evaluate.main([str(out), "--point", "4"]) == 2
     assert "has points 0 to 3" in capsys.readouterr().err
     curves = np.load(out / "curves.npz")

@@ -20,10 +20,11 @@ SMALL = gasil_jax.Config(
     num_epochs=2,
     hidden_sizes=(16,),
     discriminator_hidden_sizes=(16,),
-    discriminator_updates=2,
-    buffer_steps=100,
     sil_buffer_steps=500,
     sil_minibatch_size=64,
+    hyperparameters=gasil_jax.Hyperparameters(
+        discriminator_updates=2, buffer_steps=100
+    ),
 )
 
 
@@ -39,17 +40,14 @@ SELF_TAUGHT = [name for name in gasil_jax.agents() if name != "gail"]
 
 def test_vmap_over_every_hyperparameter_equals_single_runs():
     env = gasil_jax.make_env("point_mass")
-    # Its counts, limited, are as if they were smaller.
+    # Counts may be less than those of the configuration, which decide the shapes.
     larger = SMALL.replace(buffer_steps=130, discriminator_updates=4)
     train = gasil_jax.make_train(env, larger)
     key, plain = jax.random.key(0), SMALL.hyperparameters
-    both = (plain, jax.tree.map(lambda x: 0.5 * x, plain))
-    limits = {
-        "max_buffer_steps": SMALL.buffer_steps,
-        "max_discriminator_updates": SMALL.discriminator_updates,
-    }
-    limited = [hyperparameters.replace(**limits) for hyperparameters in both]
-    stacked = jax.tree.map(lambda *x: jnp.array(x), *limited)
+    half = jax.tree.map(lambda x: 0.5 * x, plain)
+    counts = {"buffer_steps": 100, "discriminator_updates": 2}
+    both = (plain, half.replace(**counts))
+    stacked = jax.tree.map(lambda *x: jnp.array(x), *both)
     _, swept = jax.jit(jax.vmap(train, in_axes=(None, 0)))(key, stacked)
     for i, hyperparameters in enumerate(both):
         _, single = trainer()(key, hyperparameters)
@@ -70,15 +68,13 @@ def test_vmap_over_every_hyperparameter_equals_single_runs():
 def test_an_agent_looks_at_the_fields_that_it_says_and_at_no_others(agent):
     env = gasil_jax.make_env("point_mass")
     train = gasil_jax.make_train(env, SMALL.replace(agent=agent, total_steps=768))
-    plain = SMALL.hyperparameters.replace(
-        max_buffer_steps=100.0, max_discriminator_updates=2.0
-    )
+    plain = SMALL.hyperparameters
     every = {name for each in AGENTS.values() for name in each.fields}
     swept = sorted(name for name in every if hasattr(plain, name))
     changed = [plain.replace(**{name: getattr(plain, name) / 2}) for name in swept]
     stacked = jax.tree.map(lambda *x: jnp.array(x), plain, *changed)
     last, _ = jax.jit(jax.vmap(train, in_axes=(None, 0)))(jax.random.key(0), stacked)
-    (first, *_) = [np.asarray(x) for x in jax.tree.leaves(last.params)]
+    (first, *_) = [np.asarray(x) for x in jax.tree.leaves(last.actor_critic)]
     seen = {x for x, w in zip(swept, first[1:], strict=True) if (w != first[0]).any()}
     assert seen == {name for name in AGENTS[agent].fields if name in swept}
 
@@ -101,9 +97,8 @@ def test_it_learns_on_the_point_mass(agent):
     config = gasil_jax.Config(
         agent=agent,
         total_steps=40 * 2048,
-        discriminator_updates=20,
         hyperparameters=gasil_jax.Hyperparameters(
-            alpha=1.0, discriminator_learning_rate=3e-4
+            alpha=1.0, discriminator_updates=20, discriminator_learning_rate=3e-4
         ),
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
@@ -176,7 +171,7 @@ def test_a_state_may_begin_outside_of_jit_and_be_donated():
     found = jax.jit(step, donate_argnums=0)(state)
     # A program of its own may round in another way.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7)
-    jax.tree.map(close, found.params, wanted.params)
+    jax.tree.map(close, found.actor_critic, wanted.actor_critic)
 
 
 def test_double_precision_is_refused():
@@ -184,3 +179,29 @@ def test_double_precision_is_refused():
     with jax.enable_x64(True):
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
             gasil_jax.make_train(env, SMALL)
+
+
+def test_two_streams_of_the_same_reward_are_that_reward():
+    """Each has a value of its own; with one of them at weight 0 it is plain PPO."""
+
+    def twice(state, context, key):
+        reward = context.rollout.reward
+        return state, jnp.stack([reward, -3.0 * reward], axis=-1), {}
+
+    weights = lambda hyperparameters: (1.0, 0.0)
+    two = AGENTS["ppo"]._replace(update_and_reward=twice, stream_weights=weights)
+    env = gasil_jax.make_env("point_mass")
+    AGENTS["two streams"] = two
+    try:
+        config = SMALL.replace(agent="two streams")
+        state, _ = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    finally:
+        del AGENTS["two streams"]
+    plain, _ = trainer("ppo")(jax.random.key(0))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
+    jax.tree.map(close, state.actor_critic.policy, plain.actor_critic.policy)
+    first, second = state.actor_critic.values
+    jax.tree.map(close, first, plain.actor_critic.values[0])
+    (kernel, *_) = jax.tree.leaves(second.params)
+    (other, *_) = jax.tree.leaves(first.params)
+    assert not np.allclose(kernel, other)

@@ -20,20 +20,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from flax import struct
 
-from gasil_jax import good_trajectories, normalization
+from gasil_jax import good_trajectories, learner, normalization
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.imitation import expert
 from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
+from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
-
-
-class AdversarialState(struct.PyTreeNode):
-    """The discriminator's parameters and its optimizer's state."""
-
-    params: Any
-    optimizer_state: Any
 
 
 def bonus(logit: jax.Array, alpha: jax.Array | float) -> jax.Array:
@@ -83,11 +76,11 @@ def _optimizer() -> optax.GradientTransformation:
 
 def _init(
     key: jax.Array, config: Config, observation_size: int, action_size: int
-) -> AdversarialState:
+) -> Learner:
     params = _network(config).init(
         key, jnp.zeros(observation_size), jnp.zeros(action_size)
     )
-    return AdversarialState(params, _optimizer().init(params))
+    return learner.init(params, _optimizer())
 
 
 class Source(NamedTuple):
@@ -124,12 +117,12 @@ _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
 
 
 def _train_discriminator(
-    state: AdversarialState, source: Source, context: Context, key: jax.Array
-) -> tuple[AdversarialState, Metrics]:
+    state: Learner, source: Source, context: Context, key: jax.Array
+) -> tuple[Learner, Metrics]:
     """Gradient steps on the discriminator; none count while there is no source.
 
-    `Config.discriminator_updates` of them, of which the first
-    `Hyperparameters.max_discriminator_updates` count.
+    As many as the configuration's own `discriminator_updates`, of which a member's
+    first `discriminator_updates` count.
     """
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters
@@ -146,7 +139,7 @@ def _train_discriminator(
             hyperparameters.discriminator_entropy_coefficient,
         )
 
-    def step(state: AdversarialState, key_and_counts: tuple[Any, Any]) -> Any:
+    def step(state: Learner, key_and_counts: tuple[Any, Any]) -> Any:
         key, counts = key_and_counts
         policy_key, good_key = jax.random.split(key)
         rows = jax.random.randint(
@@ -159,28 +152,25 @@ def _train_discriminator(
             (normalize(observation[rows]), action[rows]),
             (normalize(good_observation), good_action),
         )
-        updates, optimizer_state = transform.update(gradient, state.optimizer_state)
-        params = jax.tree.map(
-            lambda p, u: p - hyperparameters.discriminator_learning_rate * u,
-            state.params,
-            updates,
+        stepped = learner.descend(
+            state, gradient, transform, hyperparameters.discriminator_learning_rate
         )
-        return choose(counts, AdversarialState(params, optimizer_state), state), metrics
+        return choose(counts, stepped, state), metrics
 
     choose = lambda condition, new, old: jax.tree.map(
         lambda a, b: jnp.where(condition, a, b), new, old
     )
-    num_updates = config.discriminator_updates
-    counts = jnp.ones(num_updates, bool)
-    if (most := hyperparameters.max_discriminator_updates) is not None:
-        counts &= jnp.arange(num_updates) < jnp.asarray(most, jnp.int32)
+    num_updates = config.hyperparameters.discriminator_updates
+    counts = jnp.arange(num_updates) < jnp.asarray(
+        hyperparameters.discriminator_updates, jnp.int32
+    )
     trained, metrics = jax.lax.scan(
         step, state, (jax.random.split(key, num_updates), counts)
     )
     ready = source.is_ready(context)
+    mean = lambda x: jnp.sum(x, where=counts) * (1.0 / jnp.sum(counts))
     metrics = {
-        name: jnp.where(ready, jnp.mean(value, where=counts), jnp.nan)
-        for name, value in metrics.items()
+        name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
     }
     return choose(ready, trained, state), metrics
 
@@ -188,10 +178,10 @@ def _train_discriminator(
 def _update_and_reward(
     source: Source,
     combine: Callable[[jax.Array, jax.Array], jax.Array],
-) -> Callable[[AdversarialState, Context, jax.Array], Any]:
+) -> Callable[[Learner, Context, jax.Array], Any]:
     def update_and_reward(
-        state: AdversarialState, context: Context, key: jax.Array
-    ) -> tuple[AdversarialState, jax.Array, Metrics]:
+        state: Learner, context: Context, key: jax.Array
+    ) -> tuple[Learner, jax.Array, Metrics]:
         state, metrics = _train_discriminator(state, source, context, key)
         rollout = context.rollout
         observation = normalization.normalize(context.normalizer, rollout.observation)
@@ -217,11 +207,13 @@ _reward_and_bonus = lambda reward, bonus: reward + bonus
 _bonus_alone = lambda reward, bonus: bonus
 
 _FIELDS = (
-    *("alpha", "discriminator_learning_rate", "discriminator_entropy_coefficient"),
-    *("discriminator_updates", "max_discriminator_updates"),
+    "alpha",
+    "discriminator_learning_rate",
+    "discriminator_entropy_coefficient",
+    "discriminator_updates",
     "discriminator_minibatch_size",
 )
-_FIELDS_OF_BUFFER = (*_FIELDS, "buffer_steps", "max_buffer_steps")
+_FIELDS_OF_BUFFER = (*_FIELDS, "buffer_steps")
 
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(

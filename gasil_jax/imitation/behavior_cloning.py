@@ -16,7 +16,9 @@ from gasil_jax import good_trajectories, normalization, ppo
 from gasil_jax.config import Config
 from gasil_jax.imitation.interface import Context, Imitation, Metrics
 from gasil_jax.imitation.none import no_state, plain_reward
+from gasil_jax.learner import Learner
 from gasil_jax.networks import gaussian_log_prob
+from gasil_jax.ppo import ActorCritic
 
 
 def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
@@ -25,45 +27,38 @@ def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
 
 
 def _update_policy(
-    state: tuple[()],
-    params: Any,
-    optimizer_state: Any,
-    learning_rate: jax.Array | float,
-    context: Context,
-    key: jax.Array,
-) -> tuple[tuple[()], Any, Any, Metrics]:
+    state: tuple[()], actor_critic: ActorCritic, context: Context, key: jax.Array
+) -> tuple[tuple[()], ActorCritic, Metrics]:
     config: Config = context.config
     coefficient = context.hyperparameters.behavior_cloning_coefficient
 
-    def objective(policy: Any, observation: jax.Array, action: jax.Array) -> Any:
-        mean, log_std = context.policy(policy, observation)
+    def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
+        mean, log_std = context.policy(params, observation)
         value = loss(mean, log_std, action)
         return coefficient * value, value
 
-    def step(carry: Any, key: jax.Array) -> Any:
+    def step(policy: Learner, key: jax.Array) -> Any:
         observation, action = good_trajectories.sample(
             key, context.good_trajectories, config.behavior_cloning_minibatch_size
         )
         observation = normalization.normalize(context.normalizer, observation)
-        policy, policy_state = carry
-        gradient, value = jax.grad(objective, has_aux=True)(policy, observation, action)
-        carry = ppo.descend(
-            policy, policy_state, gradient, learning_rate, context.hyperparameters
+        gradient, value = jax.grad(objective, has_aux=True)(
+            policy.params, observation, action
         )
-        return carry, value
+        return ppo.descend_one(policy, gradient, context.hyperparameters), value
 
-    before = (params["policy"], optimizer_state["policy"])
-    after, values = jax.lax.scan(
-        step, before, jax.random.split(key, config.behavior_cloning_updates)
+    cloned, values = jax.lax.scan(
+        step,
+        actor_critic.policy,
+        jax.random.split(key, config.behavior_cloning_updates),
     )
     has_good = context.good_trajectories.size > 0
-    policy, policy_state = jax.tree.map(
-        lambda a, b: jnp.where(has_good, a, b), after, before
+    policy = jax.tree.map(
+        lambda new, old: jnp.where(has_good, new, old), cloned, actor_critic.policy
     )
-    params = {**params, "policy": policy}
-    optimizer_state = {**optimizer_state, "policy": policy_state}
     cloning_loss = jnp.where(has_good, jnp.mean(values), jnp.nan)
-    return state, params, optimizer_state, {"behavior_cloning_loss": cloning_loss}
+    metrics = {"behavior_cloning_loss": cloning_loss}
+    return state, actor_critic.replace(policy=policy), metrics
 
 
 PPO_BC = Imitation(
@@ -71,7 +66,9 @@ PPO_BC = Imitation(
     plain_reward,
     _update_policy,
     fields=(
-        *("buffer_steps", "max_buffer_steps", "behavior_cloning_coefficient"),
-        *("behavior_cloning_updates", "behavior_cloning_minibatch_size"),
+        "buffer_steps",
+        "behavior_cloning_coefficient",
+        "behavior_cloning_updates",
+        "behavior_cloning_minibatch_size",
     ),
 )

@@ -9,6 +9,7 @@ from flax import struct
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.good_trajectories import GoodTrajectories, History
 from gasil_jax.normalization import Normalizer
+from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
 
 Metrics = dict[str, jax.Array]
@@ -56,21 +57,28 @@ def check_without_expert(
         )
 
 
+def one_stream(hyperparameters: Hyperparameters) -> tuple[float, ...]:
+    """The weights of an agent that gives one reward: a `stream_weights`."""
+    return (1.0,)
+
+
 class Imitation(NamedTuple):
     """Pure functions; their state is a pytree that the loop carries.
 
     Attributes:
       init: (key, config, observation size, action size) -> state.
-      update_and_reward: (state, context, key) -> state, reward (time, env),
-        metrics. Learns from the batch, and gives the reward that PPO maximizes.
-      update_policy: (state, params, optimizer state, learning rate, context, key)
-        -> state, params, optimizer state, metrics. Gradient steps of its own on
-        the policy and value after PPO's.
+      update_and_reward: (state, context, key) -> state, rewards, metrics. Learns from
+        the batch, and gives the rewards that PPO maximizes: (time, env), or
+        (time, env, stream) of several streams, each with a value of its own.
+      update_policy: (state, actor_critic, context, key) -> state, actor_critic,
+        metrics. Gradient steps of its own on the policy and the values after PPO's.
       check: (config, observation size, action size), raises `ValueError` for what
         the agent can't run with, before anything compiles; default
         `check_without_expert`.
       fields: of `Config` and `Hyperparameters` those that it looks at, PPO's apart:
         a sweep of the others would change nothing. None where it does not say.
+      stream_weights: hyperparameters -> the weight of each reward stream's standardized
+        advantage in the policy's; default one stream of weight 1.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -78,20 +86,15 @@ class Imitation(NamedTuple):
         [Any, Context, jax.Array], tuple[Any, jax.Array, Metrics]
     ]
     update_policy: Callable[
-        [Any, Any, Any, jax.Array | float, Context, jax.Array],
-        tuple[Any, Any, Any, Metrics],
+        [Any, ActorCritic, Context, jax.Array], tuple[Any, ActorCritic, Metrics]
     ]
     check: Callable[[Config, int, int], None] = check_without_expert
     fields: tuple[str, ...] | None = None
+    stream_weights: Callable[[Hyperparameters], tuple[Any, ...]] = one_stream
 
 
 def leave_policy(
-    state: Any,
-    params: Any,
-    optimizer_state: Any,
-    learning_rate: jax.Array | float,
-    context: Context,
-    key: jax.Array,
-) -> tuple[Any, Any, Any, Metrics]:
+    state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
+) -> tuple[Any, ActorCritic, Metrics]:
     """An `update_policy` that takes no steps."""
-    return state, params, optimizer_state, {}
+    return state, actor_critic, {}

@@ -26,6 +26,7 @@ from gasil_jax.config import Config
 from gasil_jax.good_trajectories import History
 from gasil_jax.imitation.interface import Context, Imitation, Metrics
 from gasil_jax.networks import gaussian_log_prob
+from gasil_jax.ppo import ActorCritic
 
 _PRIORITY_EXPONENT = 0.6
 _IMPORTANCE_EXPONENT = 0.1
@@ -213,13 +214,8 @@ def _update_and_reward(
 
 
 def _update_policy(
-    replay: Replay,
-    params: Any,
-    optimizer_state: Any,
-    learning_rate: jax.Array | float,
-    context: Context,
-    key: jax.Array,
-) -> tuple[Replay, Any, Any, Metrics]:
+    replay: Replay, actor_critic: ActorCritic, context: Context, key: jax.Array
+) -> tuple[Replay, ActorCritic, Metrics]:
     config, hyperparameters = context.config, context.hyperparameters
     normalize = lambda x: normalization.normalize(context.normalizer, x)
     # The replay's returns are the environment's; the value is of normalized rewards.
@@ -230,7 +226,8 @@ def _update_policy(
         log_prob = gaussian_log_prob(
             *context.policy(params["policy"], observation), rows.action
         )
-        value = context.value(params["value"], observation)
+        (critic,) = params["values"]
+        value = context.value(critic, observation)
         total, fraction = loss(
             log_prob,
             value,
@@ -242,32 +239,30 @@ def _update_policy(
         return hyperparameters.sil_coefficient * total, (value, fraction)
 
     def step(carry: Any, key: jax.Array) -> Any:
-        params, optimizer_state, priority = carry
+        actor_critic, priority = carry
         place, weight = sample(
             key, replay.replace(priority=priority), config.sil_minibatch_size
         )
         rows = replay.at(place)
         rows = rows._replace(return_=rows.return_ / context.reward_scale)
         gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
-            params, rows, weight
+            actor_critic.params, rows, weight
         )
-        params, optimizer_state = ppo.descend_each(
-            params, optimizer_state, gradient, learning_rate, hyperparameters
-        )
+        actor_critic = ppo.descend(actor_critic, gradient, hyperparameters)
         advantage = clipped_advantage(rows.return_, value, scale)
         priority = priority.at[place].set(jnp.maximum(advantage, _LEAST_PRIORITY))
-        return (params, optimizer_state, priority), fraction
+        return (actor_critic, priority), fraction
 
-    before = (params, optimizer_state, replay.priority)
+    before = (actor_critic, replay.priority)
     after, fraction = jax.lax.scan(
         step, before, jax.random.split(key, config.sil_updates)
     )
     filled = jnp.any(replay.priority > 0)
-    params, optimizer_state, priority = jax.tree.map(
+    actor_critic, priority = jax.tree.map(
         lambda a, b: jnp.where(filled, a, b), after, before
     )
     metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}
-    return replay.replace(priority=priority), params, optimizer_state, metrics
+    return replay.replace(priority=priority), actor_critic, metrics
 
 
 PPO_SIL = Imitation(
@@ -275,7 +270,10 @@ PPO_SIL = Imitation(
     _update_and_reward,
     _update_policy,
     fields=(
-        *("sil_coefficient", "sil_value_coefficient", "sil_updates"),
-        *("sil_minibatch_size", "sil_buffer_steps"),
+        "sil_coefficient",
+        "sil_value_coefficient",
+        "sil_updates",
+        "sil_minibatch_size",
+        "sil_buffer_steps",
     ),
 )
