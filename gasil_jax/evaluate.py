@@ -112,7 +112,8 @@ def load(
 
     Args:
       folder: of the run or sweep, finished or not.
-      which: of its checkpoints, "last" or "best" (the highest mean return).
+      which: of its checkpoints, "last" or "best", the one with the best evaluation
+        on the way or, where there was none, the highest returns in training.
       point: of a sweep; default the best by mean.
       seed: its number; default all.
 
@@ -136,7 +137,7 @@ def load(
             )
         found = checkpoint.best(saved.root)
     if found is None:
-        scored = " in whose time an episode ended" if which == "best" else ""
+        scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     with command_line.input_checked():
