@@ -24,7 +24,8 @@ class Batch:
     """Functions that train many members, each a seed with its hyperparameters.
 
     Attributes:
-      num_members: asked for; arrays are padded to a multiple of the devices.
+      env: one environment.
+      seeds: absolute seed number of each member.
       config: what runs.
       chunk: most iterations in one call of `advance`.
       init: () -> states, (padded, ...) each leaf.
@@ -36,7 +37,8 @@ class Batch:
       sharding: of the states.
     """
 
-    num_members: int
+    env: Any
+    seeds: Sequence[int]
     config: Config
     chunk: int
     init: Callable[[], Any]
@@ -45,6 +47,11 @@ class Batch:
     compiled: Callable[[Any], Callable[[Any, Any], Any]]
     devices: Sequence[jax.Device]
     sharding: NamedSharding
+
+    @property
+    def num_members(self) -> int:
+        """How many are asked for; arrays are padded to a multiple of the devices."""
+        return len(self.seeds)
 
     @property
     def device_kind(self) -> str:
@@ -66,7 +73,24 @@ class Batch:
     ) -> "Batch":
         """Other members, as many, for the same compiled program."""
         init = lambda: self.init_members(seeds, hyperparameters)
-        return dataclasses.replace(self, init=init)
+        return dataclasses.replace(self, init=init, seeds=seeds)
+
+    def of_members(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """A function of one member's arrays, for all members: sharded as in training.
+
+        Compiles when it is first called. Takes and gives padded arrays, (padded, ...).
+        """
+        mesh, spec = self.sharding.mesh, self.sharding.spec
+        # Nothing passes between the members, so nothing is to be checked.
+        return jax.jit(
+            jax.shard_map(
+                jax.vmap(function),
+                mesh=mesh,
+                in_specs=spec,
+                out_specs=spec,
+                check_vma=False,
+            )
+        )
 
     def train(
         self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
@@ -185,7 +209,8 @@ def make_batch(
         return programs[0]
 
     return Batch(
-        num_members=len(seeds),
+        env=env,
+        seeds=seeds,
         config=config,
         chunk=chunk,
         init=lambda: init_members(seeds, hyperparameters),

@@ -15,6 +15,7 @@ training goes on from the one before.
 import contextlib
 import hashlib
 import json
+import math
 import os
 import pathlib
 import shutil
@@ -207,6 +208,11 @@ def best(root: pathlib.Path) -> Checkpoint | None:
         with contextlib.suppress(ValueError):
             return read(folder)
     return None
+
+
+def best_score(root: pathlib.Path) -> float:
+    """The highest "score" in a record, minus infinity where none has any."""
+    return max(_scores(_folders(root)).values(), default=-math.inf)
 
 
 def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:

@@ -1,8 +1,9 @@
 """Train a batch for a command line: chunk by chunk, logged, saved and interruptible.
 
-The folder that it is given gets metrics.csv and checkpoints/. What a checkpoint has
-seen of metrics.csv is recorded in it, so that a run that goes on from it cuts the file
-there and writes the same rows again.
+The folder that it is given gets metrics.csv, checkpoints/ and, where policies are
+evaluated on the way, evaluations.csv. What a checkpoint has seen of the two tables is
+recorded in it, so that a run that goes on from it cuts them there and writes the same
+rows again.
 """
 
 import dataclasses
@@ -19,6 +20,7 @@ import numpy as np
 from gasil_jax import checkpoint, command_line, logging
 from gasil_jax.batch import Batch
 from gasil_jax.interruption import Interrupted, Interruption
+from gasil_jax.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
 from gasil_jax.progress import Progress
 from gasil_jax.trackers import Tracker, log
 
@@ -33,7 +35,8 @@ class CheckpointSchedule:
 
     Attributes:
       every: environment steps of a seed between two of them; None for ten minutes.
-      keep: so many of the newest, and the one with the best returns.
+      keep: so many of the newest, and the one with the best evaluation or, where
+        there is none, the best returns since the one before.
     """
 
     every: int | None
@@ -47,14 +50,50 @@ class Outcome:
     Attributes:
       states: of the members, after the last iteration.
       new_steps: environment steps over all members, without those of a checkpoint.
-      compile_seconds: of this process.
-      train_seconds: of this process.
+      compile_seconds: of this process, for training.
+      train_seconds: of this process, without its evaluations.
+      evaluation_seconds: of this process, compiling included; None without evaluations.
     """
 
     states: Any
     new_steps: int
     compile_seconds: float
     train_seconds: float
+    evaluation_seconds: float | None
+
+
+def _restored(
+    runs: Batch, root: pathlib.Path, progress: Progress
+) -> tuple[Any, int, Mapping[str, Any] | None]:
+    """The states of the newest whole checkpoint, its iteration and its record.
+
+    Without one the states and the record are None, and the iteration is 0. What is
+    newer is damaged, told and set aside.
+    """
+    with progress.aside("reading the checkpoints"):
+        newest, damages = checkpoint.latest(root)
+    for damage in damages:
+        instead = "starting anew" if newest is None else f"using {newest.folder.name}"
+        print(f"warning: {damage}; {instead}", file=sys.stderr)
+    checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
+    if newest is None:
+        return None, 0, None
+    with progress.aside(f"restoring {newest.folder.name}"):
+        like = jax.eval_shape(lambda: runs.trim(runs.init()))
+        with command_line.input_checked():
+            return newest.restore(like), newest.iteration, newest.record
+
+
+def _size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
+    """Where a table goes on: what the checkpoint has seen of it; None where it begins.
+
+    Args:
+      path: of the table, such as metrics.csv.
+      record: of the checkpoint that training goes on from; None without one.
+    """
+    if record is not None:
+        return record[f"{path.stem}_size"]
+    return 0 if path.exists() else None
 
 
 def drive(
@@ -65,6 +104,7 @@ def drive(
     schedule: CheckpointSchedule,
     progress: Progress,
     interruption: Interruption,
+    evaluation_schedule: EvaluationSchedule | None = None,
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
     until: int | None = None,
@@ -73,41 +113,39 @@ def drive(
 
     Args:
       runs: what to train.
-      folder: of metrics.csv and checkpoints/.
-      labels: what metrics.csv calls the members, (members,) each.
+      folder: of metrics.csv, evaluations.csv and checkpoints/.
+      labels: what the tables call the members, (members,) each.
       schedule: of the checkpoints.
       progress: told what is going on.
       interruption: looked at after each chunk; a checkpoint is written then.
+      evaluation_schedule: of evaluations on the way; None for none.
       steps_before: environment steps that `progress` has counted already.
       trackers: given the metrics too, and closed.
       until: pause after so many iterations; a checkpoint is written then.
 
     Raises:
       Interrupted: after the checkpoint that an interruption asks for.
-      InputError: the checkpoint is of another state, or metrics.csv is damaged.
+      InputError: the checkpoint is of another state, or a table is damaged.
       OSError: the folder can't be written, or the disk is full.
     """
     config, root = runs.config, folder / "checkpoints"
     last = config.num_iterations if until is None else until
     steps_of = lambda done: done * config.batch_steps * runs.num_members
-    with progress.aside("reading the checkpoints"):
-        found, damages = checkpoint.latest(root)
-    for damage in damages:
-        instead = "starting anew" if found is None else f"using {found.folder.name}"
-        print(f"warning: {damage}; {instead}", file=sys.stderr)
-    checkpoint.set_aside(root, newer_than=-1 if found is None else found.iteration)
-    first, states, size = 0, None, None
-    if found is not None:
-        with progress.aside(f"restoring {found.folder.name}"):
-            like = jax.eval_shape(lambda: runs.trim(runs.init()))
-            first = found.iteration
-            with command_line.input_checked():
-                states = found.restore(like)
-        size = found.record["metrics_size"]
-    elif (folder / "metrics.csv").exists():
-        size = 0
+    states, first, record = _restored(runs, root, progress)
+    evaluation = None
     with command_line.input_checked():
-        writer = logging.MetricsWriter(folder / "metrics.csv", labels, size)
+        path = folder / "metrics.csv"
+        writer = logging.MetricsWriter(path, labels, _size(path, record))
+        if evaluation_schedule is not None:
+            path = folder / "evaluations.csv"
+            evaluation = PeriodicEvaluation(
+                runs,
+                evaluation_schedule,
+                path,
+                labels=labels,
+                size=_size(path, record),
+                following=trackers,
+            )
 
     started = time.monotonic()
     if first < last:
@@ -119,12 +157,15 @@ def drive(
     saved_at = started = time.monotonic()
     done, pace = first, math.inf
     recent: list[np.ndarray] = []
+    # Of the evaluation of the states as they are now.
+    evaluated: float | None = None
     every = schedule.every and math.ceil(schedule.every / config.batch_steps)
 
     def save() -> None:
-        returns = np.concatenate(recent, axis=1) if recent else np.full((1, 1), np.nan)
-        score = float(np.nanmean(returns)) if np.isfinite(returns).any() else None
-        record = {"metrics_size": writer.size(), "score": score}
+        record = {"metrics_size": writer.size(), "score": _mean(recent)}
+        if evaluation is not None:
+            # Where policies are evaluated, one that was not has no score.
+            record |= {"evaluations_size": evaluation.size(), "score": evaluated}
         with progress.aside("saving a checkpoint"):
             checkpoint.write(root, done, runs.trim(states), record)
             checkpoint.prune(root, schedule.keep)
@@ -134,6 +175,8 @@ def drive(
         counts.append(max(1, int(_SECONDS_BETWEEN_LOOKS / pace)))
         if every is not None:
             counts.append(every - done % every)
+        if evaluation is not None:
+            counts.append(evaluation.iterations_left(done))
         count = min(counts)
         looked = time.monotonic()
         states, metrics = runs.train(advance, states, done, count)
@@ -147,12 +190,20 @@ def drive(
             due = time.monotonic() - saved_at > _SECONDS_BETWEEN_CHECKPOINTS
         else:
             due = done % every == 0
+        evaluated = None
+        if evaluation is not None and evaluation.is_due(done):
+            with progress.aside("evaluating the policies"):
+                evaluated = evaluation.score(states, done)
+            due |= evaluated > checkpoint.best_score(root)
         if due:
             save()
             saved_at, recent = time.monotonic(), []
     train_seconds = time.monotonic() - started
     save()
     writer.close()
+    if evaluation is not None:
+        evaluation.close()
+        train_seconds -= evaluation.seconds
     with progress.aside("closing the trackers"):
         for tracker in trackers:
             tracker.close()
@@ -163,4 +214,12 @@ def drive(
         new_steps=steps_of(done - first),
         compile_seconds=compile_seconds,
         train_seconds=train_seconds,
+        evaluation_seconds=None if evaluation is None else evaluation.seconds,
     )
+
+
+def _mean(returns: Sequence[np.ndarray]) -> float | None:
+    """The mean of all that are finite; None where none is."""
+    finite = [x[np.isfinite(x)] for x in returns]
+    every = np.concatenate(finite) if finite else np.empty(0)
+    return float(every.mean()) if every.size else None

@@ -1,4 +1,4 @@
-"""Score policies: as a function, and ``python -m gasil_jax.evaluate RUN``."""
+"""Score the policies of a run: ``python -m gasil_jax.evaluate RUN``."""
 
 import csv
 import dataclasses
@@ -12,13 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gasil_envs import wrappers
-from gasil_envs.precision import full_precision
 from gasil_jax import (
     batch,
     command_line,
     environments,
-    normalization,
     numpy_policy,
     output_file,
     policy,
@@ -28,70 +25,9 @@ from gasil_jax import (
 )
 from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, validate
+from gasil_jax.evaluation import evaluate
 from gasil_jax.imitation import AGENTS
-from gasil_jax.networks import Policy
 from gasil_jax.progress import announced
-
-
-@full_precision
-def evaluate(
-    env: Any,
-    config: Config,
-    state: train.TrainState,
-    key: jax.Array,
-    *,
-    num_episodes: int,
-    deterministic: bool = True,
-) -> dict[str, jax.Array]:
-    """Run whole episodes with the policy of one training state.
-
-    Pure: jit it, and vmap it over states. The return is of the environment's true
-    reward (undelayed, unshaped, undiscounted).
-
-    Args:
-      env: one environment.
-      config: of the run.
-      state: of one run, not of a batch of them.
-      key: consumed.
-      num_episodes: run side by side.
-      deterministic: act with the policy's mean; else draw from the policy.
-
-    Returns:
-      "episode_return" and "episode_length", (num_episodes,) each.
-    """
-    network: Any = Policy(config.hidden_sizes, env.action_size)
-    low, high = getattr(env, "action_range", (-1.0, 1.0))
-    reset_key, act_key = jax.random.split(key)
-
-    def act(observation: jax.Array, key: jax.Array) -> jax.Array:
-        observation = normalization.normalize(state.normalizer, observation)
-        mean, log_std = network.apply(state.actor_critic.policy.params, observation)
-        noise = jax.random.normal(key, mean.shape, mean.dtype)
-        action = mean if deterministic else mean + jnp.exp(log_std) * noise
-        return jnp.clip(action, low, high)
-
-    def step(carry: Any, key: jax.Array) -> Any:
-        states, running, return_, length = carry
-        states = jax.vmap(env.step)(states, act(states.obs, key))
-        reward = states.info.get("true_reward", states.reward)
-        sound = normalization.is_sound(states.obs).all(axis=-1)
-        sound &= normalization.is_sound(reward)
-        # As in training a step of failed physics ends the episode with reward 0.
-        return_ = return_ + jnp.where(running & sound, reward, 0.0)
-        length = length + running
-        ended = (states.done > 0) | wrappers.truncated(states)
-        running = running & ~ended & sound
-        return (states, running, return_, length), None
-
-    start = (
-        jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes)),
-        jnp.ones(num_episodes, bool),
-        jnp.zeros(num_episodes),
-        jnp.zeros(num_episodes, jnp.int32),
-    )
-    keys = jax.random.split(act_key, train.max_episode_steps(env, config))
-    _, _, return_, length = jax.lax.scan(step, start, keys)[0]
-    return {"episode_return": return_, "episode_length": length}
 
 
 def evaluate_in_gymnasium(
@@ -176,7 +112,8 @@ def load(
 
     Args:
       folder: of the run or sweep, finished or not.
-      which: of its checkpoints, "last" or "best" (the highest mean return).
+      which: of its checkpoints, "last" or "best", the one with the best evaluation
+        on the way or, where there was none, the highest returns in training.
       point: of a sweep; default the best by mean.
       seed: its number; default all.
 
@@ -200,7 +137,7 @@ def load(
             )
         found = checkpoint.best(saved.root)
     if found is None:
-        scored = " in whose time an episode ended" if which == "best" else ""
+        scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     with command_line.input_checked():

@@ -1,4 +1,4 @@
-"""The files of a run folder: config.json, metrics.csv, summary.json."""
+"""The files of a run folder: config.json, summary.json, and its tables in CSV."""
 
 import csv
 import dataclasses
@@ -65,7 +65,7 @@ def _to_json(value: Any) -> Any:
 
 
 class MetricsWriter:
-    """Appends a row for each member and iteration to metrics.csv.
+    """Appends a row for each member and iteration to a table such as metrics.csv.
 
     A value that is not finite (no episode ended yet, no discriminator) is left empty;
     the others are written so that float32 reads them back unchanged.
@@ -75,6 +75,7 @@ class MetricsWriter:
       labels: columns that tell the members apart, (members,) each: "seed" and others.
       size: where to go on: the file is cut there and the rest is kept beside it;
         None for a new file.
+      columns: metrics that are written first, in this order; others follow.
 
     Raises:
       FileExistsError: a new file would replace one.
@@ -86,7 +87,10 @@ class MetricsWriter:
         path: pathlib.Path,
         labels: Mapping[str, Sequence[Any]],
         size: int | None = None,
+        *,
+        columns: Sequence[str] = COLUMNS,
     ):
+        self._first = tuple(columns)
         self._columns: tuple[str, ...] | None = None
         self._labels = labels
         if size is None:
@@ -103,8 +107,8 @@ class MetricsWriter:
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
         """Write (members, iterations) arrays, one for each metric."""
         if self._columns is None:
-            own = tuple(sorted(set(metrics) - set(COLUMNS)))
-            self._columns = (*self._labels, *COLUMNS, *own)
+            own = tuple(sorted(set(metrics) - set(self._first)))
+            self._columns = (*self._labels, *self._first, *own)
             self._writer.writerow(self._columns)
         members, iterations = metrics["env_steps"].shape
         labels = list(zip(*self._labels.values(), strict=True))
@@ -156,7 +160,7 @@ def _cell(value: Any) -> str:
 def read_metrics(
     path: pathlib.Path, labels: Sequence[str], num_members: int
 ) -> dict[str, np.ndarray]:
-    """Every metric of a metrics.csv, (members, iterations) each; NaN where empty.
+    """Every column of a `MetricsWriter`, (members, iterations); NaN where empty.
 
     Args:
       path: of the file.

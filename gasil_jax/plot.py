@@ -3,7 +3,7 @@
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -49,12 +49,15 @@ class Curves(NamedTuple):
       env_steps: (points,).
       returns: (seeds, points), each the mean of the episodes since the point before.
       final: (seeds,), mean over the last tenth of training.
+      evaluations: "env_steps" and "mean" of those on the way, (seeds, evaluations)
+        each; None without any.
     """
 
     label: str
     env_steps: np.ndarray
     returns: np.ndarray
     final: np.ndarray
+    evaluations: Mapping[str, np.ndarray] | None
 
 
 _POINTS = 50
@@ -72,6 +75,10 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
             f"run is {folder}, a sweep: its plot is sweep.png, and its curves are in "
             "curves.npz"
         )
+    path, evaluations = folder / "evaluations.csv", None
+    # It may be too early for the first one.
+    if path.is_file() and path.stat().st_size:
+        evaluations = logging.read_metrics(path, ("seed",), described["seeds"])
     path = folder / "metrics.csv"
     try:
         metrics = logging.read_metrics(path, ("seed",), described["seeds"])
@@ -91,14 +98,16 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
         env_steps=np.array([steps[p[-1]] for p in some]),
         returns=np.stack([mean(returns[:, p]) for p in some], axis=1),
         final=final_returns(returns),
+        evaluations=evaluations,
     )
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
     """Write the figure: the interquartile mean over seeds, with 95% intervals.
 
-    Left, over environment steps; in the middle, of the final returns, with every seed;
-    right, the share of seeds above each final return.
+    Left, over environment steps, dashed of the evaluations on the way; in the middle,
+    of the final returns, with every seed; right, the share of seeds above each final
+    return.
     """
     import matplotlib
 
@@ -118,6 +127,11 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
         middle = statistics.interquartile_mean(run.returns, axis=0)
         curves.fill_between(run.env_steps, low, high, color=color, alpha=0.2, lw=0)
         curves.plot(run.env_steps, middle, style, color=color, label=run.label)
+        if run.evaluations is not None:
+            steps = run.evaluations["env_steps"][0]
+            middle = statistics.interquartile_mean(run.evaluations["mean"], axis=0)
+            label = f"{run.label}, evaluations"
+            curves.plot(steps, middle, "--", color=color, lw=1, label=label)
 
         low, high = statistics.bootstrap_interval(run.final)
         middle = statistics.interquartile_mean(run.final)

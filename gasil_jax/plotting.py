@@ -1,6 +1,7 @@
 """Learning curves from metrics."""
 
 import pathlib
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -66,17 +67,25 @@ def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
 
 
 def learning_curve(
-    path: pathlib.Path, env_steps: np.ndarray, episode_return: np.ndarray, title: str
+    path: pathlib.Path,
+    env_steps: np.ndarray,
+    episode_return: np.ndarray,
+    title: str,
+    *,
+    evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Save mean, spread and each seed's return over environment steps as a PNG.
 
-    Each point is the mean of the last fiftieth of training.
+    Each point is the mean of the last fiftieth of training. The mean of evaluations is
+    dashed.
 
     Args:
       path: where to.
       env_steps: (iterations,).
       episode_return: (seeds, iterations); NaN where no episode ended.
       title: of the plot.
+      evaluations: "env_steps" and "mean" of those on the way, (seeds, evaluations)
+        each; None without any.
     """
     import matplotlib
 
@@ -92,6 +101,10 @@ def learning_curve(
         seen, steps = episode_return[:, some], env_steps[some]
         mean, spread = np.nanmean(seen, axis=0), np.nanstd(seen, axis=0)
         draw_band(axes, steps, mean, spread, "#0072B2", "mean ± standard deviation")
+    if evaluations is not None:
+        steps, mean = evaluations["env_steps"][0], evaluations["mean"].mean(axis=0)
+        axes.plot(steps, mean, "--", color="#D55E00", label="mean of the evaluations")
+    if some.any() or evaluations is not None:
         axes.legend(frameon=False, loc="upper left")
     axes.set(xlabel="environment steps", ylabel="episode return", title=title)
     save(figure, path, dpi=150)

@@ -96,7 +96,12 @@ def check_memory(
 
 
 def check_episodes(
-    env: Any, num_episodes: int, num_policies: int, devices: Sequence[jax.Device]
+    env: Any,
+    num_episodes: int,
+    num_policies: int,
+    devices: Sequence[jax.Device],
+    *,
+    option: str = "episodes",
 ) -> None:
     """Refuse more episodes side by side than fit the devices.
 
@@ -105,6 +110,7 @@ def check_episodes(
       num_episodes: of each policy.
       num_policies: scored at once.
       devices: that they run on.
+      option: that gives their number.
 
     Raises:
       ValueError: the numbers.
@@ -113,7 +119,7 @@ def check_episodes(
     wanted, free = _STATES * state * num_episodes * num_policies, available(devices)
     if free is not None and wanted > free:
         raise ValueError(
-            f"episodes is {num_episodes}: of {num_policies} policies side by side they "
+            f"{option} is {num_episodes}: of {num_policies} policies side by side they "
             f"need at least {_in_words(wanted)} of memory, and {_in_words(free)} are "
             "free"
         )

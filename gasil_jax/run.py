@@ -14,7 +14,7 @@ import platform
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar
 
 import jax
@@ -33,6 +33,7 @@ from gasil_jax.progress import Progress, announced
 
 if TYPE_CHECKING:
     from gasil_jax import batch, driver
+    from gasil_jax.periodic_evaluation import EvaluationSchedule
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +53,11 @@ class Options:
       checkpoint_every: environment steps of a seed between two checkpoints; default
         ten minutes.
       keep_checkpoints: how many of the newest checkpoints are kept, besides the one
-        with the best returns.
+        with the best evaluation or, without evaluate_every, the best returns.
+      evaluate_every: environment steps of a seed between two evaluations of the
+        policy's mean action in fresh environments, rounded up to whole iterations;
+        default none. Scores, of the undelayed return, are in evaluations.csv.
+      evaluate_episodes: of each evaluation and seed; default 10.
       log: also to these, besides metrics.csv: tensorboard, wandb.
       preset: where the hyperparameters start from: tuned, by environment and agent,
         or paper, with the paper's one environment a seed, which is several times
@@ -69,6 +74,8 @@ class Options:
     resume: bool = False
     checkpoint_every: int | None = None
     keep_checkpoints: int = 2
+    evaluate_every: int | None = None
+    evaluate_episodes: int | None = None
     log: tuple[str, ...] = ()
     preset: str = "tuned"
     devices: int | None = None
@@ -175,8 +182,18 @@ def check(options: Options) -> None:
         validate(options.config, tuple(AGENTS))
         trackers.check(options.log)
     command_line.check_least(
-        options, seeds=1, devices=1, checkpoint_every=1, keep_checkpoints=1
+        options,
+        seeds=1,
+        devices=1,
+        checkpoint_every=1,
+        keep_checkpoints=1,
+        evaluate_every=1,
+        evaluate_episodes=1,
     )
+    if options.evaluate_episodes is not None and options.evaluate_every is None:
+        raise InputError(
+            f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
+        )
     last = 2**32 - options.seeds
     if last < 0:
         raise InputError(f"seeds is {options.seeds}: it must be from 1 to {2**32}")
@@ -184,6 +201,15 @@ def check(options: Options) -> None:
         raise InputError(
             f"first_seed is {options.first_seed}: it must be from 0 to {last}"
         )
+
+
+def evaluation_schedule(options: Options) -> "EvaluationSchedule | None":
+    """When policies are evaluated on the way; None if they are not."""
+    from gasil_jax.periodic_evaluation import EvaluationSchedule
+
+    if options.evaluate_every is None:
+        return None
+    return EvaluationSchedule(options.evaluate_every, options.evaluate_episodes or 10)
 
 
 def check_out(options: Options) -> None:
@@ -215,11 +241,20 @@ def check_resources(
     """
     from gasil_jax import resources
 
+    schedule = evaluation_schedule(options)
     with announced(options.env, "starting the devices"):
         devices = jax.devices()
     with command_line.input_checked():
         for config, num_members in at_once:
             resources.check_memory(env, config, num_members, devices)
+            if schedule is not None:
+                resources.check_episodes(
+                    env,
+                    schedule.num_episodes,
+                    num_members,
+                    devices,
+                    option="evaluate_episodes",
+                )
         folder = options.out or pathlib.Path("runs")
         # The best one too.
         resources.check_disk(env, saved, folder, options.keep_checkpoints + 1)
@@ -333,6 +368,7 @@ def train(options: Options, env: Any, folder: pathlib.Path) -> dict[str, Any]:
             schedule=driver.CheckpointSchedule(
                 options.checkpoint_every, options.keep_checkpoints
             ),
+            evaluation_schedule=evaluation_schedule(options),
             progress=progress,
             interruption=interruption,
             trackers=following,
@@ -355,8 +391,16 @@ def _write_results(
     seeds = range(options.first_seed, options.first_seed + options.seeds)
     metrics = logging.read_metrics(folder / "metrics.csv", ("seed",), options.seeds)
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
+    evaluations = None
+    if options.evaluate_every is not None:
+        path = folder / "evaluations.csv"
+        evaluations = logging.read_metrics(path, ("seed",), options.seeds)
     plotting.learning_curve(
-        folder / "learning_curve.png", steps, returns, f"{options.env}, {config.agent}"
+        folder / "learning_curve.png",
+        steps,
+        returns,
+        f"{options.env}, {config.agent}",
+        evaluations=evaluations,
     )
     final = final_returns(returns)
     policy.save(folder / "policy.npz", outcome.states, env, seeds, final)
@@ -375,16 +419,18 @@ def _write_results(
         "device_count": len(runs.devices),
         "versions": logging.versions(),
     }
+    lengths = final_returns(metrics["episode_length"])
+    finals = {"final_return": final, "final_length": lengths}
+    if evaluations is not None:
+        finals["final_evaluation"] = evaluations["mean"][:, -1]
+        trained["evaluation_seconds"] = outcome.evaluation_seconds
     if not outcome.new_steps:
         trained = _on_record(folder / "summary.json", trained)
     summary = {
         "env": options.env,
         "agent": config.agent,
         "env_steps_per_seed": int(steps[-1]),
-        "final_return": {str(seed): None for seed in seeds} | by_seed(final, float),
-        "final_return_mean": None
-        if np.isnan(final).all()
-        else float(np.nanmean(final)),
+        **_by_seed_and_mean(seeds, finals),
         "faulty_steps": by_seed(faulty, int),
         "skipped_updates": by_seed(skipped, int),
         "unhealthy_seeds": [
@@ -394,6 +440,22 @@ def _write_results(
     }
     logging.write_json(folder / "summary.json", summary)
     return summary
+
+
+def _by_seed_and_mean(
+    seeds: Sequence[int], quantities: Mapping[str, np.ndarray]
+) -> dict[str, Any]:
+    """Each quantity, (seeds,), by seed and, as NAME_mean, its mean; NaN is None."""
+    fields: dict[str, Any] = {}
+    for name, values in quantities.items():
+        finite = np.isfinite(values)
+        fields[name] = {
+            str(seed): float(value) if is_finite else None
+            for seed, value, is_finite in zip(seeds, values, finite, strict=True)
+        }
+        mean = float(values[finite].mean()) if finite.any() else None
+        fields[f"{name}_mean"] = mean
+    return fields
 
 
 def _on_record(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
@@ -408,8 +470,9 @@ def _on_record(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
 def final_returns(returns: np.ndarray) -> np.ndarray:
     """Each seed's mean return over the last tenth of iterations, (seeds,).
 
-    Where no episode ended in that time, of the last iteration in which one did, for in
-    some tasks all last as long; NaN where none has.
+    The same of another metric of episodes: their length. Where no episode ended in that
+    time, of the last iteration in which one did, for in some tasks all last as long;
+    NaN where none has.
     """
     last = returns[:, -max(1, returns.shape[1] // 10) :]
     count = np.isfinite(last).sum(axis=1)
@@ -437,9 +500,15 @@ def _main(arguments: Sequence[str] | None) -> None:
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, folder)
     mean = summary["final_return_mean"]
+    evaluated = ""
+    if options.evaluate_every is not None:
+        evaluated = (
+            f"final evaluation {summary['final_evaluation_mean']:.1f} "
+            f"({summary['evaluation_seconds']:,.0f} s of evaluations), "
+        )
     print(
         f"final return {'none ended' if mean is None else format(mean, '.1f')} "
-        f"(mean over {options.seeds} seeds), "
+        f"(mean over {options.seeds} seeds), {evaluated}"
         f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}, "
         f"in {folder}"
     )

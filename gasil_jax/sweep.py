@@ -8,6 +8,8 @@ these two don't divide the points: all run in the program of the largest.
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
 curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png, and
 for each program a folder under programs/ with its metrics.csv and checkpoints. With
+--evaluate-every there is an evaluations.csv beside each metrics.csv, and curves.npz has
+its columns, (points, seeds, evaluations), as evaluation_mean and so on. With
 --shard 3/8 an eighth of all points and seeds is trained in a folder of its own,
 shards/3-of-8, without the tables, which gasil_jax.merge makes of all shards.
 """
@@ -121,6 +123,7 @@ def train(
                     place,
                     dict(zip(sweep_tables.LABELS, (indices, seeds))),
                     schedule=schedule,
+                    evaluation_schedule=run.evaluation_schedule(options),
                     progress=progress,
                     interruption=interruption,
                     steps_before=steps_before,
@@ -134,6 +137,7 @@ def train(
                     env_steps=outcome.new_steps,
                     compile_seconds=outcome.compile_seconds,
                     train_seconds=outcome.train_seconds,
+                    evaluation_seconds=outcome.evaluation_seconds,
                     device=runs.device_kind,
                     device_count=len(runs.devices),
                 )

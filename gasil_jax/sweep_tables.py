@@ -1,8 +1,9 @@
 """What a sweep comes to: from its programs' folders to results.csv and the others.
 
 A program's folder holds metrics.csv, a row for each member and iteration, and, once it
-is trained, training.json. Whether one process trained all programs or shards did on
-many hosts, the tables are made here, from those files alone.
+is trained, training.json; and evaluations.csv where policies were evaluated. Whether
+one process trained all programs or shards did on many hosts, the tables are made here,
+from those files alone.
 """
 
 import csv
@@ -34,8 +35,9 @@ def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> N
     Args:
       folder: of the sweep or shard.
       program: which one.
-      **measured: "env_steps" (over all members), "compile_seconds" and "train_seconds",
-        all of the process that ended it; "device" and "device_count".
+      **measured: "env_steps" (over all members), "compile_seconds", "train_seconds"
+        and "evaluation_seconds" (None without evaluations), all of the process that
+        ended it; "device" and "device_count".
     """
     iterations = program.config.num_iterations
     content = {"iterations": iterations, "members": len(program.members), **measured}
@@ -102,19 +104,40 @@ class Trained:
         Raises:
           InputError: metrics.csv is not what training has written.
         """
-        found = {}
+        every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
-            path = program.folder(self.folder) / "metrics.csv"
-            try:
-                metrics = logging.read_metrics(path, LABELS, len(program.members))
-                whole = len(metrics["env_steps"][0]) == program.config.num_iterations
-            except (OSError, ValueError, KeyError, IndexError) as error:
-                raise InputError(f"{path} is damaged: {error}") from None
-            if not whole:
-                raise InputError(f"{path} is damaged: it lacks iterations")
-            for position, member in enumerate(program.members):
-                found[member] = {name: x[position] for name, x in metrics.items()}
-        return found
+            every |= self._table(program, "metrics.csv", program.config.num_iterations)
+        return every
+
+    def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
+        """The same of every evaluation, (evaluations,) each; empty without evaluations.
+
+        Raises:
+          InputError: evaluations.csv is not what training has written.
+        """
+        every: dict[Member, dict[str, np.ndarray]] = {}
+        for program, training in zip(self.programs, self.trainings(), strict=True):
+            if training.get("evaluation_seconds") is not None:
+                every |= self._table(program, "evaluations.csv")
+        return every
+
+    def _table(
+        self, program: Program, name: str, rows: int | None = None
+    ) -> dict[Member, dict[str, np.ndarray]]:
+        """A program's table by member, to its end; `rows` are a member's, if known."""
+        path, config = program.folder(self.folder) / name, program.config
+        try:
+            columns = logging.read_metrics(path, LABELS, len(program.members))
+            steps = columns["env_steps"][0]
+            whole = steps[-1] == config.num_iterations * config.batch_steps
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            raise InputError(f"{path} is damaged: {error}") from None
+        if not whole or rows not in (None, len(steps)):
+            raise InputError(f"{path} is damaged: it lacks iterations")
+        return {
+            member: {column: x[position] for column, x in columns.items()}
+            for position, member in enumerate(program.members)
+        }
 
 
 def write(
@@ -134,27 +157,39 @@ def write(
       parts: finished, every point with every seed in one of them.
     """
     members: dict[Member, dict[str, np.ndarray]] = {}
+    evaluations: dict[Member, dict[str, np.ndarray]] = {}
     for part in parts:
         members |= part.members()
+        evaluations |= part.evaluations()
     curves = _curves(points, seeds, members)
+    of_point = lambda name, i: np.stack([members[i, seed][name] for seed in seeds])
     final = np.array(
-        [
-            final_returns(
-                np.stack([members[i, seed]["episode_return"] for seed in seeds])
-            )
-            for i in range(len(points))
-        ]
+        [final_returns(of_point("episode_return", i)) for i in range(len(points))]
     )
+    length = np.array(
+        [final_returns(of_point("episode_length", i)) for i in range(len(points))]
+    )
+    # (points, seeds) each, in columns and fields of this name.
+    finals = {"final_return": final, "final_length": length}
+    if evaluations:
+        scores = _curves(points, seeds, evaluations)
+        curves |= {f"evaluation_{name}": values for name, values in scores.items()}
+        last = lambda member: evaluations[member]["mean"][-1]
+        finals["final_evaluation"] = np.array(
+            [[last((i, seed)) for seed in seeds] for i in range(len(points))]
+        )
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     names = sorted({name for point in points for name in point})
     with (folder / "results.csv").open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow([*LABELS, *names, "final_return", "diverged"])
+        writer.writerow([*LABELS, *names, *finals, "diverged"])
         for index, point in enumerate(points):
-            for seed, value, bad in zip(seeds, final[index], diverged[index]):
-                cell = "" if math.isnan(value) else f"{value:.7g}"
-                own = (point.get(name, "") for name in names)
-                writer.writerow([index, seed, *own, cell, int(bad)])
+            own = [point.get(name, "") for name in names]
+            for position, seed in enumerate(seeds):
+                values = (x[index, position] for x in finals.values())
+                cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
+                bad = int(diverged[index, position])
+                writer.writerow([index, seed, *own, *cells, bad])
     np.savez_compressed(folder / "curves.npz", **curves)
     trainings = [training for part in parts for training in part.trainings()]
     fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
@@ -165,6 +200,11 @@ def write(
                 **point,
                 "mean": _finite(final[i].mean()),
                 "worst_seed": _finite(final[i].min()),
+                **{
+                    name: _finite(values[i].mean())
+                    for name, values in finals.items()
+                    if name != "final_return"
+                },
                 "diverged_seeds": int(diverged[i].sum()),
             }
             for i, point in enumerate(points)
@@ -182,14 +222,18 @@ def write(
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Seconds, steps/s and devices of programs that were trained one by one.
 
+    "evaluation_seconds" are there where policies were evaluated.
+
     Of shards, which run side by side, "env_steps_per_second" is one shard's on average.
     """
     total = lambda name: sum(training[name] for training in trainings)
     devices = _joined([{"device": training["device"]} for training in trainings])
+    evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
     return {
         "compile_seconds": total("compile_seconds"),
         "train_seconds": total("train_seconds"),
         "env_steps_per_second": total("env_steps") / max(total("train_seconds"), 1e-9),
+        **({"evaluation_seconds": total("evaluation_seconds")} if evaluated else {}),
         **devices,
         "device_count": max(training["device_count"] for training in trainings),
     }
@@ -209,7 +253,7 @@ def _curves(
     seeds: Sequence[int],
     members: Mapping[Member, Mapping[str, np.ndarray]],
 ) -> dict[str, Any]:
-    """Every metric, (points, seeds, iterations)."""
+    """Every metric, (points, seeds, iterations), NaN beyond a member's last."""
     # Points may differ in batch_steps, and so in iterations.
     length = max(len(metrics["env_steps"]) for metrics in members.values())
     pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
@@ -230,9 +274,12 @@ def _finite(value: float) -> float | None:
 
 def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
     """Lines that say how fast it was and which points are best."""
+    seconds = f"{summary['train_seconds']:,.0f} s of training"
+    if "evaluation_seconds" in summary:
+        seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
     lines = [
         f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}"
-        f" ({summary['train_seconds']:,.0f} s of training)"
+        f" ({seconds})"
     ]
     for title in ("best_by_mean", "best_by_worst_seed"):
         best = summary[title]

@@ -1,7 +1,8 @@
 """Metrics for TensorBoard and Weights & Biases, beside metrics.csv.
 
 A tracker is given what metrics.csv is given: "mean/NAME" is a metric's mean over the
-members, "episode_return/LABEL" a member's own; steps are environment steps of a member.
+members, "episode_return/LABEL" a member's own; "evaluation/mean" and "evaluation/LABEL"
+are the same of an evaluation's mean return. Steps are environment steps of a member.
 """
 
 import contextlib
@@ -127,16 +128,37 @@ def log(
     metrics: Mapping[str, np.ndarray],
 ) -> None:
     """Give a chunk of metrics, (members, iterations) each, to all trackers."""
-    members = list(zip(*labels.values(), strict=True))
     for index, step in enumerate(metrics["env_steps"][0] if trackers else ()):
         scalars = {}
         for name, values in metrics.items():
             column = values[:, index][np.isfinite(values[:, index])]
             if column.size and name != "env_steps":
                 scalars[f"mean/{name}"] = float(column.mean())
-        for member, value in zip(members, metrics["episode_return"][:, index]):
-            if np.isfinite(value):
-                label = "-".join(map(str, member))
-                scalars[f"episode_return/{label}"] = float(value)
+        returns = metrics["episode_return"][:, index]
+        scalars |= _by_member("episode_return", labels, returns)
         for tracker in trackers:
             tracker.log(int(step), scalars)
+
+
+def log_evaluation(
+    trackers: Sequence[Tracker],
+    labels: Mapping[str, Sequence[Any]],
+    scores: Mapping[str, np.ndarray],
+) -> None:
+    """Give the scores of an evaluation, (members,) each, to all trackers."""
+    mean = {"evaluation/mean": float(scores["mean"].mean())}
+    scalars = mean | _by_member("evaluation", labels, scores["mean"])
+    for tracker in trackers:
+        tracker.log(int(scores["env_steps"][0]), scalars)
+
+
+def _by_member(
+    name: str, labels: Mapping[str, Sequence[Any]], values: np.ndarray
+) -> dict[str, float]:
+    """The finite values, (members,), by the name with each member's label."""
+    members = zip(*labels.values(), strict=True)
+    return {
+        f"{name}/{'-'.join(map(str, member))}": float(value)
+        for member, value in zip(members, values, strict=True)
+        if np.isfinite(value)
+    }

@@ -23,7 +23,14 @@ native.reserve_threads(2)
 # of their time. What compares numbers is compiled as it is for users.
 _OF_COMMANDS = {
     *("test_experiments", "test_halving", "test_input", "test_plot", "test_readme"),
-    *("test_render", "test_resume", "test_run", "test_sweep", "test_trackers"),
+    *(
+        "test_periodic_evaluation",
+        "test_render",
+        "test_resume",
+        "test_run",
+        "test_sweep",
+        "test_trackers",
+    ),
 }
 
 

@@ -61,6 +61,7 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path):
         returns = np.array([np.nan, value, np.nan])
         return {
             "episode_return": returns,
+            "episode_length": 10 * returns,
             "env_steps": np.arange(3.0),
             "skipped_updates": np.zeros(3),
         }
@@ -69,6 +70,7 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path):
     training |= {"device": "cpu", "device_count": 1, "versions": {}}
     trained = types.SimpleNamespace(
         members=lambda: {(0, 5): metrics(1.0), (1, 5): metrics(2.0)},
+        evaluations=lambda: {},
         trainings=lambda: [training],
     )
     points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
@@ -76,9 +78,9 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path):
     assert summary["best_by_mean"] == 1
     header, *rows = (tmp_path / "results.csv").read_text().splitlines()
     assert header == (
-        "point,seed,alpha,buffer_steps,learning_rate,final_return,diverged"
+        "point,seed,alpha,buffer_steps,learning_rate,final_return,final_length,diverged"
     )
-    assert rows == ["0,5,1.0,500,,1,0", "1,5,,,0.0001,2,0"]
+    assert rows == ["0,5,1.0,500,,1,10,0", "1,5,,,0.0001,2,20,0"]
 
 
 def test_points_from_a_file(tmp_path):

@@ -54,7 +54,12 @@ def test_a_run_in_tensorboard(tmp_path, monkeypatch):
 
     for module in (run, progress):
         monkeypatch.setattr(module, "announced", announced)
-    assert run.main([*SMALL, "--log", "tensorboard", "--out", str(out)]) == 0
+    assert (
+        run.main(
+            [*SMALL, "--no-stagger-episodes", "--log", "tensorboard", "--out", str(out)]
+        )
+        == 0
+    )
     (path,) = (out / "tensorboard").iterdir()
     content = path.read_bytes()
     assert content.count(b"mean/policy_loss") == 4

@@ -1,0 +1,73 @@
+"""Score the policy of a training state in whole episodes."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gasil_envs import wrappers
+from gasil_envs.precision import full_precision
+from gasil_jax import normalization, train
+from gasil_jax.config import Config
+from gasil_jax.networks import Policy
+
+
+@full_precision
+def evaluate(
+    env: Any,
+    config: Config,
+    state: train.TrainState,
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    deterministic: bool = True,
+) -> dict[str, jax.Array]:
+    """Run whole episodes with the policy of one training state.
+
+    Pure: jit it, and vmap it over states. The return is of the environment's true
+    reward (undelayed, unshaped, undiscounted).
+
+    Args:
+      env: one environment.
+      config: of the run.
+      state: of one run, not of a batch of them.
+      key: consumed.
+      num_episodes: run side by side.
+      deterministic: act with the policy's mean; else draw from the policy.
+
+    Returns:
+      "episode_return" and "episode_length", (num_episodes,) each.
+    """
+    network: Any = Policy(config.hidden_sizes, env.action_size)
+    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    reset_key, act_key = jax.random.split(key)
+
+    def act(observation: jax.Array, key: jax.Array) -> jax.Array:
+        observation = normalization.normalize(state.normalizer, observation)
+        mean, log_std = network.apply(state.actor_critic.policy.params, observation)
+        noise = jax.random.normal(key, mean.shape, mean.dtype)
+        action = mean if deterministic else mean + jnp.exp(log_std) * noise
+        return jnp.clip(action, low, high)
+
+    def step(carry: Any, key: jax.Array) -> Any:
+        states, running, return_, length = carry
+        states = jax.vmap(env.step)(states, act(states.obs, key))
+        reward = states.info.get("true_reward", states.reward)
+        sound = normalization.is_sound(states.obs).all(axis=-1)
+        sound &= normalization.is_sound(reward)
+        # As in training a step of failed physics ends the episode with reward 0.
+        return_ = return_ + jnp.where(running & sound, reward, 0.0)
+        length = length + running
+        ended = (states.done > 0) | wrappers.truncated(states)
+        running = running & ~ended & sound
+        return (states, running, return_, length), None
+
+    start = (
+        jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes)),
+        jnp.ones(num_episodes, bool),
+        jnp.zeros(num_episodes),
+        jnp.zeros(num_episodes, jnp.int32),
+    )
+    keys = jax.random.split(act_key, train.max_episode_steps(env, config))
+    _, _, return_, length = jax.lax.scan(step, start, keys)[0]
+    return {"episode_return": return_, "episode_length": length}
