@@ -1,14 +1,13 @@
-"""Speed and fidelity: ``python -m experiments.benchmark``.
+"""Speed and fidelity: ``python -m experiments benchmark``.
 
-Tables, and the same as JSON. "physics": each way of building
-a task, random actions under jit, vmap and scan, with the relative error of one step
-(the worst entry of the observation, median over the environments) against C MuJoCo
-with the model's own integrator, which is Gymnasium's. "training": whole PPO+GASIL, many
-seeds at once, beside the physics alone with as many environments, and beside
-Stable-Baselines3's PPO on Gymnasium's task where that is installed (the extra
-"benchmark"): one process, and one on every core. "scaling", if asked for: that
-training on 1, 2, 4 ... devices, each with as many seeds: a perfect ratio is the number
-of devices.
+Tables, and the same as JSON. "physics": each way of building a task, random actions
+under jit, vmap and scan, with the relative error of one step (the worst entry of the
+observation, median over the environments) against C MuJoCo with the model's own
+integrator, which is Gymnasium's. "training": whole PPO+GASIL, many seeds at once,
+beside the physics alone with as many environments, and beside Stable-Baselines3's PPO
+on Gymnasium's task where that is installed (the extra "benchmark"): one process, and
+one on every core. "scaling", if asked for: that training on 1, 2, 4 ... devices, each
+with as many seeds: a perfect ratio is the number of devices.
 
 All rows of a task are compiled first and then timed in turn, again and again, so that a
 ratio is of numbers from the same minutes; a speed is the median of the repeats.
@@ -18,7 +17,6 @@ import dataclasses
 import importlib.util
 import multiprocessing
 import pathlib
-import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
@@ -30,11 +28,11 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
+from experiments.search import TASKS
 from gasil_jax import batch, command_line, logging, output_file, presets
 from gasil_jax.command_line import InputError
 from gasil_jax.environments import Settings, available_cores, prepare
 
-TASKS = tuple(name for name in gasil_envs.names() if name != "point_mass")
 VARIANTS = {
     "mjx": {"solver": "mjx"},
     "ours": {},
@@ -42,7 +40,7 @@ VARIANTS = {
     "ours-euler": {"integrator": "euler"},
     "mujoco-euler": {"physics": "mujoco", "integrator": "euler"},
 }
-BASELINE = "stable-baselines3"
+_HEAD = "envs     steps/s  ratio compile s  error of a step"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,27 +100,25 @@ class Row:
     error: float | None = None
     speeds: list[float] = dataclasses.field(default_factory=list)
 
-    @property
-    def speed(self) -> float:
-        """Steps a second."""
-        return float(np.median(self.speeds))
+
+def _random_actions(env: Any, num_envs: int, key: jax.Array) -> jax.Array:
+    low, high = env.action_range
+    shape = (num_envs, env.action_size)
+    return jax.random.uniform(key, shape, minval=low, maxval=high)
 
 
 def make_rollout(env: Any, num_envs: int, num_steps: int) -> Any:
     """From states and a key to the states after random actions, and mean rewards."""
-    low, high = env.action_range
 
     def step(states: Any, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
-        shape = (num_envs, env.action_size)
-        action = jax.random.uniform(action_key, shape, minval=low, maxval=high)
+        action = _random_actions(env, num_envs, action_key)
         stepped = jax.vmap(env.step)(states, action)
         fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
-        done = stepped.done > 0
 
         def restart(first: jax.Array, now: jax.Array) -> jax.Array:
-            at = done.reshape((-1,) + (1,) * (now.ndim - 1))
-            return jnp.where(at, first, now).astype(now.dtype)
+            done = (stepped.done > 0).reshape((-1,) + (1,) * (now.ndim - 1))
+            return jnp.where(done, first, now).astype(now.dtype)
 
         return jax.tree.map(restart, fresh, stepped), stepped.reward.mean()
 
@@ -132,37 +128,24 @@ def make_rollout(env: Any, num_envs: int, num_steps: int) -> Any:
     return rollout
 
 
-def physics_row(
-    env_name: str, name: str, settings: Any, num_envs: int, num_steps: int
-) -> Row:
+def physics_row(env_name: str, name: str, num_envs: int, num_steps: int) -> Row:
     """Random actions in `num_envs` environments, shared out over the devices."""
-    env = gasil_envs.make(env_name, **settings)
+    env = gasil_envs.make(env_name, **VARIANTS[name])
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
-    mesh = Mesh(np.array(jax.devices()[:count]), ("envs",))
+    mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
     rollout = make_rollout(env, num_envs // count, num_steps)
-    each = jax.shard_map(
-        lambda states, keys: rollout(states, keys[0]),
-        mesh=mesh,
-        in_specs=(P("envs"), P("envs")),
-        out_specs=(P("envs"), P("envs")),
-        check_vma=False,
+    shard = lambda function, specs: jax.shard_map(
+        function, mesh=mesh, in_specs=specs, out_specs=spec, check_vma=False
     )
-    reset = jax.jit(
-        jax.shard_map(
-            jax.vmap(env.reset),
-            mesh=mesh,
-            in_specs=P("envs"),
-            out_specs=P("envs"),
-            check_vma=False,
-        )
-    )
+    each = shard(lambda states, keys: rollout(states, keys[0])[0], (spec, spec))
+    reset = jax.jit(shard(jax.vmap(env.reset), spec))
     states = reset(jax.random.split(jax.random.key(0), num_envs))
     keys = lambda number: jax.random.split(jax.random.key(number), count)
     began = time.perf_counter()
     compiled = jax.jit(each).lower(states, keys(0)).compile()
     compile_seconds = time.perf_counter() - began
     # Not from the start: most bodies have fallen to the ground after a while.
-    states = jax.block_until_ready(compiled(states, keys(0)))[0]
+    states = jax.block_until_ready(compiled(states, keys(0)))
 
     def run() -> float:
         began = time.perf_counter()
@@ -177,9 +160,7 @@ def one_step_error(env: Any, reference: Any, num_envs: int, num_steps: int) -> f
     keys = jax.random.split(jax.random.key(1), num_envs)
     states = jax.jit(jax.vmap(reference.reset))(keys)
     states, _ = jax.jit(make_rollout(reference, num_envs, num_steps))(states, keys[0])
-    low, high = env.action_range
-    shape = (num_envs, env.action_size)
-    action = jax.random.uniform(keys[1], shape, minval=low, maxval=high)
+    action = _random_actions(env, num_envs, keys[1])
     right = np.asarray(jax.jit(jax.vmap(reference.step))(states, action).obs)
     obs = np.asarray(jax.jit(jax.vmap(env.step))(states, action).obs)
     error = np.abs(obs - right) / (1.0 + np.abs(right))
@@ -194,10 +175,9 @@ def physics_table(options: Options) -> Iterator[list[Row]]:
         for num_envs in options.num_envs:
             rows = []
             for name in options.variants:
-                settings = VARIANTS[name]
-                row = physics_row(env_name, name, settings, num_envs, options.num_steps)
+                row = physics_row(env_name, name, num_envs, options.num_steps)
                 if name not in errors and not options.skip_errors:
-                    env = gasil_envs.make(env_name, **settings)
+                    env = gasil_envs.make(env_name, **VARIANTS[name])
                     errors[name] = one_step_error(env, reference, 64, options.num_steps)
                 rows.append(dataclasses.replace(row, error=errors.get(name)))
             yield rows
@@ -213,13 +193,12 @@ def training_row(
     """PPO+GASIL with the paper's preset, `options.iterations` in a repeat."""
     env = gasil_envs.make(env_name, **VARIANTS[name])
     config = presets.preset(env_name, "ppo+gasil", "paper")
-    if options.training_envs:
-        config = config.replace(num_envs=options.training_envs)
+    config = config.replace(num_envs=options.training_envs or config.num_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    runs = batch.make_batch(env, config, range(seeds), devices=devices)
+    members = batch.make_batch(env, config, range(seeds), devices=devices)
     began = time.perf_counter()
-    states, advance = runs.compile()
+    states, advance = members.compile()
     compile_seconds = time.perf_counter() - began
     count = np.int32(options.iterations)
     held = [jax.block_until_ready(advance(states, count))[0]]
@@ -235,9 +214,7 @@ def training_row(
     return Row(env_name, f"ppo+gasil, {name}", num_envs, run, compile_seconds)
 
 
-def _baseline(
-    gymnasium_id: str, num_envs: int, steps: int, threads: int, pipe: Any
-) -> None:
+def _baseline(task: str, num_envs: int, steps: int, threads: int, pipe: Any) -> None:
     """Train Stable-Baselines3's PPO in a process of its own; send the seconds."""
     import torch
     from stable_baselines3 import PPO
@@ -245,8 +222,8 @@ def _baseline(
 
     # More threads than cores, and each waits for the others.
     torch.set_num_threads(threads)
-    env = make_vec_env(gymnasium_id, num_envs)
     # 2048 steps, 10 epochs and minibatches of 64 are its own values, and ours.
+    env = make_vec_env(task, num_envs)
     model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, device="cpu")
     model.learn(2048)
     pipe.send("ready")
@@ -258,26 +235,25 @@ def _baseline(
 
 def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
     """Stable-Baselines3's PPO, as many runs at once as there are processes."""
-    gymnasium_id = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
-    steps = 3 * 2048
+    task, steps = gasil_envs.make(env_name).unwrapped.task.gymnasium_id, 3 * 2048
     context = multiprocessing.get_context("spawn")
+    threads = max(1, available_cores() // processes)
 
     def run() -> float:
         pipes = []
         for _ in range(processes):
-            here, there = context.Pipe()
-            threads = max(1, available_cores() // processes)
-            arguments = (gymnasium_id, num_envs, steps, threads, there)
+            mine, theirs = context.Pipe()
+            arguments = (task, num_envs, steps, threads, theirs)
             context.Process(target=_baseline, args=arguments, daemon=True).start()
             # Else nobody would be told of the end of a process that failed.
-            there.close()
-            pipes.append(here)
+            theirs.close()
+            pipes.append(mine)
         for act in (lambda pipe: pipe.recv(), lambda pipe: pipe.send("go")):
             for pipe in pipes:
                 act(pipe)
         return processes * steps / max(pipe.recv() for pipe in pipes)
 
-    name = f"{BASELINE} ppo, {processes} process{'es'[: 2 * (processes > 1)]}"
+    name = f"stable-baselines3 ppo, {processes} process{'es'[: 2 * (processes > 1)]}"
     return Row(env_name, name, processes * num_envs, run)
 
 
@@ -291,13 +267,10 @@ def training_table(options: Options) -> Iterator[list[Row]]:
             for processes in sorted({1, available_cores()}):
                 rows += [baseline_row(env_name, processes, n) for n in (1, 8)]
         for name in options.training_variants:
-            settings = VARIANTS[name]
-            title = f"physics alone, {name}"
-            row = physics_row(env_name, name, settings, num_envs, options.num_steps)
-            rows.append(dataclasses.replace(row, name=title))
-            rows.append(
-                training_row(env_name, name, options, options.seeds, jax.devices())
-            )
+            row = physics_row(env_name, name, num_envs, options.num_steps)
+            rows.append(dataclasses.replace(row, name=f"physics alone, {name}"))
+            devices = jax.devices()
+            rows.append(training_row(env_name, name, options, options.seeds, devices))
         yield rows
 
 
@@ -307,40 +280,35 @@ def scaling_table(options: Options) -> Iterator[list[Row]]:
     doubled = [2**power for power in range(len(devices)) if 2**power < len(devices)]
     for env_name in options.envs:
         rows = []
-        for count in (*doubled, len(devices)):
+        for n in (*doubled, len(devices)):
             row = training_row(
-                env_name, "ours", options, count * options.seeds, devices[:count]
+                env_name, "ours", options, n * options.seeds, devices[:n]
             )
-            title = f"{row.name}, {count} device{'s' * (count > 1)}"
-            rows.append(dataclasses.replace(row, name=title))
+            name = f"{row.name}, {n} device{'s' * (n > 1)}"
+            rows.append(dataclasses.replace(row, name=name))
         yield rows
 
 
-def time_in_turn(rows: Sequence[Row], repeats: int) -> None:
-    """Fill in the speeds."""
+def measure(rows: Sequence[Row], repeats: int) -> list[dict[str, Any]]:
+    """Time the rows of a task in turn, print them, and return them."""
     for _ in range(repeats):
         for row in rows:
             row.speeds.append(row.run())
-
-
-def show(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Print the rows of a task, ratios to the first, and return them."""
     described = []
     for row in rows:
-        ratio = row.speed / rows[0].speed
+        speed, first = (float(np.median(x.speeds)) for x in (row, rows[0]))
         error = "" if row.error is None else f"{row.error:11.1e}"
         print(
-            f"{row.env:11} {row.name:36} {row.num_envs:6} {row.speed:11,.0f} "
-            f"{ratio:6.2f} {row.compile_seconds:9.1f}{error}",
+            f"{row.env:11} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
+            f"{speed / first:6.2f} {row.compile_seconds:9.1f}{error}",
             flush=True,
         )
-        values = dataclasses.asdict(row) | {"speed": row.speed, "ratio": ratio}
+        values = dataclasses.asdict(row) | {"speed": speed, "ratio": speed / first}
         del values["run"]
         described.append(values)
     return described
 
 
-_HEAD = "envs     steps/s  ratio compile s  error of a step"
 TABLES = {
     "physics": physics_table,
     "training": training_table,
@@ -349,14 +317,16 @@ TABLES = {
 
 
 def _check(options: Options) -> None:
-    for name, known in (
-        ("tables", TABLES),
+    for name, allowed in (
+        ("tables", tuple(TABLES)),
         ("envs", TASKS),
-        ("variants", VARIANTS),
-        ("training_variants", VARIANTS),
+        ("variants", tuple(VARIANTS)),
+        ("training_variants", tuple(VARIANTS)),
     ):
-        if unknown := set(getattr(options, name)) - set(known):
-            raise InputError(f"{name} has {min(unknown)!r}: allowed {', '.join(known)}")
+        if others := set(getattr(options, name)) - set(allowed):
+            raise InputError(
+                f"{name} has {min(others)!r}: allowed {', '.join(allowed)}"
+            )
     if (fewest := min(options.num_envs, default=0)) < 1:
         raise InputError(f"num_envs is {fewest}: it must be 1 or more")
     command_line.check_least(options, num_steps=1, repeats=1, seeds=1, iterations=1)
@@ -369,7 +339,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = command_line.parse(Options, arguments, "experiments.benchmark")
+    options = command_line.parse(Options, arguments, "experiments benchmark")
     _check(options)
     stamp = time.strftime("%Y%m%d-%H%M%S")
     out = options.out or pathlib.Path("runs", f"benchmark-{stamp}.json")
@@ -381,12 +351,11 @@ def _main(arguments: Sequence[str] | None) -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     devices = jax.devices()
     tables: dict[str, list[Any]] = {name: [] for name in options.tables}
+    values = dataclasses.asdict(options).items()
     result = {
         "device": f"{len(devices)} x {devices[0].device_kind}",
         "cores": available_cores(),
-        "options": {
-            name: str(value) for name, value in dataclasses.asdict(options).items()
-        },
+        "options": {name: str(value) for name, value in values},
         "versions": logging.versions(),
         "tables": tables,
     }
@@ -394,12 +363,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     for table in options.tables:
         print(f"{table:51}{_HEAD}", flush=True)
         for rows in TABLES[table](options):
-            time_in_turn(rows, options.repeats)
-            tables[table] += show(rows)
+            tables[table] += measure(rows, options.repeats)
             # After every task: a benchmark that is cut off has its first figures.
             logging.write_json(out, result)
     print(f"in {out}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

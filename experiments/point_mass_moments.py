@@ -1,6 +1,6 @@
 """What is learned on the point mass (paper, figures 3 and 4).
 
-``python -m experiments.point_mass_moments`` trains one seed of PPO and of PPO+GASIL and
+``python -m experiments point_mass_moments`` trains one seed of PPO and of PPO+GASIL and
 draws them at several moments of training: episodes of the policy, the trajectories in
 the buffer, and the discriminator's reward. An arrow is the action that the
 discriminator pays most at a place, of 16 directions at full speed, with every object
@@ -10,7 +10,6 @@ still there; the stronger its colour the higher the reward. ``--animate`` makes 
 import dataclasses
 import itertools
 import pathlib
-import sys
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -20,19 +19,23 @@ import matplotlib
 import numpy as np
 
 import gasil_jax
-from experiments import point_mass, trials
-from gasil_jax import (
-    batch,
-    command_line,
-    normalization,
-    output_file,
-    plotting,
-    policy,
-)
+from experiments import report
+from experiments.figures import FIGURES
+from experiments.store import RESULTS, Store
+from gasil_jax import batch, command_line, normalization, output_file, plotting, policy
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
+#: Shares of training: more of the early ones, most happens there.
+SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
+#: An agent's columns; PPO has no discriminator.
+_COLUMNS = {
+    "ppo": ("policy", "good trajectories"),
+    "ppo+gasil": ("policy", "good trajectories", "discriminator's reward"),
+}
+#: Agent -> its configuration and its states, one for each moment.
+Moments = Mapping[str, tuple[gasil_jax.Config, Sequence[Any]]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,27 +48,27 @@ class Options:
       out: folder of the picture or film, which is made anew.
     """
 
-    total_steps: int = point_mass.STEPS
+    total_steps: int = 500_000
     animate: int = 0
-    out: pathlib.Path = trials.RESULTS
+    out: pathlib.Path = RESULTS
 
 
 def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
     """The state of seed 0 at `moments`, in shares of training, increasing from 0."""
-    runs = batch.make_batch(env, config, [0])
-    states, advance = runs.compile()
+    members = batch.make_batch(env, config, [0])
+    states, advance = members.compile()
     ends = [max(1, round(share * config.num_iterations)) for share in moments]
-    found = []
+    kept = []
     for first, end in itertools.pairwise([0, *ends]):
-        for done in range(first, end, runs.chunk):
-            count = min(runs.chunk, end - done)
-            states, _ = runs.train(advance, states, done, count)
-        found.append(jax.device_get(batch.member(runs.trim(states), 0)))
-    return found
+        for done in range(first, end, members.chunk):
+            count = min(members.chunk, end - done)
+            states, _ = members.train(advance, states, done, count)
+        kept.append(jax.device_get(batch.member(members.trim(states), 0)))
+    return kept
 
 
 def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
-    """Places (episodes, steps + 1, 2) of episodes drawn from the policy."""
+    """Positions (episodes, steps + 1, 2) of episodes drawn from the policy."""
     act = policy.from_state(state, env)
 
     def one(key: jax.Array) -> jax.Array:
@@ -77,134 +80,111 @@ def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
             return state, state.pipeline_state.position
 
         keys = jax.random.split(key, env.unwrapped.episode_length)
-        places = jax.lax.scan(step, start, keys)[1]
-        return jnp.concatenate([start.pipeline_state.position[None], places])
+        positions = jax.lax.scan(step, start, keys)[1]
+        return jnp.concatenate([start.pipeline_state.position[None], positions])
 
     return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(key, _EPISODES)))
 
 
 def buffer_paths(state: Any) -> list[np.ndarray]:
-    """Places (steps, 2) of each episode in the buffer, the best first."""
+    """Positions (steps, 2) of each episode in the buffer, the best first."""
     buffer = state.good_trajectories
     size = int(buffer.size)
     starts = np.flatnonzero(np.asarray(buffer.time[:size]) == 0)
-    places = np.asarray(buffer.observation[:size, :2])
-    return np.split(places, starts[1:]) if size else []
+    positions = np.asarray(buffer.observation[:size, :2])
+    return np.split(positions, starts[1:]) if size else []
 
 
 def reward_field(
-    env: Any, config: gasil_jax.Config, state: Any, num_places: int = 17
+    env: Any, config: gasil_jax.Config, state: Any, num_lines: int = 17
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places (n, 2), the best direction there (n, 2), and its -log D (n,)."""
-    line = np.linspace(-0.95, 0.95, num_places, dtype=np.float32)
-    places = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    """Positions (n, 2), the best direction there (n, 2), and its -log D (n,)."""
+    line = np.linspace(-0.95, 0.95, num_lines, dtype=np.float32)
+    positions = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     angle = np.arange(16) * (2.0 * np.pi / 16)
     actions = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
-    there = np.ones((len(places), env.observation_size - 2), np.float32)
+    objects = np.ones((len(positions), env.observation_size - 2), np.float32)
     observation = normalization.normalize(
-        state.normalizer, jnp.asarray(np.concatenate([places, there], axis=1))
+        state.normalizer, jnp.asarray(np.concatenate([positions, objects], axis=1))
     )
     network = Discriminator(config.discriminator_hidden_sizes)
-    logit: Any = jax.vmap(
+    logits: Any = jax.vmap(
         lambda action: network.apply(
             state.imitation.params,
             observation,
-            jnp.broadcast_to(action, (len(places), 2)),
+            jnp.broadcast_to(action, (len(positions), 2)),
         )
     )(jnp.asarray(actions))
-    reward = np.asarray(adversarial.bonus(logit, jnp.float32(1.0)))
-    return places, actions[reward.argmax(axis=0)], reward.max(axis=0)
-
-
-#: An agent's columns, and what draws each.
-_COLUMNS = ("policy", "good trajectories", "discriminator's reward")
-
-
-def _columns(agent: str) -> tuple[str, ...]:
-    return _COLUMNS if agent == "ppo+gasil" else _COLUMNS[:2]
+    reward = np.asarray(adversarial.bonus(logits, jnp.float32(1.0)))
+    return positions, actions[reward.argmax(axis=0)], reward.max(axis=0)
 
 
 def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> None:
     """One moment of an agent: its policy, its buffer, and its discriminator if any."""
-    layout = env.unwrapped.layout
     for panel in panels:
         panel.clear()
         none = np.zeros(len(env.unwrapped.objects), bool)
-        plotting.point_mass_layout(panel, layout, none)
+        plotting.point_mass_layout(panel, env.unwrapped.layout, none)
         panel.set(xticks=[], yticks=[])
     for path in policy_paths(env, state, jax.random.key(1)):
         panels[0].plot(*path.T, color="0.2", linewidth=0.7, alpha=0.6)
     for path in buffer_paths(state):
         panels[1].plot(*path.T, color="#0072B2", linewidth=0.7, alpha=0.6)
-    if len(panels) == len(_COLUMNS):
-        places, direction, reward = reward_field(env, config, state)
+    if len(panels) > 2:
+        positions, direction, reward = reward_field(env, config, state)
         strength = (reward - reward.min()) / max(np.ptp(reward), 1e-6)
-        panels[2].quiver(*places.T, *direction.T, alpha=strength, scale=28, width=0.006)
-
-
-Moments = Mapping[str, tuple[gasil_jax.Config, Sequence[Any]]]
+        panels[2].quiver(
+            *positions.T, *direction.T, alpha=strength, scale=28, width=0.006
+        )
 
 
 def _draw_row(panels: Any, env: Any, moments: Moments, number: int) -> str:
     """Every agent at one moment; returns how far training is."""
     steps = 0
     for agent, (config, states) in moments.items():
-        mine, panels = np.split(panels, [len(_columns(agent))])
+        mine, panels = np.split(panels, [len(_COLUMNS[agent])])
         draw_moment(mine, env, config, states[number])
         steps = int(states[number].iteration) * config.batch_steps
     return f"{steps:,} steps"
 
 
 def _titles(panels: Sequence[Any], moments: Moments) -> None:
-    titles = [f"{agent}: {name}" for agent in moments for name in _columns(agent)]
+    titles = [f"{agent}: {name}" for agent in moments for name in _COLUMNS[agent]]
     for panel, title in zip(panels, titles, strict=True):
         panel.set_title(title, fontsize=9)
 
 
-def draw(env: Any, moments: Moments, path: pathlib.Path) -> None:
-    """Figures 3 and 4 side by side: a row for each moment.
-
-    Args:
-      env: the point mass.
-      moments: agent -> its configuration and its states.
-      path: PNG.
-    """
-    import matplotlib.pyplot as plt
-
-    rows = min(len(states) for _, states in moments.values())
-    columns = sum(len(_columns(agent)) for agent in moments)
-    size = (2.4 * columns, 2.5 * rows)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=size, layout="constrained", squeeze=False
-    )
-    for number, row in enumerate(grid):
-        row[0].set_ylabel(_draw_row(row, env, moments, number))
-    _titles(grid[0], moments)
-    plotting.save(figure, path, dpi=75)
-
-
-def animate(env: Any, moments: Moments, path: pathlib.Path) -> None:
-    """The same as a film, a frame for each moment."""
+def draw(env: Any, moments: Moments, path: pathlib.Path, animate: int) -> None:
+    """Figures 3 and 4 side by side: a row for each moment, or a frame of a film."""
     import matplotlib.pyplot as plt
     from matplotlib.animation import FuncAnimation, PillowWriter
 
-    frames = min(len(states) for _, states in moments.values())
-    columns = sum(len(_columns(agent)) for agent in moments)
-    figure, panels = plt.subplots(
-        1, columns, figsize=(2.6 * columns, 3.0), layout="constrained"
+    columns = sum(len(_COLUMNS[agent]) for agent in moments)
+    rows = 1 if animate else len(SHARES)
+    size = (2.4 * columns, 3.0 if animate else 2.5 * rows)
+    figure, grid = plt.subplots(
+        rows, columns, figsize=size, layout="constrained", squeeze=False
     )
+    if not animate:
+        for number, row in enumerate(grid):
+            row[0].set_ylabel(_draw_row(row, env, moments, number))
+        _titles(grid[0], moments)
+        report.save_png(figure, path, dpi=75)
+        return
 
     def frame(number: int) -> None:
-        figure.suptitle(_draw_row(panels, env, moments, number))
-        _titles(panels, moments)
+        figure.suptitle(_draw_row(grid[0], env, moments, number))
+        _titles(grid[0], moments)
 
-    film = FuncAnimation(figure, frame, frames=frames)
+    film = FuncAnimation(figure, frame, frames=animate)
     film.save(path, writer=PillowWriter(fps=2), dpi=80)
     plt.close(figure)
 
 
-#: Shares of training: more of the early ones, most happens there.
-SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
+def config(agent: str) -> gasil_jax.Config:
+    """What the figure's runs of an agent are trained with."""
+    curve = FIGURES["point_mass"].panels["point_mass"][agent]
+    return curve.runs(Store(RESULTS / "runs"))[0].config
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -213,7 +193,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = command_line.parse(Options, arguments, "experiments.point_mass_moments")
+    options = command_line.parse(Options, arguments, "experiments point_mass_moments")
     command_line.check_least(options, total_steps=1, animate=0)
     name = "point_mass.gif" if options.animate else "point_mass_moments.png"
     path = options.out / name
@@ -221,15 +201,10 @@ def _main(arguments: Sequence[str] | None) -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     matplotlib.use("Agg")
     env = gasil_jax.make_env("point_mass")
-    evenly = np.linspace(0, 1, options.animate).tolist()
-    shares = evenly if options.animate else SHARES
+    shares = np.linspace(0, 1, options.animate).tolist() or SHARES
     moments = {}
-    for agent in point_mass.AGENTS:
-        config = point_mass.config(agent).replace(total_steps=options.total_steps)
-        moments[agent] = config, train(env, config, shares)
-    (animate if options.animate else draw)(env, moments, path)
+    for agent in _COLUMNS:
+        own = config(agent).replace(total_steps=options.total_steps)
+        moments[agent] = own, train(env, own, shares)
+    draw(env, moments, path, options.animate)
     print(f"in {path}")
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,198 +1,192 @@
-"""All figures in one page: ``python -m experiments.summary``."""
+"""The page of all claims, and the blocks of the README that are generated.
 
-import dataclasses
-import sys
-from collections.abc import Iterable, Mapping, Sequence
+A block stands between ``<!-- begin SLOT -->`` and ``<!-- end -->``. A claim's verdict
+is a rule on the comparisons of its figure's page.
+"""
 
-from experiments import (
-    comparison,
-    constant_bonus,
-    delayed_mujoco,
-    humanoid,
-    hyperparameters,
-    mujoco,
-    normalized_rewards,
-    point_mass,
-    random_search,
-    report,
-    stochastic_walker2d,
-    trials,
-    wider_search,
-)
-from experiments.trials import Results
-from gasil_jax import command_line
+import pathlib
+import re
+import shlex
+from collections.abc import Callable, Mapping, Sequence
 
-#: Each figure with the function that makes its trials.
-FIGURES = (
-    (point_mass.FIGURE, point_mass.make),
-    (mujoco.FIGURE, lambda: comparison.make(1)),
-    (stochastic_walker2d.FIGURE, stochastic_walker2d.make),
-    (delayed_mujoco.FIGURE, lambda: comparison.make(random_search.DELAY)),
-    (normalized_rewards.FIGURE, normalized_rewards.make),
-    (constant_bonus.FIGURE, constant_bonus.make),
-    (wider_search.FIGURE, wider_search.make),
-    (humanoid.FIGURE, humanoid.make),
-    (hyperparameters.FIGURE, hyperparameters.make),
-)
-# Each of the paper's claims, and what the figures say of it.
-_IN_SHORT = (
-    (
-        "Point mass: PPO settles early on a poorer policy, PPO+GASIL is slower at "
-        "first and ends higher",
-        "holds, both clearly, in a layout of 128 that was chosen for it",
-    ),
-    (
-        "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
-        "does not hold: it is clearly ahead of all three on ant alone",
-    ),
-    (
-        "Delayed rewards: it is ahead by a large margin on all tasks",
-        "holds on hopper and walker2d, of all three, with normalized rewards; on no "
-        "other task",
-    ),
-    (
-        "Noise: the gap to PPO is larger with it",
-        "in part, with normalized rewards: no gap is clear without noise, at 0.05 and "
-        "0.1 it is, at 0.5 nobody walks; that it grows is not clear",
-    ),
-    (
-        "Discriminator updates: one is too few, twenty are too many",
-        "twenty have least in all four panels, clearly in one; one is nowhere clearly "
-        "too few",
-    ),
-    (
-        "Buffer: 500 steps are too few, 5,000 too many",
-        "no order, in any of four panels",
-    ),
-)
-# Of all agents on the locomotion tasks, rewards as they are: by the reward's delay.
-_COMPARISONS = {random_search.DELAY: delayed_mujoco.FIGURE, 1: mujoco.FIGURE}
+from experiments import report
+from experiments.figures import FIGURES, NORMALIZED, name_of
+from experiments.report import Page
+from experiments.search import AGENTS, DELAY, TASKS
+from experiments.store import RESULTS, Store
+from gasil_jax import output_file
+from gasil_jax.command_line import InputError
+
+README = pathlib.Path(__file__).parent.parent / "README.md"
+_COMPARISONS = {DELAY: "delayed_mujoco", 1: "mujoco"}
 
 
-def tuned() -> str:
-    """Every agent with what its tuned preset has, a task a row: Markdown.
+class Summary:
+    """What all figures say, from one store."""
 
-    First the tasks that were tuned with normalized rewards, then the others.
-    """
-    rows = dict(_rows(_normalized()))
-    for name, curves in _rows(_as_they_are()):
-        rows.setdefault(name, curves)
-    return _table(rows)
+    def __init__(self, store: Store):
+        self.pages = {name: Page(name, store) for name in FIGURES}
 
+    def _ahead(self, figure: str, panels: Sequence[str], all_of_them: bool) -> str:
+        """Holds if PPO+GASIL is better than every other agent on most or all tasks."""
+        compared = self.pages[figure].comparisons
+        verdicts = {
+            panel: [x.verdict for key, x in compared.items() if key[0] == panel]
+            for panel in panels
+        }
+        better = [p for p, x in verdicts.items() if x and set(x) == {"better"}]
+        worse = [p for p, x in verdicts.items() if "worse" in x]
+        needed = len(panels) if all_of_them else len(panels) // 2 + 1
+        word = "holds" if len(better) >= needed else "holds in part"
+        words = f"{word if better else 'does not hold'}: better than all three on "
+        words += f"{len(better)} of {len(panels)} tasks"
+        words += f" ({', '.join(better)})" if better else ""
+        return words + (f", worse than one on {', '.join(worse)}" if worse else "")
 
-def as_they_are() -> str:
-    """Every agent on the tasks that have normalized rewards too, without: Markdown."""
-    both = dict(_rows(_normalized()))
-    rows = dict(_rows(_as_they_are()))
-    return _table({name: curves for name, curves in rows.items() if name in both})
+    def _point_mass(self) -> str:
+        """Holds if PPO+GASIL is worse early and better at the end."""
+        page = self.pages["point_mass"]
+        early = page.verdict("point_mass", "ppo+gasil early", "ppo early")
+        late = page.verdict("point_mass", "ppo+gasil", "ppo")
+        word = "holds" if (early, late) == ("worse", "better") else "does not hold"
+        layout = "in a layout that was chosen for it"
+        return f"{word}: {early} early, {late} at the end, {layout}"
 
+    def _noise(self) -> str:
+        """Holds if the gap at some noise is clearly larger than without."""
+        compared = self.pages["stochastic_walker2d"].comparisons
+        better = [key for key, x in compared.items() if x.verdict == "better"]
+        ahead = ", ".join(key[0] for key in better if len(key) == 3) or "none"
+        grows = ", ".join(key[0] for key in better if len(key) == 4)
+        return (
+            f"{'holds' if grows else 'not clear'}: better than PPO at {ahead}; by "
+            f"clearly more than without noise at {grows or 'none'}"
+        )
 
-def tallies() -> tuple[str, ...]:
-    """What the agents with normalized rewards come to, delayed and dense: Markdown."""
-    return tuple(
-        report.tally(report.complete(tasks), trials.AGENTS[-1])
-        for tasks in _normalized().values()
-    )
+    def _ends(self, name: str, few: str, many: str) -> str:
+        """Holds if the best value is better than both of these in most panels."""
+        page = self.pages["hyperparameters"]
+        panels = [panel for panel in page.figure.panels if panel.startswith(name)]
+        counts = {
+            end: sum(
+                page.verdict(panel, page.best_value(panel), end) == "better"
+                for panel in panels
+                if page.best_value(panel) != end
+            )
+            for end in (few, many)
+        }
+        word = "holds in part" if any(counts.values()) else "not clear"
+        word = "holds" if min(counts.values()) > len(panels) / 2 else word
+        words = " and ".join(f"than {end} in {count}" for end, count in counts.items())
+        return f"{word}: the best value is better {words} of {len(panels)} panels"
 
+    def claims(self) -> str:
+        """Each claim of the paper and what was measured."""
+        dense, delayed = (
+            [name_of(x, delay) for x in NORMALIZED] for delay in (1, DELAY)
+        )
+        normalized = "The same, with normalized rewards"
+        rows = [
+            (
+                "Point mass: PPO settles early on a poorer policy, PPO+GASIL is slower "
+                "at first and ends higher",
+                self._point_mass(),
+            ),
+            (
+                "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most "
+                "tasks",
+                self._ahead("mujoco", TASKS, False),
+            ),
+            (normalized, self._ahead("normalized_rewards", dense, False)),
+            (
+                "Delayed rewards: it is ahead of them by a large margin on all tasks",
+                self._ahead("delayed_mujoco", TASKS, True),
+            ),
+            (normalized, self._ahead("normalized_rewards", delayed, True)),
+            ("Noise: the gap to PPO is larger with it", self._noise()),
+            (
+                "Discriminator updates: too few (1) and too many (20) do poorly",
+                self._ends("discriminator_updates", "1", "20"),
+            ),
+            (
+                "Buffer: too small (500 steps) and too large (5000) do poorly",
+                self._ends("buffer_steps", "500", "5000"),
+            ),
+        ]
+        return report.markdown_table(["The paper's claim", "Here"], rows)
 
-#: Task -> curve -> results.
-_Tasks = Mapping[str, Mapping[str, Results]]
+    def _table(self, rows: Mapping[str, tuple[str, str]]) -> str:
+        """Agents on tasks: name of a row -> figure and panel."""
+        table = []
+        for name, (figure, panel) in rows.items():
+            of = self.pages[figure].results.get(panel, {})
+            final = lambda x: (
+                report.interval(x.final) + ("" if x.complete else f" ({x.seeds} seeds)")
+            )
+            cells = [final(of[agent]) if agent in of else "" for agent in AGENTS]
+            table.append([name, *cells])
+        return report.markdown_table(["", *map(str.upper, AGENTS)], table)
 
+    def as_they_are(self) -> str:
+        """Rewards as they are, where there are normalized ones too."""
+        each = [(env, delay) for delay in _COMPARISONS for env in NORMALIZED]
+        return self._table({_row(*x): (_COMPARISONS[x[1]], x[0]) for x in each})
 
-def _normalized() -> Mapping[int, _Tasks]:
-    """By the reward's delay."""
-    figure = normalized_rewards.FIGURE
-    shown = figure.shown(normalized_rewards.make(), trials.RESULTS)
-    return normalized_rewards.by_delay(shown)
+    def tuned(self) -> str:
+        """Every agent with its tuned preset."""
+        each = [(env, delay) for delay in _COMPARISONS for env in NORMALIZED]
+        rows = {_row(*x): ("normalized_rewards", name_of(*x)) for x in each}
+        others = [(env, delay) for delay in _COMPARISONS for env in TASKS[4:]]
+        rows |= {_row(*x): (_COMPARISONS[x[1]], x[0]) for x in others}
+        return self._table(rows)
 
+    def figures(self) -> str:
+        """Links to the pages of all figures."""
+        return "\n".join(f"- [{x.figure.title}]({n}.md)" for n, x in self.pages.items())
 
-def _as_they_are() -> Mapping[int, _Tasks]:
-    return {
-        delay: figure.shown(comparison.make(delay), trials.RESULTS)
-        for delay, figure in _COMPARISONS.items()
-    }
+    def value(self, name: str, *arguments: str) -> str:
+        """What stands in a slot: one of these, or a figure's name and its slot.
 
+        Raises:
+          InputError: there is no such slot.
+        """
+        own: dict[str, Callable[[], str]] = {
+            "claims": self.claims,
+            "tuned": self.tuned,
+            "as_they_are": self.as_they_are,
+            "figures": self.figures,
+        }
+        if name in own and not arguments:
+            return own[name]()
+        if name in self.pages and arguments:
+            return self.pages[name].value(*arguments)
+        raise InputError(
+            f"slot is {shlex.join([name, *arguments])}: it must be one of "
+            f"{', '.join(own)}, or a figure and its slot"
+        )
 
-def _rows(of: Mapping[int, _Tasks]) -> Iterable[tuple[str, Mapping[str, Results]]]:
-    """(name of the row, curve -> results), of all delays."""
-    for delay, tasks in of.items():
-        for env, curves in tasks.items():
-            yield _row(env, delay), curves
+    def text(self) -> str:
+        """The page of all claims."""
+        note = report.fill((report.NOTES / "README.md").read_text(), self.value)
+        title, body = note.split("\n", 1)
+        in_step = any(page.in_step for page in self.pages.values())
+        parts = [title, *([report.IN_STEP] if in_step else []), body.strip()]
+        return "\n\n".join(parts) + "\n"
+
+    def fill_blocks(self, text: str) -> str:
+        """A document with its generated blocks made anew."""
+        block = re.compile(r"(<!-- begin (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+        made = lambda match: self.value(*shlex.split(match[2]))
+        return block.sub(lambda x: f"{x[1]}\n{made(x)}\n\n{x[3]}", text)
+
+    def write(self) -> None:
+        """Write the page of all claims and the README's blocks."""
+        texts = {RESULTS / "README.md": self.text()}
+        texts[README] = self.fill_blocks(README.read_text())
+        for path, text in texts.items():
+            with output_file.whole(path) as partial:
+                partial.write_text(text)
 
 
 def _row(env: str, delay: int) -> str:
     return env if delay == 1 else f"{env}, delayed"
-
-
-def _table(rows: _Tasks) -> str:
-    """An agent a column."""
-    lines = [
-        f"| | {' | '.join(agent.upper() for agent in trials.AGENTS)} |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for name, curves in rows.items():
-        cells = [_cell(curves.get(agent)) for agent in trials.AGENTS]
-        lines.append(f"| {name} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def _cell(known: Results | None) -> str:
-    if known is None:
-        return ""
-    partly = "" if known.complete else f" ({len(known.seeds)} seeds)"
-    return report.interval(known.final[0]) + partly
-
-
-def _in_short() -> str:
-    rows = [f"| {claim} | {here} |" for claim, here in _IN_SHORT]
-    return "\n".join(["| The paper's claim | Here |", "| --- | --- |", *rows])
-
-
-def page() -> str:
-    """Claim by claim, what was measured: Markdown, from the CSV files alone."""
-    parts = [
-        "# The paper's claims, measured",
-        "Written by `python -m experiments.summary` from the CSV files in this folder. "
-        "Numbers are interquartile means over seeds of the return in the last tenth of "
-        "training, with 95% bootstrap intervals.",
-        _in_short(),
-        "With what the tuned presets have: rewards [normalized]"
-        "(normalized_rewards.md), but for ant's and humanoid's:",
-        tuned(),
-        "[Rewards as they are](random_search.md):",
-        as_they_are(),
-    ]
-    for figure, make in FIGURES:
-        wanted = make()
-        shown = figure.shown(wanted, trials.RESULTS)
-        folder = trials.RESULTS / figure.name
-        missing = [x.name for x in wanted if trials.read_whole(x, folder) is None]
-        parts += [f"## {figure.title}", f"**Claim.** {figure.claim}"]
-        conclusions = figure.conclusions(shown)
-        linked = (trials.RESULTS / f"{figure.name}.md").exists()
-        link = f"[Tables, curves and settings]({figure.name}.md)." if linked else ""
-        parts += [conclusions, link, figure.more if shown else ""]
-        if missing:
-            parts.append(f"Not run yet, or not wholly: {', '.join(missing)}.")
-    return "\n\n".join(part for part in parts if part) + "\n"
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page; returns the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
-    command_line.parse(Options, arguments, "experiments.summary")
-    path = trials.RESULTS / "README.md"
-    trials.write_whole(path, page())
-    print(f"in {path}")
-
-
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Write the page of all figures, from the CSV files alone."""
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -87,8 +87,7 @@ _STRONG_DISCRIMINATOR = {
     "discriminator_updates": 20,
     "discriminator_learning_rate": 3e-4,
 }
-# On the locomotion tasks measured with delayed rewards, 4 to 8 seeds each
-# (experiments/results/delayed_agents.csv).
+# On the locomotion tasks of delayed rewards, 4 to 8 seeds each, which are not kept.
 _STRONG = {
     ("point_mass", "gasil"): _STRONG_DISCRIMINATOR,
     ("point_mass", "ppo+gasil"): _STRONG_DISCRIMINATOR,

@@ -266,8 +266,8 @@ def scored(tmp_path, seeds, devices, times=1):
     runs = batch.make_batch(env, config, seeds, devices=jax.devices()[:devices])
     states = runs.init()
     # The first policies hardly move.
-    params = jax.tree.map(lambda x: 30 * x, states.params)
-    states = states.replace(params=params)
+    params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
+    states = states.replace(actor_critic=params)
     path = tmp_path / f"{devices}.csv"
     evaluation = PeriodicEvaluation(
         runs, EvaluationSchedule(128, 4), path, labels={"seed": seeds}

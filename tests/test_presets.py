@@ -4,7 +4,9 @@ import pytest
 
 import gasil_envs
 import gasil_jax
-from experiments import normalized_rewards, random_search, trials
+from experiments.figures import NORMALIZED
+from experiments.search import AGENTS, DELAY, NUM_ENVS, NUM_ENVS_OF, TASKS, Search
+from experiments.store import RESULTS, Store
 from gasil_jax import presets, run
 from gasil_jax.config import Config, validate
 
@@ -24,16 +26,17 @@ def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
         assert overrides and config != Config(agent=agent)
 
 
-@pytest.mark.parametrize("reward_delay", [1, random_search.DELAY])
-@pytest.mark.parametrize("env", trials.TASKS)
+@pytest.mark.parametrize("reward_delay", [1, DELAY])
+@pytest.mark.parametrize("env", TASKS)
 def test_the_tuned_rows_are_what_the_search_found(env, reward_delay):
-    normalized = env in normalized_rewards.TASKS
-    best = normalized_rewards.TUNED[normalized]
-    for agent in trials.AGENTS:
-        trial = random_search.search(env, agent, reward_delay)
-        changes = {"num_envs": trial.num_envs, "normalize_rewards": normalized}
-        found = best(env, agent, reward_delay)
-        expected = Config(agent=agent).replace(**found, **changes)
+    normalized, store = env in NORMALIZED, Store(RESULTS / "runs")
+    changes = {
+        "num_envs": NUM_ENVS_OF.get(env, NUM_ENVS),
+        "normalize_rewards": normalized,
+    }
+    for agent in AGENTS:
+        search = Search(env, agent, reward_delay, normalize_rewards=normalized)
+        expected = Config(agent=agent).replace(**search.chosen(store), **changes)
         assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
 
 

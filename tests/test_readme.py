@@ -47,7 +47,7 @@ LOCOMOTION = ("--gymnasium", ".html")
 #: How commands begin that are not run here, and why.
 NOT_RUN = {
     "python -m pip install": "it changes the environment; .ci/run does it",
-    "python -m experiments.benchmark": "it measures for minutes",
+    "python -m experiments benchmark": "it measures for minutes",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
     "and tests/test_ray.py train shards",
     "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",

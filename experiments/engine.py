@@ -1,0 +1,340 @@
+"""Trains the runs that a store lacks, and adds them to it.
+
+Runs of the same environment and static settings are members of one compiled program.
+It works in a folder named by a hash of all it trains, so that what is there is its own,
+and work that was stopped goes on from its checkpoints by itself.
+"""
+
+import dataclasses
+import hashlib
+import json
+import multiprocessing
+import os
+import pathlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from multiprocessing import connection
+from typing import Any
+
+import jax
+import numpy as np
+
+import gasil_jax
+from experiments.store import Record, Run, Store
+from gasil_jax import (
+    batch,
+    command_line,
+    driver,
+    evaluate,
+    logging,
+    resources,
+    run_folder,
+    shards,
+)
+from gasil_jax import run as run_command
+from gasil_jax.environments import Settings
+from gasil_jax.interruption import Interrupted, Interruption
+from gasil_jax.progress import Progress
+
+#: Equal parts of training in a record.
+ROWS = 50
+#: What metrics.csv calls the members of a program.
+_LABELS = ("member", "seed")
+_SECONDS_BETWEEN_LOOKS = 1.0
+# A new interpreter: what a fork shares with its parent JAX does not survive.
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+@dataclasses.dataclass(frozen=True)
+class Setup:
+    """With what runs are trained, which does not decide what they are.
+
+    Attributes:
+      runs: folder of the work folders.
+      physics: of locomotion: mjx or mujoco.
+      devices: host devices that members are sharded over; None for the cores.
+      evaluate: episodes of the policy's mean after training; 0 for no evaluation.
+      source: commit of the checkout, and whether it was clean, before training.
+    """
+
+    runs: pathlib.Path
+    physics: str = "mjx"
+    devices: int | None = None
+    evaluate: int = 0
+    source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def source(commit: str | None = None) -> dict[str, Any]:
+    """The commit of the checkout, and whether its files are as they are there.
+
+    Results are left out: they change while experiments run.
+
+    Args:
+      commit: what is said where there is no repository to ask.
+    """
+
+    def ask(*arguments: str) -> str | None:
+        root = pathlib.Path(__file__).parent.parent
+        command = ("git", "-C", str(root), *arguments)
+        try:
+            answer = subprocess.run(command, capture_output=True, text=True)
+        except OSError:
+            return None
+        return answer.stdout.strip() if answer.returncode == 0 else None
+
+    changed = ask("status", "--porcelain", "--", ".", ":!experiments/results")
+    clean = None if changed is None else not changed
+    return {"commit": ask("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """What one compiled program trains.
+
+    Attributes:
+      runs: its members, alike but for hyperparameters and seeds.
+      physics: mjx or mujoco, whose states differ.
+    """
+
+    runs: tuple[Run, ...]
+    physics: str
+
+    def folder(self, runs: pathlib.Path) -> pathlib.Path:
+        """Where it works."""
+        text = " ".join([self.physics, *(run.key for run in self.runs)])
+        return runs / hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    def __str__(self) -> str:
+        run = self.runs[0]
+        words = [f"{run.env} {run.config.agent}", f"{run.config.num_envs} environments"]
+        words += [f"delayed {run.reward_delay}"] if run.reward_delay > 1 else []
+        words += [] if run.config.stagger_episodes else ["in step"]
+        one = len(self.runs) == 1
+        return ", ".join(
+            [*words, f"seed {run.seed}" if one else f"{len(self.runs)} runs"]
+        )
+
+
+def programs(runs: Iterable[Run], physics: str) -> list[Program]:
+    """Runs in as few programs as may be."""
+    groups: dict[Run, list[Run]] = {}
+    for run in runs:
+        # Counts decide shapes: they divide the runs, the other numbers do not.
+        counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
+        shared_values = gasil_jax.Hyperparameters(**counts)
+        config = run.config.replace(hyperparameters=shared_values)
+        shared = dataclasses.replace(run, config=config, seed=0)
+        groups.setdefault(shared, []).append(run)
+    ordered = lambda group: tuple(sorted(group, key=lambda run: run.key))
+    return [Program(ordered(group), physics) for group in groups.values()]
+
+
+def part_of(runs: Sequence[Run], part: shards.Shard) -> list[Run]:
+    """Every n-th run, by their keys: the same on each machine, whatever it has."""
+    mine = sorted(runs, key=lambda run: run.key)[part.number - 1 :: part.count]
+    chosen = set(mine)
+    return [run for run in runs if run in chosen] if part.count > 1 else list(runs)
+
+
+def train(program: Program, setup: Setup) -> dict[Run, Record]:
+    """Train a program or go on with it.
+
+    Raises:
+      InputError: it does not fit the memory, or another process works on it.
+      Interrupted: by a signal; it has saved.
+    """
+    run, count = program.runs[0], len(program.runs)
+    settings = Settings(
+        *(run.reward_delay, run.obs_noise),
+        physics=program.physics,
+        integrator=run.integrator,
+    )
+    options = run_command.Options(
+        env=run.env, settings=settings, config=run.config, devices=setup.devices
+    )
+    run_command.use_devices(options, count)
+    env = run_command.make_env(options)
+    with command_line.input_checked():
+        resources.check_memory(env, run.config, count, jax.devices())
+    seeds = [run.seed for run in program.runs]
+    hyperparameters = [run.config.hyperparameters for run in program.runs]
+    members = batch.make_batch(env, run.config, seeds, hyperparameters)
+    folder = run_folder.create(program.folder(setup.runs), "")
+    steps = run.config.num_iterations * run.config.batch_steps * count
+    with (
+        run_folder.lock(folder),
+        Interruption() as interruption,
+        Progress(str(program), steps) as progress,
+    ):
+        provenance = _provenance(folder, members.device_kind, program.physics, setup)
+        try:
+            outcome = driver.drive(
+                members,
+                folder,
+                dict(zip(_LABELS, (range(count), seeds), strict=True)),
+                schedule=driver.CheckpointSchedule(every=None, keep=1),
+                progress=progress,
+                interruption=interruption,
+            )
+        except Interrupted as interrupted:
+            interrupted.add_note("go on with the same command")
+            raise
+        metrics = logging.read_metrics(folder / "metrics.csv", _LABELS, count)
+    final = np.full(count, np.nan)
+    if setup.evaluate:
+        final = _evaluate(env, program, outcome.states, setup.evaluate)
+    of = lambda member: {name: values[member] for name, values in metrics.items()}
+    return {
+        run: record(of(member), float(final[member]), provenance)
+        for member, run in enumerate(program.runs)
+    }
+
+
+def _provenance(
+    folder: pathlib.Path, device: str, physics: str, setup: Setup
+) -> dict[str, Any]:
+    """With what a program is trained; all of it, if it went on with something else."""
+    now = {"physics": physics, "device": device, "versions": logging.versions()}
+    now |= setup.source
+    path = folder / "provenance.json"
+    sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
+    if now not in sessions:
+        sessions.append(now)
+        logging.write_json(path, {"sessions": sessions})
+    every = lambda name: ", then ".join(
+        dict.fromkeys(str(session[name]) for session in sessions if session.get(name))
+    )
+    # The worst of them: no, or unknown.
+    order = (False, None, True)
+    clean = min((session.get("clean") for session in sessions), key=order.index)
+    commit = every("commit") or None
+    return {**now, "device": every("device"), "commit": commit, "clean": clean}
+
+
+def record(
+    metrics: Mapping[str, np.ndarray], final: float, provenance: Mapping[str, Any]
+) -> Record:
+    """What is kept of a run: its metrics, (iterations,) each, as means over parts."""
+    steps = metrics["env_steps"]
+    parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
+
+    def means(name: str) -> np.ndarray:
+        values = metrics.get(name, np.full(len(steps), np.nan))
+        seen = [values[part][np.isfinite(values[part])] for part in parts]
+        return np.array([x.mean() if len(x) else np.nan for x in seen])
+
+    return Record(
+        env_steps=np.array([steps[part[-1]] for part in parts]),
+        episode_return=means("episode_return"),
+        episode_length=means("episode_length"),
+        evaluation_return=means("evaluation_return"),
+        final_evaluation=final,
+        provenance=provenance,
+    )
+
+
+def _evaluate(env: Any, program: Program, states: Any, episodes: int) -> np.ndarray:
+    """Mean return of each member's policy, deterministic: (members,)."""
+    config = program.runs[0].config
+
+    def score(state: Any, seed: jax.Array) -> jax.Array:
+        key = jax.random.fold_in(jax.random.key(seed), 1)
+        scores = evaluate.evaluate(env, config, state, key, num_episodes=episodes)
+        return scores["episode_return"].mean()
+
+    seeds = np.array([run.seed for run in program.runs], np.uint32)
+    return np.asarray(jax.jit(jax.vmap(score))(states, seeds))
+
+
+def train_missing(
+    missing: Sequence[Run], store: Store, setup: Setup, processes: int | None = None
+) -> None:
+    """Train runs and add them to the store, each program as soon as it has ended.
+
+    Args:
+      missing: what to train.
+      store: gets them.
+      setup: with what.
+      processes: so many single runs at a time, on the CPU, a process on cores of its
+        own for each; None for one program after another that holds all runs alike.
+
+    Raises:
+      ChildProcessError: processes have failed; the other runs are done.
+      Interrupted: by a signal, which the running processes were sent too.
+    """
+    if processes is None:
+        for program in programs(missing, setup.physics):
+            store.add(train(program, setup))
+        return
+    waiting = [Program((run,), setup.physics) for run in missing]
+    total, ended, failed = len(waiting), 0, []
+    free, running = list(range(processes)), dict[Any, tuple[Program, int, Any, float]]()
+    log = lambda program: program.folder(setup.runs).with_suffix(".log")
+    with Interruption() as interruption:
+        try:
+            while waiting or running:
+                if interruption.signal is not None:
+                    interrupted = Interrupted(interruption.signal)
+                    interrupted.add_note("go on with the same command")
+                    raise interrupted
+                while free and waiting:
+                    program, slot = waiting.pop(0), free.pop(0)
+                    work = (program, store.folder, setup, (slot, processes))
+                    child = _CONTEXT.Process(target=_work, args=(*work, log(program)))
+                    child.start()
+                    running[child.sentinel] = program, slot, child, time.monotonic()
+                for sentinel in connection.wait(list(running), _SECONDS_BETWEEN_LOOKS):
+                    program, slot, child, began = running.pop(sentinel)
+                    child.join()
+                    free.append(slot)
+                    if child.exitcode != 0:
+                        failed.append(program)
+                        continue
+                    ended += 1
+                    seconds = time.monotonic() - began
+                    print(
+                        f"{program}: {seconds:.0f} s ({ended} of {total})", flush=True
+                    )
+        finally:
+            for _, _, child, _ in running.values():
+                child.terminate()
+            for _, _, child, _ in running.values():
+                child.join()
+            store.refresh()
+    if failed:
+        logs = ", ".join(str(log(program)) for program in failed)
+        raise ChildProcessError(
+            f"{len(failed)} of {total} runs failed, see {logs}; the others are done, "
+            "and the same command goes on"
+        )
+
+
+def _work(
+    program: Program,
+    store: pathlib.Path,
+    setup: Setup,
+    slot: tuple[int, int],
+    log: pathlib.Path,
+) -> None:
+    """What a process does; exits with a status."""
+    # In a session of its own Ctrl-C reaches it once, from the parent.
+    os.setsid()
+    if hasattr(os, "sched_setaffinity"):
+        number, processes = slot
+        cores = sorted(os.sched_getaffinity(0))
+        # Where there are fewer cores than processes, some share one.
+        own = cores[number::processes] or [cores[number % len(cores)]]
+        os.sched_setaffinity(0, own)
+    log.parent.mkdir(parents=True, exist_ok=True)
+    with log.open("a") as file:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(file.fileno(), stream.fileno())
+    jax.config.update("jax_platforms", "cpu")
+    alone = dataclasses.replace(setup, devices=1)
+
+    def work() -> None:
+        Store(store).add(train(program, alone))
+
+    sys.exit(command_line.exit_status(work))

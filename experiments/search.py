@@ -1,0 +1,294 @@
+"""The search for hyperparameters: many points on few seeds, then the best on more.
+
+The best of many points on few seeds is partly the luckiest, so the best four are tried
+again on new seeds, and the mean over both decides. Figures train the chosen point with
+seeds of their own. The spaces are the ranges of the paper's appendix.
+"""
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from experiments.store import Run, Store
+from gasil_jax.config import Config
+
+Point = Mapping[str, Any]
+Space = Mapping[str, tuple[Any, ...]]
+
+AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
+#: Those of the figures that compare two.
+PAIR = ("ppo", "ppo+gasil")
+TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
+#: The reward is given every so many steps where it is delayed (paper, section 5.4).
+DELAY = 20
+#: Noise on walker2d's observations in its search: the middle of the paper's three.
+NOISE = 0.1
+#: Environments a seed. More where physics is slow: a GPU is fast only with thousands.
+NUM_ENVS, NUM_ENVS_OF = 32, {"ant": 64, "humanoid": 64}
+#: The runs of these figures and searches had all environments reset together.
+STAGGER_EPISODES, ALGORITHM_VERSION = False, 1
+
+_RATES = (3e-4, 1e-4, 5e-5, 3e-5)
+# PPO's search shows what the lower two cost in 1M steps.
+_RATE, _HIGHER = {"learning_rate": _RATES}, {"learning_rate": _RATES[:2]}
+_COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
+#: What each agent's search draws from.
+SPACES: Mapping[str, Space] = {
+    "ppo": _RATE,
+    "ppo+bc": {**_HIGHER, "behavior_cloning_coefficient": _COEFFICIENTS},
+    "ppo+sil": {**_HIGHER, "sil_coefficient": _COEFFICIENTS},
+    "ppo+gasil": {
+        **_HIGHER,
+        "discriminator_updates": (1, 5, 10, 20),
+        "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+        "buffer_steps": (1000, 10000),
+        "alpha": (0.02, 0.1, 0.2, 1.0),
+    },
+}
+_POINT_MASS = {"learning_rate": (1e-3, 3e-4, 1e-4, 3e-5)}
+_STRONG = {
+    "discriminator_updates": (20,),
+    "discriminator_learning_rate": (3e-4,),
+    "alpha": (1.0,),
+}
+_OTHER_SPACES: Mapping[tuple[str, str], Space] = {
+    ("ant", "ppo"): _HIGHER,
+    ("humanoid", "ppo"): _HIGHER,
+    ("point_mass", "ppo"): _POINT_MASS,
+    ("point_mass", "ppo+gasil"): {**_POINT_MASS, **_STRONG},
+}
+#: Steps of a run in a search where they are not 1M; humanoid's figure has three times
+#: as many.
+STEPS = {"point_mass": 500_000, "humanoid": 333_000}
+# In the first stage so many runs; in the second so many points and seeds.
+_RUNS, _RUNS_OF = 32, {"ant": 16, "humanoid": 16}
+_BEST, _SEEDS, _SEEDS_OF = 4, 4, {"ant": 2, "humanoid": 2}
+_FIRST_SEED, _SECOND_SEED = 1000, 2000
+#: Points that have so many seeds are not tried again.
+_ENOUGH_SEEDS = 8
+# Multiplication by 1, 2 and 3 in the field of four elements; its sum is exclusive or.
+_TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
+
+
+def every_point(space: Space) -> tuple[Point, ...]:
+    """All points of a space."""
+    every = itertools.product(*space.values())
+    return tuple(dict(zip(space, values, strict=True)) for values in every)
+
+
+def draw(space: Space) -> tuple[Point, ...]:
+    """At most sixteen points of a space of up to five hyperparameters.
+
+    All there are, if they are no more. Else an orthogonal array: any two
+    hyperparameters have every pair of their values equally often, so that none is
+    judged by what it happened to be drawn with.
+    """
+    if len(every := every_point(space)) <= 16:
+        return every
+    if len(space) > 5 or any(len(values) not in (2, 4) for values in space.values()):
+        raise ValueError(
+            f"{dict(space)}: at most five hyperparameters of two or four values"
+        )
+    rng = np.random.default_rng(0)
+    # Which value is which level is left to chance; two levels are one of two values.
+    of_level = {
+        name: [values[i % len(values)] for i in rng.permutation(4)]
+        for name, values in space.items()
+    }
+    pairs = itertools.product(range(4), repeat=2)
+    rows = [(a, b, *(a ^ times[b] for times in _TIMES)) for a, b in pairs]
+    return tuple(
+        {name: of_level[name][level] for name, level in zip(space, row, strict=False)}
+        for row in rows
+    )
+
+
+class Stage(NamedTuple):
+    """Points and the seeds that each of them gets."""
+
+    points: tuple[Point, ...]
+    seeds: range
+
+
+@dataclasses.dataclass(frozen=True)
+class Search:
+    """A search for an agent's hyperparameters on a task.
+
+    Attributes:
+      env: environment's name.
+      agent: agent's name.
+      reward_delay: of the environment.
+      obs_noise: of the environment.
+      normalize_rewards: whether PPO's rewards are.
+      after: a search to go on from: hyperparameters that are not `free` are fixed at
+        the value whose points did best in it, on average.
+      free: what is searched then: all points of these, on two seeds each.
+    """
+
+    env: str
+    agent: str
+    reward_delay: int = 1
+    obs_noise: float = 0.0
+    normalize_rewards: bool = False
+    after: "Search | None" = None
+    free: tuple[str, ...] = ()
+
+    @property
+    def space(self) -> Space:
+        """What its points are drawn from, if it goes on from no other search."""
+        return _OTHER_SPACES.get((self.env, self.agent), SPACES[self.agent])
+
+    def config(self, point: Point) -> Config:
+        """The appendix's values with a point's, and our number of environments."""
+        return Config(
+            agent=self.agent,
+            total_steps=STEPS.get(self.env, 1_000_000),
+            num_envs=NUM_ENVS_OF.get(self.env, NUM_ENVS),
+            normalize_rewards=self.normalize_rewards,
+            stagger_episodes=STAGGER_EPISODES,
+        ).replace(**point)
+
+    def runs(self, stage: Stage) -> list[list[Run]]:
+        """The runs of a stage: a list for each point."""
+        return [
+            [self.run(self.config(point), seed) for seed in stage.seeds]
+            for point in stage.points
+        ]
+
+    def run(self, config: Config, seed: int, **changes: Any) -> Run:
+        """A run on its task."""
+        fields = {
+            "reward_delay": self.reward_delay,
+            "obs_noise": self.obs_noise,
+            "algorithm_version": ALGORITHM_VERSION,
+        }
+        return Run(self.env, config, seed, **{**fields, **changes})
+
+    def scores(self, stage: Stage, store: Store) -> np.ndarray | None:
+        """Mean return over the last fifth of training, (points, seeds).
+
+        None before all runs of the stage are in the store.
+        """
+        runs = self.runs(stage)
+        if store.missing(run for of_point in runs for run in of_point):
+            return None
+        return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+
+    def first(self, store: Store) -> Stage | None:
+        """The first stage; None before that of the search it goes on from has ended."""
+        if self.after is None:
+            points = draw(self.space)
+            seeds = _RUNS_OF.get(self.env, _RUNS) // len(points)
+        else:
+            before = self.after.first(store)
+            scores = None if before is None else self.after.scores(before, store)
+            if before is None or scores is None:
+                return None
+            space = {
+                name: values if name in self.free else (best,)
+                for name, values in self.after.space.items()
+                for best in [_best_value(name, before.points, _means(scores))]
+            }
+            points, seeds = every_point(space), 2
+        return Stage(points, range(_FIRST_SEED, _FIRST_SEED + seeds))
+
+    def stages(self, store: Store) -> list[Stage]:
+        """Those whose points are settled by what is in the store."""
+        first = self.first(store)
+        if first is None:
+            return []
+        scores = self.scores(first, store)
+        if len(first.seeds) >= _ENOUGH_SEEDS or scores is None:
+            return [first]
+        order = np.argsort(-_means(scores), kind="stable")[:_BEST]
+        seeds = range(_SECOND_SEED, _SECOND_SEED + _SEEDS_OF.get(self.env, _SEEDS))
+        return [first, Stage(tuple(first.points[i] for i in order), seeds)]
+
+    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
+        """The best point and its scores in all stages; None before all are there."""
+        stages = self.stages(store)
+        scores = [self.scores(stage, store) for stage in stages]
+        if not stages or (all_scores := scores[0]) is None or scores[-1] is None:
+            return None
+        points = stages[-1].points
+        if len(stages) > 1:
+            among = [stages[0].points.index(point) for point in points]
+            all_scores = np.hstack([all_scores[among], scores[-1]])
+        chosen = int(_means(all_scores).argmax())
+        return points[chosen], all_scores[chosen]
+
+    def chosen(self, store: Store) -> Point | None:
+        """The point that it has chosen; None before it is complete."""
+        best = self.best(store)
+        return None if best is None else best[0]
+
+
+def _means(scores: np.ndarray) -> np.ndarray:
+    """(points, seeds) -> (points,); -inf where a seed ended no episode."""
+    means = scores.mean(axis=1)
+    return np.where(np.isfinite(means), means, -np.inf)
+
+
+def _by_value(
+    name: str, points: Sequence[Point], means: np.ndarray
+) -> dict[Any, float]:
+    """The mean over the points that have each value of a hyperparameter."""
+    values = np.array([point[name] for point in points])
+    return {
+        value: float(means[values == value].mean())
+        for value in dict.fromkeys(point[name] for point in points)
+    }
+
+
+def _best_value(name: str, points: Sequence[Point], means: np.ndarray) -> Any:
+    by_value = _by_value(name, points, means)
+    return max(by_value, key=lambda value: by_value[value])
+
+
+def point_in_words(point: Point) -> str:
+    """A point as "name value, name value"."""
+    words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
+    return ", ".join(f"{name} {words(value)}" for name, value in point.items())
+
+
+def table(searches: Mapping[str, Search], store: Store) -> str:
+    """What searches have found: Markdown."""
+    head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
+    lines = [f"| {' | '.join(head.split('|'))} |", "|---" * 8 + "|"]
+    for name, search in searches.items():
+        best, stages = search.best(store), search.stages(store)
+        sizes = [f"{len(stage.points)} x {len(stage.seeds)}" for stage in stages]
+        cells = [name, *sizes, *[""] * (2 - len(sizes))]
+        scores = search.scores(stages[0], store) if stages else None
+        if best is None or scores is None:
+            cells += ["not complete", *[""] * 4]
+        else:
+            cells += [point_in_words(best[0]), f"{best[1].mean():.0f}"]
+            cells += [str(len(best[1])), f"{np.median(_means(scores)):.0f}"]
+            cells += [f"{_means(scores).min():.0f}"]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def effects(searches: Mapping[str, Search], store: Store) -> str:
+    """The mean first-stage score of PPO+GASIL's points that have each value: Markdown.
+
+    Every value met every value of the others equally often, so that a mean is of no
+    other's doing; what two do together is not told apart.
+    """
+    names = list(SPACES["ppo+gasil"])
+    lines = [f"| task | {' | '.join(names)} |", "|---|" + "---|" * len(names)]
+    for label, search in searches.items():
+        stage = search.first(store)
+        if search.space != SPACES["ppo+gasil"] or stage is None:
+            continue
+        if (scores := search.scores(stage, store)) is not None:
+            cells = [label]
+            for name in names:
+                by_value = sorted(_by_value(name, stage.points, _means(scores)).items())
+                cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in by_value))
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)

@@ -1,0 +1,260 @@
+"""The store of runs: each stands in it once, under all that decides its numbers.
+
+A task has one file, TASK.npz, of plain arrays and one JSON text. Figures, tables and
+searches ask the store for runs; no run knows which of them it is for.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import json
+import pathlib
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from gasil_jax import npz, output_file, run_folder
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters
+
+#: To be raised by hand when a change makes the same settings give other numbers than
+#: before by more than rounding: all runs of before are then missing. Runs of version 1
+#: had their environments in step, and were moved here from another form of results.
+ALGORITHM_VERSION = 2
+
+_DEFAULTS = Hyperparameters()
+RESULTS = pathlib.Path(__file__).parent / "results"
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """All that decides the numbers of one training run.
+
+    The simulator (mjx or mujoco) and the device are no part of it: they are ways to
+    compute the same thing, and a record says which were used.
+    """
+
+    env: str
+    config: Config
+    seed: int
+    reward_delay: int = 1
+    obs_noise: float = 0.0
+    integrator: str = "model"
+    algorithm_version: int = ALGORITHM_VERSION
+
+    @functools.cached_property
+    def experiment(self) -> str:
+        """Everything but the seed, as JSON: what runs of one curve share."""
+        values = dict(vars(self.config))
+        for name, value in values.items():
+            if callable(value):
+                raise InputError(f"{name} is a function: a stored run needs points")
+            if name.endswith("_schedule"):
+                values[name] = [[float(x) for x in point] for point in value]
+        values["hyperparameters"] = {
+            name: type(getattr(_DEFAULTS, name))(value)
+            for name, value in vars(self.config.hyperparameters).items()
+        }
+        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        fields |= {"config": values, "obs_noise": float(self.obs_noise)}
+        del fields["seed"]
+        return json.dumps(fields, sort_keys=True)
+
+    @functools.cached_property
+    def key(self) -> str:
+        """A hash of everything, which names the run."""
+        text = f"{self.experiment} {self.seed}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _tuples(value: Any) -> Any:
+    # JSON has no tuples, and a configuration is hashable.
+    return tuple(map(_tuples, value)) if isinstance(value, list) else value
+
+
+def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """The fields of `Run` but the seed; one of `Config` that is newer is default."""
+    values = {name: _tuples(value) for name, value in fields["config"].items()}
+    values["hyperparameters"] = Hyperparameters(**values["hyperparameters"])
+    return {**fields, "config": Config(**values)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Record:
+    """What is kept of a run: means over equal parts of training, (rows,) each.
+
+    Attributes:
+      env_steps: at the end of each part.
+      episode_return: of the episodes that ended in it; NaN where none did.
+      episode_length: the same; NaN where it was not recorded.
+      evaluation_return: of the policy's mean; NaN where it was not evaluated.
+      final_evaluation: of the policy's mean after training; NaN if not evaluated.
+      provenance: physics, device, versions, the commit that it was trained with, and
+        whether the checkout was clean.
+    """
+
+    env_steps: np.ndarray
+    episode_return: np.ndarray
+    episode_length: np.ndarray
+    evaluation_return: np.ndarray
+    final_evaluation: float
+    provenance: Mapping[str, Any]
+
+    def part(self, begin: float, end: float) -> float:
+        """Mean return over a part of training, from share to share.
+
+        Of the rows whose middle is in it (a row may end just past a round share), or of
+        the row that the part's own middle is in.
+        """
+        ends = self.env_steps / self.env_steps[-1]
+        middle = (np.concatenate([[0.0], ends[:-1]]) + ends) / 2
+        chosen = (middle > begin) & (middle <= end)
+        if not chosen.any():
+            chosen[np.searchsorted(ends, (begin + end) / 2)] = True
+        rows = self.episode_return[chosen]
+        rows = rows[np.isfinite(rows)]
+        return float(rows.mean()) if len(rows) else float("nan")
+
+    @property
+    def final(self) -> float:
+        """Mean return over the last tenth of training.
+
+        Where no episode ended in it, for many environments in step end theirs seldom,
+        of the last part of training in which one did; NaN where none ever did.
+        """
+        ended = self.episode_return[np.isfinite(self.episode_return)]
+        last = self.part(0.9, 1.0)
+        return float(ended[-1]) if np.isnan(last) and len(ended) else last
+
+
+_ROWS = ("env_steps", "episode_return", "episode_length", "evaluation_return")
+
+
+def _rounded(values: Iterable[float]) -> np.ndarray:
+    """Six significant digits, which float32 keeps: seeds differ by far more."""
+    return np.array([float(f"{value:.6g}") for value in values], np.float32)
+
+
+def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
+    """Write a file of runs; the same runs give the same bytes in whatever order."""
+    runs = sorted(records, key=lambda run: (run.experiment, run.seed))
+    texts = {run: json.dumps(records[run].provenance, sort_keys=True) for run in runs}
+    experiments = sorted({run.experiment for run in runs})
+    provenances = sorted(set(texts.values()))
+    number = {
+        text: i for these in (experiments, provenances) for i, text in enumerate(these)
+    }
+    rows = {
+        name: np.concatenate([getattr(records[run], name) for run in runs])
+        for name in _ROWS
+    }
+    index = {
+        "experiments": list(map(json.loads, experiments)),
+        "provenances": list(map(json.loads, provenances)),
+    }
+    arrays = {
+        "index": np.array(json.dumps(index, sort_keys=True)),
+        "experiment": np.array([number[run.experiment] for run in runs]),
+        "provenance": np.array([number[texts[run]] for run in runs]),
+        "seed": np.array([run.seed for run in runs], np.uint32),
+        "rows": np.array([len(records[run].env_steps) for run in runs]),
+        "final_evaluation": _rounded(records[run].final_evaluation for run in runs),
+        "env_steps": rows["env_steps"].astype(np.uint32),
+        **{name: _rounded(rows[name]) for name in _ROWS[1:]},
+    }
+    with output_file.whole(path) as partial:
+        np.savez_compressed(partial, allow_pickle=False, **arrays)
+
+
+def read(path: pathlib.Path) -> dict[Run, Record]:
+    """The runs of a file.
+
+    Raises:
+      InputError: it is damaged, or has settings that the package does not.
+    """
+    records = {}
+    try:
+        arrays = npz.read(path)
+        index = json.loads(str(arrays["index"]))
+        experiments = list(map(_experiment, index["experiments"]))
+        ends = np.cumsum(arrays["rows"])
+        for i, seed in enumerate(arrays["seed"]):
+            span = slice(ends[i] - arrays["rows"][i], ends[i])
+            run = Run(seed=int(seed), **experiments[arrays["experiment"][i]])
+            records[run] = Record(
+                **{name: arrays[name][span].astype(float) for name in _ROWS},
+                final_evaluation=float(arrays["final_evaluation"][i]),
+                provenance=index["provenances"][arrays["provenance"][i]],
+            )
+    except (ValueError, KeyError, TypeError, IndexError) as error:
+        raise InputError(f"{path} is not a file of runs: {error}") from None
+    return records
+
+
+class Store:
+    """The runs of a folder: `run in store`, `store[run]` and `store.add`."""
+
+    def __init__(self, folder: pathlib.Path):
+        self.folder = folder
+        self._records: dict[str, dict[Run, Record]] = {}
+
+    def _path(self, env: str) -> pathlib.Path:
+        # One of brax.envs, "brax:ant", or a class of one's own, "my_tasks:Line".
+        return self.folder / f"{env.replace(':', '-')}.npz"
+
+    def _of(self, env: str) -> dict[Run, Record]:
+        if env not in self._records:
+            path = self._path(env)
+            self._records[env] = read(path) if path.exists() else {}
+        return self._records[env]
+
+    def __contains__(self, run: Run) -> bool:
+        return run in self._of(run.env)
+
+    def __getitem__(self, run: Run) -> Record:
+        return self._of(run.env)[run]
+
+    def refresh(self) -> None:
+        """Read anew what other processes may have added."""
+        self._records.clear()
+
+    def missing(self, runs: Iterable[Run]) -> list[Run]:
+        """Those that are not here, each once."""
+        return [run for run in dict.fromkeys(runs) if run not in self]
+
+    def add(self, records: Mapping[Run, Record]) -> int:
+        """Add runs; one that is here already stays as it is. Returns how many are new.
+
+        Processes may add side by side: a file is locked, read anew, and written whole.
+        """
+        added = 0
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for env in sorted({run.env for run in records}):
+            with run_folder.wait_for_lock(self.folder):
+                self._records.pop(env, None)
+                stored = self._of(env)
+                new = {run for run in records if run.env == env} - set(stored)
+                if new:
+                    stored.update({run: records[run] for run in new})
+                    write(self._path(env), stored)
+            added += len(new)
+        return added
+
+
+def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
+    """Add the runs of another store; returns how many are new, and how many there are.
+
+    Args:
+      source: its folder, or the folder of results that it is in.
+      target: keeps what it has already.
+
+    Raises:
+      InputError: there are no runs.
+    """
+    folder = source / "runs" if (source / "runs").is_dir() else source
+    paths = sorted(folder.glob("[!.]*.npz"))
+    if not paths:
+        raise InputError(f"folder is {source}: it must have TASK.npz files of runs")
+    records = {run: record for path in paths for run, record in read(path).items()}
+    return target.add(records), len(records)

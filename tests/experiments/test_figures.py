@@ -1,0 +1,115 @@
+"""What the figures ask for."""
+
+import dataclasses
+
+import jax
+import numpy as np
+import pytest
+
+import gasil_jax
+from experiments.figures import CONSTANT, FIGURES, Curve
+from experiments.search import DELAY, PAIR
+from experiments.store import RESULTS, Store
+from gasil_jax.config import Config, validate
+
+STORE = Store(RESULTS / "runs")
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_run_of_a_figure_is_valid(name):
+    runs = FIGURES[name].requested(STORE, STORE)
+    for config in {run.config for run in runs}:
+        validate(config, gasil_jax.agents())
+    assert runs and len(set(runs)) == len(runs)
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_figure_names_what_it_has(name):
+    figure = FIGURES[name]
+    names = {
+        (panel, curve) for panel, curves in figure.panels.items() for curve in curves
+    }
+    if figure.early is not None:
+        names |= {(panel, f"{curve} early") for panel, curve in names}
+    for terms in figure.compared().values():
+        assert {(panel, curve) for _, panel, curve in terms} <= names
+        assert sum(weight for weight, _, _ in terms) == 0
+    assert set(figure.quick) <= {*figure.panels, *figure.searches}
+
+
+@pytest.mark.parametrize(
+    "name", [x for x in FIGURES if x not in ("batch_geometry", "wider_search")]
+)
+def test_what_is_published_is_complete(name):
+    assert not STORE.missing(FIGURES[name].requested(STORE, STORE))
+
+
+def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
+    for curve in FIGURES["mujoco"].panels["hopper"].values():
+        assert curve.runs(Store(tmp_path)) == () and len(curve.runs(STORE)) == 10
+
+
+def test_the_control_differs_in_the_discriminator_alone():
+    for curves in FIGURES["constant_bonus"].panels.values():
+        control, tuned = (curves[name].runs(STORE)[0] for name in ("constant", PAIR[1]))
+        one, other = (vars(x.config.hyperparameters) for x in (control, tuned))
+        changed = {name for name in one if one[name] != other[name]}
+        one, other = (dict(vars(x.config)) for x in (control, tuned))
+        del one["hyperparameters"], other["hyperparameters"]
+        changed |= {name for name in one if one[name] != other[name]}
+        assert "discriminator_entropy_coefficient" in changed
+        assert all(name.startswith("discriminator_") for name in changed)
+
+
+def test_the_control_s_discriminator_is_held_at_a_half():
+    env = gasil_jax.make_env("point_mass")
+    small = {"total_steps": 20 * 512, "batch_steps": 512, "num_envs": 8}
+    probability = {}
+    for name, change in (
+        ("free", {**CONSTANT, "discriminator_entropy_coefficient": 1e-3}),
+        ("held", CONSTANT),
+    ):
+        config = Config(agent="ppo+gasil").replace(**small, **change)
+        _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+        names = ("discriminator_good_probability", "discriminator_policy_probability")
+        probability[name] = np.array([metrics[x][-1] for x in names])
+    assert np.abs(probability["held"] - 0.5).max() < 0.005
+    assert 0.5 - probability["free"][0] > 0.02
+
+
+def test_the_figure_on_geometry_is_the_tuned_presets_with_other_environments():
+    figure, runs = FIGURES["batch_geometry"], set()
+    for panel, curves in figure.panels.items():
+        for curve in curves.values():
+            mine = curve.runs(STORE)
+            assert len(mine) == (20 if panel.startswith("halfcheetah") else 10)
+            delay = DELAY if panel.endswith("delayed") else 1
+            preset = gasil_jax.preset(
+                curve.search.env, curve.search.agent, "tuned", delay
+            )
+            config = mine[0].config
+            assert (config.batch_steps, config.total_steps) == (2048, 1_000_000)
+            same = {
+                name: getattr(preset, name) for name in ("num_envs", "stagger_episodes")
+            }
+            assert config.replace(**same) == preset and mine[0].reward_delay == delay
+            runs |= set(mine)
+    assert len(runs) == len(figure.requested(STORE, STORE)) == 960
+    assert {(x.config.num_envs, x.config.stagger_episodes) for x in runs} == {
+        (count, drawn) for count in (1, 8, 32, 128) for drawn in (True, False)
+    }
+    # What an earlier figure trained with the same settings is found.
+    assert len(runs) - len(STORE.missing(runs)) >= 100
+
+
+def test_a_curve_changes_what_was_chosen():
+    curve = FIGURES["humanoid"].panels["dense"]["ppo+gasil-from-2M"]
+    scheduled, fixed = (
+        x.runs(STORE)[0].config
+        for x in (curve, FIGURES["humanoid"].panels["dense"]["ppo+gasil"])
+    )
+    assert scheduled.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
+    alpha = fixed.hyperparameters.alpha
+    assert scheduled.replace(alpha=alpha, alpha_schedule=()) == fixed
+    bare = dataclasses.replace(curve, preset=True, changes={})
+    assert isinstance(bare, Curve) and bare.point(STORE) == {}

@@ -1,0 +1,260 @@
+"""Pages are what the stored runs say; verdicts are corrected for their number."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from experiments import report, summary
+from experiments.figures import FIGURES, Curve, Figure, difference
+from experiments.report import Page, compare
+from experiments.search import Search
+from experiments.store import RESULTS, Record, Store
+from gasil_jax.command_line import InputError
+
+STORE = Store(RESULTS / "runs")
+
+
+def scores(**means):
+    rng = np.random.default_rng(0)
+    return {("a", name): mean + rng.normal(0, 1, 10) for name, mean in means.items()}
+
+
+def family(*pairs):
+    return {("a", *pair): difference("a", *pair) for pair in pairs}
+
+
+def test_a_clear_difference_is_told_and_none_is_not():
+    found = compare(
+        scores(high=9.0, low=0.0, same=0.0), family(("high", "low"), ("low", "same"))
+    )
+    assert found["a", "high", "low"].verdict == "better"
+    assert found["a", "low", "same"].verdict == "not clear"
+    (other,) = compare(scores(high=9.0, low=0.0), family(("low", "high"))).values()
+    assert other.verdict == "worse"
+    assert other.low < other.middle < other.high < 0
+
+
+def test_the_correction_is_holm_s():
+    """Against a plain loop over sorted p-values."""
+    means = {f"x{i}": 0.4 * i for i in range(6)} | {"zero": 0.0}
+    pairs = [(name, "zero") for name in means if name != "zero"]
+    data = scores(**means)
+    alone = {key: compare(data, {key: x})[key].p for key, x in family(*pairs).items()}
+    found = compare(data, family(*pairs))
+    order = sorted(alone, key=alone.get)
+    rejected = True
+    for i, key in enumerate(order):
+        rejected = rejected and alone[key] <= report.LEVEL / (len(order) - i)
+        assert (found[key].verdict != "not clear") == rejected
+    # The correction decides something here.
+    assert any(alone[key] <= report.LEVEL < found[key].p for key in order)
+
+
+def test_a_contrast_is_a_weighted_sum():
+    data = scores(ours=5.0, other=1.0, calm=2.0)
+    terms = (*difference("a", "ours", "other"), *difference("a", "other", "calm"))
+    (found,) = compare(data, {("x",): terms}).values()
+    (same,) = compare(data, {("x",): difference("a", "ours", "calm")}).values()
+    assert (found.middle, found.low, found.high) == pytest.approx(
+        (same.middle, same.low, same.high)
+    )
+
+
+def test_few_seeds_make_nothing_clear():
+    few = {name: x[:3] for name, x in scores(high=9.0, low=0.0).items()}
+    (found,) = compare(few, family(("high", "low"))).values()
+    assert found.verdict == "not clear"
+    assert report.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
+    # Nor does a seed that ended no episode.
+    none = scores(high=9.0, low=0.0)
+    none["a", "low"][0] = np.nan
+    (found,) = compare(none, family(("high", "low"))).values()
+    assert found.verdict == "not clear"
+    assert report.interval(np.arange(5.0)).startswith("2.0 [")
+
+
+def test_a_ratio_over_tasks_does_not_depend_on_their_scale():
+    rng = np.random.default_rng(4)
+    lognormal = lambda mean: mean * np.exp(rng.normal(0.0, 0.5, 10))
+    data = {(panel, name): lognormal(2.0) for panel in "ab" for name in ("x", "y")}
+    scaled = {key: x * (1000.0 if key[0] == "a" else 1.0) for key, x in data.items()}
+    assert report.together(data, "ab", "x", "y") == report.together(
+        scaled, "ab", "x", "y"
+    )
+    doubled = data | {(p, "x"): 2 * data[p, "y"] for p in "ab"}
+    assert report.together(doubled, "ab", "x", "y").startswith("+100% [")
+
+
+FIGURE = Figure(
+    "Title",
+    "Claim.",
+    {
+        panel: {
+            name: Curve(
+                Search(env, "ppo"), seeds=6, preset=True, changes={"alpha": alpha}
+            )
+            for name, alpha in (("ours", 0.5), ("other", 0.6))
+        }
+        for panel, env in (("one", "hopper"), ("two", "swimmer"))
+    },
+    favourite="ours",
+)
+
+
+@pytest.fixture
+def page(tmp_path):
+    store = Store(tmp_path / "runs")
+    nan = np.full(10, np.nan)
+    by = {
+        "physics": "mjx",
+        "device": None,
+        "versions": None,
+        "commit": "c",
+        "clean": False,
+    }
+    for panel, means in (("one", (200.0, 100.0)), ("two", (5.0, 5.0))):
+        for curve, mean in zip(FIGURE.panels[panel].values(), means, strict=True):
+            for i, run in enumerate(curve.runs(store)):
+                values = np.full(10, mean + i)
+                store.add({run: Record(np.arange(1, 11), values, nan, nan, 0.0, by)})
+    return Page("mujoco", store, figure=FIGURE)
+
+
+def test_a_table_and_a_tally(page):
+    assert "| one | other | 6 | 102 [101, 104] | 100 [" in page.table()
+    assert page.table().count(" better |") == 1 == page.table().count(" not clear |")
+    (line,) = page.tally().splitlines()
+    assert line.startswith(
+        "- ours against other: better on 1, not clear on 1 of 2; over"
+    )
+    assert page.tally("two") == "- ours against other: not clear on 1 of 1."
+    words = "ours is better than other on one (100 ["
+    assert page.value("compared", "one", "ours", "other").startswith(words)
+    assert report.fill("so {{final two ours}}.", page.value).startswith("so 7.5 [")
+    assert "commit c, changed" in page.settings()
+
+
+def test_what_lacks_seeds_is_not_compared(page, tmp_path):
+    curve = dataclasses.replace(FIGURE.panels["one"]["ours"], seeds=7)
+    panels = {**FIGURE.panels, "one": {**FIGURE.panels["one"], "ours": curve}}
+    lacking = dataclasses.replace(FIGURE, panels=panels)
+    page = Page("mujoco", page.store, figure=lacking)
+    assert "| one | ours | 6 of 7 |" in page.table()
+    assert ("one", "ours", "other") not in page.comparisons
+    assert "Not trained yet: 1 of 25 runs." in page.text()
+    with pytest.raises(InputError, match="final one ours in mujoco"):
+        page.value("final", "one", "ours")
+    with pytest.raises(InputError, match="slot is nonsense"):
+        page.value("nonsense")
+
+
+def test_a_page_is_written_with_its_plot(page, tmp_path):
+    page.write(tmp_path)
+    assert (tmp_path / "mujoco.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "mujoco.md").read_text() == page.text()
+
+
+def test_lock_step_is_told_as_long_as_runs_have_it(page):
+    assert report.IN_STEP not in page.text()
+    changes = {"stagger_episodes": False}
+    store = page.store
+    for curves in FIGURE.panels.values():
+        for curve in curves.values():
+            run = dataclasses.replace(curve, changes=changes).runs(store)[0]
+            store.add({run: store[curve.runs(store)[0]]})
+    together = {
+        panel: {
+            n: dataclasses.replace(x, changes=changes, seeds=1) for n, x in c.items()
+        }
+        for panel, c in FIGURE.panels.items()
+    }
+    figure = dataclasses.replace(FIGURE, panels=together)
+    assert report.IN_STEP in Page("mujoco", store, figure=figure).text()
+
+
+def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
+    figure, store = FIGURES["batch_geometry"], Store(tmp_path / "runs")
+    rng, nan = np.random.default_rng(0), np.full(10, np.nan)
+    by = {
+        "physics": "mjx",
+        "device": None,
+        "versions": None,
+        "commit": "c",
+        "clean": True,
+    }
+    records = {}
+    for curve in figure.panels["swimmer"].values():
+        drawn = curve.changes["stagger_episodes"] and curve.changes["num_envs"] == 128
+        for run in curve.runs(store):
+            values = np.full(10, rng.normal(90.0 if drawn else 30.0, 1.0))
+            records[run] = Record(np.arange(1, 11), values, nan, nan, 0.0, by)
+    store.add(records)
+    page = Page("batch_geometry", store)
+    rows = page.geometry().splitlines()[2:]
+    assert len(rows) == 8
+    verdicts = {tuple(row.split(" | ")[1:3]): row.split(" | ")[-1] for row in rows}
+    for (_, count), verdict in verdicts.items():
+        assert verdict.startswith("better" if count == "128" else "not clear")
+    page.write(tmp_path)
+    assert (tmp_path / "batch_geometry.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_a_published_page_is_what_the_stored_runs_say(name):
+    assert (RESULTS / f"{name}.md").read_text() == Page(name, STORE).text()
+
+
+def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
+    made = summary.Summary(STORE)
+    assert (RESULTS / "README.md").read_text() == made.text()
+    text = summary.README.read_text()
+    assert made.fill_blocks(text) == text
+    assert text.count("<!-- begin ") == text.count("<!-- end -->") > 0
+
+
+def test_seeds_in_words():
+    assert report._ranges([0, 1, 2, 4, 6, 7]) == "0 to 2, 4, 6 to 7"
+    assert report._ranges([3]) == "3"
+
+
+def test_a_block_is_made_anew():
+    made = summary.Summary(STORE)
+    text = "before\n<!-- begin tuned -->\nold\n<!-- end -->\nafter"
+    filled = made.fill_blocks(text)
+    assert filled == text.replace("old\n", f"\n{made.tuned()}\n\n")
+    assert made.fill_blocks(filled) == filled
+    with pytest.raises(InputError, match="slot is nonsense: it must be one of claims"):
+        made.fill_blocks(text.replace("tuned", "nonsense"))
+
+
+#: Settings, and names: what may stand in a note in digits.
+_SETTINGS = re.compile(
+    r"walker2d|ppo[12]|\(http\S+\)|`[^`]*`|95%"
+    r"|[Ff]igures? [2-8](?:,? (?:and|to) [2-8])?"
+    r"|\d+M steps|all \dM|until 2M|at 3M|\"from-2M\"|[13]e-\d"
+    r"|30,000 steps|of 128 drawn|2048 steps|128 environments|16 steps|1, 8, 32 and 128"
+    r"|at 0 as|is 0 until|to 0\.02|log 2|at 0\.1\b|alpha 1 |20 updates|1,000 steps"
+    r"|buffer\s+of 500|first stage: 32 of|256|all 32 points"
+)
+
+
+@pytest.mark.parametrize(
+    "path", sorted(report.NOTES.glob("*.md")), ids=lambda x: x.stem
+)
+def test_no_number_of_a_note_is_typed_by_hand(path):
+    """Every digit is of a slot, or of a setting."""
+    text = re.sub(r"{{.+?}}", "", path.read_text())
+    rest = _SETTINGS.sub("", text)
+    assert not re.findall(r".*\d.*", rest)
+
+
+def test_no_verdict_of_a_note_is_typed_by_hand():
+    words = r"\b(better than|worse than|clearly|not clear|outperforms|ahead of)\b"
+    allowed = ("PPO+GASIL was most clearly ahead, on new seeds",)
+    for path in report.NOTES.glob("*.md"):
+        text = " ".join(re.sub(r"{{.+?}}", "", path.read_text()).split())
+        for sentence in allowed:
+            text = text.replace(sentence, "")
+        assert not re.findall(words, text), path.name

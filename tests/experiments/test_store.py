@@ -1,0 +1,179 @@
+"""A run stands once, under what decides its numbers; files are whole and the same."""
+
+import dataclasses
+import subprocess
+import threading
+
+import numpy as np
+import pytest
+
+from experiments.store import RESULTS, Record, Run, Store, merge, read, write
+from gasil_jax.command_line import InputError
+from gasil_jax.config import Config, Hyperparameters
+
+
+def run(seed=0, env="hopper", **changes):
+    return Run(env, Config().replace(**changes), seed)
+
+
+def record(value=1.0, rows=3, **more):
+    nan = np.full(rows, np.nan)
+    steps = np.arange(1, rows + 1) * 2048
+    return Record(steps, np.full(rows, value), nan, nan, float("nan"), more)
+
+
+def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
+    one = run()
+    others = [
+        run(seed=1),
+        run(env="ant"),
+        run(alpha=0.2),
+        run(stagger_episodes=False),
+        run(total_steps=5),
+        run(alpha_schedule=((1e3, 0.0), (2e3, 1.0))),
+        *(
+            dataclasses.replace(one, **change)
+            for change in (
+                {"reward_delay": 20},
+                {"obs_noise": 0.1},
+                {"integrator": "euler"},
+                {"algorithm_version": 99},
+            )
+        ),
+    ]
+    assert len({x.key for x in [one, *others]}) == 1 + len(others)
+    assert run().key == one.key == run(alpha=0.1).key
+    # A whole number and the same as a float are one number.
+    assert run(gamma=1).key == run(gamma=1.0).key and run(gamma=1) == run(gamma=1.0)
+
+
+def test_every_field_of_the_configuration_is_in_the_experiment():
+    text = run().experiment
+    for kind in (Config, Hyperparameters):
+        for field in dataclasses.fields(kind):
+            assert f'"{field.name}"' in text
+
+
+def test_a_schedule_without_points_has_no_place():
+    with pytest.raises(InputError, match="alpha_schedule is a function"):
+        _ = run(alpha_schedule=lambda steps: 1.0).experiment
+
+
+def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
+    records = {
+        run(seed, alpha_schedule=((1e3, 0.0), (2e3, 1.0))): record(
+            100.0 / 3 + seed, rows=3 + seed, physics="mjx"
+        )
+        for seed in range(3)
+    } | {run(alpha=0.3): record(np.nan, physics="mujoco", commit=None)}
+    one, other = tmp_path / "one.npz", tmp_path / "other.npz"
+    write(one, records)
+    write(other, dict(reversed(records.items())))
+    assert one.read_bytes() == other.read_bytes()
+    back = read(one)
+    assert set(back) == set(records)
+    for each, before in records.items():
+        now = back[each]
+        assert now.provenance == before.provenance
+        np.testing.assert_array_equal(now.env_steps, before.env_steps)
+        np.testing.assert_allclose(now.episode_return, before.episode_return, 5e-6)
+        assert np.isnan(now.final_evaluation)
+    # What was read is written as it was.
+    write(other, back)
+    assert one.read_bytes() == other.read_bytes()
+
+
+def test_a_field_that_a_file_has_not_is_the_default(tmp_path, monkeypatch):
+    path = tmp_path / "hopper.npz"
+    older = run().experiment.replace('"num_epochs": 10, ', "")
+    assert older != run().experiment
+    monkeypatch.setattr(Run, "experiment", older)
+    write(path, {run(): record()})
+    monkeypatch.undo()
+    assert list(read(path)) == [run()]
+
+
+@pytest.mark.parametrize("content", [b"", b"no zip"])
+def test_a_damaged_file_is_told(tmp_path, content):
+    path = tmp_path / "hopper.npz"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"hopper\.npz is not a file of runs"):
+        _ = run() in Store(tmp_path)
+
+
+def test_a_setting_that_the_package_has_not_is_told(tmp_path, monkeypatch):
+    path = tmp_path / "hopper.npz"
+    other = run().experiment.replace('"num_epochs"', '"num_epoks"')
+    monkeypatch.setattr(Run, "experiment", other)
+    write(path, {run(): record()})
+    monkeypatch.undo()
+    with pytest.raises(InputError, match="num_epoks"):
+        read(path)
+
+
+def test_a_run_that_is_there_stays(tmp_path):
+    store = Store(tmp_path)
+    assert store.add({run(): record(1.0), run(env="ant"): record(2.0)}) == 2
+    assert sorted(path.name for path in tmp_path.glob("*.npz")) == [
+        "ant.npz",
+        "hopper.npz",
+    ]
+    assert store.add({run(): record(9.0), run(1): record(3.0)}) == 1
+    for fresh in (store, Store(tmp_path)):
+        assert fresh[run()].episode_return.tolist() == [1.0] * 3
+        assert fresh.missing([run(), run(2), run(1), run(2)]) == [run(2)]
+
+
+def test_the_runs_of_another_machine_are_added(tmp_path):
+    here, there = Store(tmp_path / "here"), Store(tmp_path / "results" / "runs")
+    here.add({run(): record(1.0)})
+    there.add({run(): record(2.0), run(1): record(2.0), run(env="ant"): record(2.0)})
+    assert merge(tmp_path / "results", here) == (2, 3)
+    assert merge(tmp_path / "results" / "runs", here) == (0, 3)
+    assert here[run()].episode_return[0] == 1.0 and here[run(1)].episode_return[0] == 2
+    with pytest.raises(InputError, match=r"must have TASK\.npz"):
+        merge(tmp_path, here)
+
+
+def test_runs_are_added_side_by_side(tmp_path):
+    add = lambda seed: Store(tmp_path).add({run(seed): record(float(seed))})
+    threads = [threading.Thread(target=add, args=(seed,)) for seed in range(6)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    store = Store(tmp_path)
+    assert [store[run(i)].part(0, 1) for i in range(6)] == list(range(6))
+
+
+def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
+    ends = np.array([11, 20, 31, 40, 51, 60, 71, 80, 91, 100])
+    nan = np.full(10, np.nan)
+    kept = Record(ends, np.arange(10.0), nan, nan, 0.0, {})
+    assert kept.part(0.9, 1.0) == 9.0  # Though the ninth row ends after 90.
+    assert kept.part(0.0, 0.2) == 0.5
+    assert kept.part(0.0, 0.01) == 0.0
+    assert kept.part(0.99, 1.0) == 9.0
+    assert np.isnan(dataclasses.replace(kept, episode_return=nan).part(0, 1))
+    # Where no episode ends in the last tenth, of the last part in which one did.
+    assert kept.final == 9.0
+    returns = np.where(np.arange(10) < 7, np.arange(10.0), np.nan)
+    assert dataclasses.replace(kept, episode_return=returns).final == 6.0
+    assert np.isnan(dataclasses.replace(kept, episode_return=nan).final)
+
+
+def test_what_is_checked_in_is_small_and_of_few_files():
+    files = [x for x in RESULTS.rglob("[!.]*") if x.is_file()]
+    assert len(files) <= 60 and sum(x.stat().st_size for x in files) < 3e6
+    # A pattern of .gitignore would leave them out.
+    git = ("git", "-C", str(RESULTS), "check-ignore", "-q", *map(str, files))
+    assert subprocess.run(git).returncode != 0
+
+
+@pytest.mark.parametrize("path", sorted((RESULTS / "runs").glob("*.npz")), ids=str)
+def test_what_is_checked_in_says_what_it_was_trained_with(path):
+    for each, kept in read(path).items():
+        assert path.stem == each.env
+        assert {"physics", "versions", "commit", "clean"} <= set(kept.provenance)
+        assert (np.diff(kept.env_steps) > 0).all()
+        assert kept.env_steps[-1] == 2048 * each.config.num_iterations
