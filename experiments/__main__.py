@@ -17,9 +17,9 @@ from experiments.figures import FIGURES, Figure
 from experiments.report import Page
 from experiments.store import RESULTS, Run, Store
 from experiments.summary import Summary
-from gasil_jax import command_line, shards
-from gasil_jax.command_line import InputError
-from gasil_jax.config import unknown
+from gasil_jax.errors import InputError, unknown
+from gasil_jax.host import command_line
+from gasil_jax.sweeps import shards
 
 _QUICK_STEPS = 100_000
 _OTHERS = {

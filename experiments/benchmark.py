@@ -29,9 +29,11 @@ from jax.sharding import PartitionSpec as P
 
 import gasil_envs
 from experiments.search import TASKS
-from gasil_jax import batch, command_line, logging, output_file, presets
-from gasil_jax.command_line import InputError
-from gasil_jax.environments import Settings, available_cores, prepare
+from gasil_jax import presets
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, metrics_files, output_file
+from gasil_jax.host.environments import Settings, available_cores, prepare
+from gasil_jax.host.members import make_batch
 
 VARIANTS = {
     "mjx": {"solver": "mjx"},
@@ -196,7 +198,7 @@ def training_row(
     config = config.replace(num_envs=options.training_envs or config.num_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    members = batch.make_batch(env, config, range(seeds), devices=devices)
+    members = make_batch(env, config, range(seeds), devices=devices)
     began = time.perf_counter()
     states, advance = members.compile()
     compile_seconds = time.perf_counter() - began
@@ -356,7 +358,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         "device": f"{len(devices)} x {devices[0].device_kind}",
         "cores": available_cores(),
         "options": {name: str(value) for name, value in values},
-        "versions": logging.versions(),
+        "versions": metrics_files.versions(),
         "tables": tables,
     }
     print(f"{result['device']}, {result['cores']} cores")
@@ -365,5 +367,5 @@ def _main(arguments: Sequence[str] | None) -> None:
         for rows in TABLES[table](options):
             tables[table] += measure(rows, options.repeats)
             # After every task: a benchmark that is cut off has its first figures.
-            logging.write_json(out, result)
+            metrics_files.write_json(out, result)
     print(f"in {out}")

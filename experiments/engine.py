@@ -23,20 +23,21 @@ import numpy as np
 
 import gasil_jax
 from experiments.store import Record, Run, Store
-from gasil_jax import (
-    batch,
+from gasil_jax import evaluate
+from gasil_jax.host import (
     command_line,
     driver,
-    evaluate,
-    logging,
+    metrics_files,
     resources,
     run_folder,
-    shards,
+    run_options,
 )
-from gasil_jax import run as run_command
-from gasil_jax.environments import Settings
-from gasil_jax.interruption import Interrupted, Interruption
-from gasil_jax.progress import Progress
+from gasil_jax.host import devices as host_devices
+from gasil_jax.host.environments import Settings
+from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.members import make_batch
+from gasil_jax.host.progress import Progress
+from gasil_jax.sweeps import shards
 
 #: Equal parts of training in a record.
 ROWS = 50
@@ -151,16 +152,16 @@ def train(program: Program, setup: Setup) -> dict[Run, Record]:
         physics=program.physics,
         integrator=run.integrator,
     )
-    options = run_command.Options(
+    options = run_options.Options(
         env=run.env, settings=settings, config=run.config, devices=setup.devices
     )
-    run_command.use_devices(options, count)
-    env = run_command.make_env(options)
+    host_devices.use_devices(settings, setup.devices, count)
+    env = run_options.make_env(options)
     with command_line.input_checked():
         resources.check_memory(env, run.config, count, jax.devices())
     seeds = [run.seed for run in program.runs]
     hyperparameters = [run.config.hyperparameters for run in program.runs]
-    members = batch.make_batch(env, run.config, seeds, hyperparameters)
+    members = make_batch(env, run.config, seeds, hyperparameters)
     folder = run_folder.create(program.folder(setup.runs), "")
     steps = run.config.num_iterations * run.config.batch_steps * count
     with (
@@ -181,7 +182,7 @@ def train(program: Program, setup: Setup) -> dict[Run, Record]:
         except Interrupted as interrupted:
             interrupted.add_note("go on with the same command")
             raise
-        metrics = logging.read_metrics(folder / "metrics.csv", _LABELS, count)
+        metrics = metrics_files.read_metrics(folder / "metrics.csv", _LABELS, count)
     final = np.full(count, np.nan)
     if setup.evaluate:
         final = _evaluate(env, program, outcome.states, setup.evaluate)
@@ -196,13 +197,13 @@ def _provenance(
     folder: pathlib.Path, device: str, physics: str, setup: Setup
 ) -> dict[str, Any]:
     """With what a program is trained; all of it, if it went on with something else."""
-    now = {"physics": physics, "device": device, "versions": logging.versions()}
+    now = {"physics": physics, "device": device, "versions": metrics_files.versions()}
     now |= setup.source
     path = folder / "provenance.json"
     sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
     if now not in sessions:
         sessions.append(now)
-        logging.write_json(path, {"sessions": sessions})
+        metrics_files.write_json(path, {"sessions": sessions})
     every = lambda name: ", then ".join(
         dict.fromkeys(str(session[name]) for session in sessions if session.get(name))
     )

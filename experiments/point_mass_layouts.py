@@ -28,9 +28,11 @@ from experiments.search import PAIR
 from experiments.store import RESULTS
 from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
-from gasil_jax import command_line, output_file, plotting, presets
-from gasil_jax.command_line import InputError
+from gasil_jax import presets
 from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.errors import InputError
+from gasil_jax.figures import plotting
+from gasil_jax.host import command_line, output_file
 
 _MOST_OBJECTS = 12
 # Added to the standard error: a lead of less is none, however alike the seeds are.

@@ -22,7 +22,10 @@ import gasil_jax
 from experiments import report
 from experiments.figures import FIGURES
 from experiments.store import RESULTS, Store
-from gasil_jax import batch, command_line, normalization, output_file, plotting, policy
+from gasil_jax import normalization, policy
+from gasil_jax.figures import plotting
+from gasil_jax.host import command_line, output_file
+from gasil_jax.host.members import make_batch, member
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
@@ -55,7 +58,7 @@ class Options:
 
 def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
     """The state of seed 0 at `moments`, in shares of training, increasing from 0."""
-    members = batch.make_batch(env, config, [0])
+    members = make_batch(env, config, [0])
     states, advance = members.compile()
     ends = [max(1, round(share * config.num_iterations)) for share in moments]
     kept = []
@@ -63,7 +66,7 @@ def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[
         for done in range(first, end, members.chunk):
             count = min(members.chunk, end - done)
             states, _ = members.train(advance, states, done, count)
-        kept.append(jax.device_get(batch.member(members.trim(states), 0)))
+        kept.append(jax.device_get(member(members.trim(states), 0)))
     return kept
 
 

@@ -30,9 +30,10 @@ from experiments.figures import (
 )
 from experiments.search import AGENTS, PAIR
 from experiments.store import Record, Run, Store
-from gasil_jax import output_file, plot
-from gasil_jax.command_line import InputError
-from gasil_jax.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.errors import InputError
+from gasil_jax.figures import plotting
+from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.host import output_file
 
 NOTES = pathlib.Path(__file__).parent / "notes"
 #: Probability that any verdict of a page is wrong, at most.
@@ -507,7 +508,9 @@ def _colors(curves: Sequence[str]) -> dict[str, Any]:
     import matplotlib
 
     if set(curves) & set(AGENTS):
-        return dict(zip(dict.fromkeys([*AGENTS, *curves]), plot.COLORS, strict=False))
+        return dict(
+            zip(dict.fromkeys([*AGENTS, *curves]), plotting.COLORS, strict=False)
+        )
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
     return dict(zip(curves, shades, strict=True))
 
@@ -572,7 +575,7 @@ def _draw_over(page: Page, panel: str, axes: Any) -> None:
         steps = np.array(complete) * 1.06 ** (i - 1.5)
         axes.errorbar(
             *(steps, middle, [middle - low, high - middle]),
-            color=plot.COLORS[PAIR.index(agent)],
+            color=plotting.COLORS[PAIR.index(agent)],
             linestyle="-" if drawn else "--",
             **{"marker": "o", "markersize": 3, "capsize": 2},
             label=f"{agent}, ages {AGES[drawn].replace('-', ' ')}",

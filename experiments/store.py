@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import npz, output_file, run_folder
-from gasil_jax.command_line import InputError
+from gasil_jax import npz
 from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.errors import InputError
+from gasil_jax.host import output_file, run_folder
 
 #: To be raised by hand when a change makes the same settings give other numbers than
 #: before by more than rounding: all runs of before are then missing. Runs of version 1

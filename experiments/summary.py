@@ -14,8 +14,8 @@ from experiments.figures import FIGURES, NORMALIZED, name_of
 from experiments.report import Page
 from experiments.search import AGENTS, DELAY, TASKS
 from experiments.store import RESULTS, Store
-from gasil_jax import output_file
-from gasil_jax.command_line import InputError
+from gasil_jax.errors import InputError
+from gasil_jax.host import output_file
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 _COMPARISONS = {DELAY: "delayed_mujoco", 1: "mujoco"}

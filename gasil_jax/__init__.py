@@ -6,14 +6,19 @@ from typing import TYPE_CHECKING, Any
 from gasil_jax import compatibility as compatibility
 
 if TYPE_CHECKING:
-    from gasil_jax.batch import member
-    from gasil_jax.config import Config, Hyperparameters
-    from gasil_jax.environments import make_env
-    from gasil_jax.imitation import agents
-    from gasil_jax.policy import load_policy
-    from gasil_jax.presets import preset
-    from gasil_jax.train import TrainState, init, iterate, make_train
+    from gasil_jax.config import Config as Config
+    from gasil_jax.config import Hyperparameters as Hyperparameters
+    from gasil_jax.host.environments import make_env as make_env
+    from gasil_jax.host.members import member as member
+    from gasil_jax.imitation import agents as agents
+    from gasil_jax.policy import load_policy as load_policy
+    from gasil_jax.presets import preset as preset
+    from gasil_jax.train import TrainState as TrainState
+    from gasil_jax.train import init as init
+    from gasil_jax.train import iterate as iterate
+    from gasil_jax.train import make_train as make_train
 
+#: Each public name and the module that it is in.
 _HOMES = {
     "Config": "config",
     "Hyperparameters": "config",
@@ -22,25 +27,13 @@ _HOMES = {
     "init": "train",
     "iterate": "train",
     "load_policy": "policy",
-    "make_env": "environments",
+    "make_env": "host.environments",
     "make_train": "train",
-    "member": "batch",
+    "member": "host.members",
     "preset": "presets",
 }
 
-__all__ = [
-    "Config",
-    "Hyperparameters",
-    "TrainState",
-    "agents",
-    "init",
-    "iterate",
-    "load_policy",
-    "make_env",
-    "make_train",
-    "member",
-    "preset",
-]
+__all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:

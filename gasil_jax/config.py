@@ -5,13 +5,14 @@ which the paper's code was built. Each field stands beside the values that it ma
 """
 
 import dataclasses
-import difflib
 import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from flax import struct
+
+from gasil_jax.errors import unknown
 
 #: The factor that a hyperparameter is multiplied by, over environment steps: an
 #: Optax schedule (any pure function of the steps), or (steps, factor) points, linear
@@ -195,19 +196,6 @@ class Config:
             hyperparameters = changes.get("hyperparameters", self.hyperparameters)
             changes["hyperparameters"] = hyperparameters.replace(**swept)
         return dataclasses.replace(self, **changes)
-
-
-def nearest(name: str, allowed: Sequence[str]) -> str:
-    """The allowed name that is most like `name`."""
-    return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
-
-
-def unknown(kind: str, name: str, allowed: Sequence[str]) -> str:
-    """The error message for a name that is none of the allowed ones."""
-    return (
-        f"{kind} {name!r} is unknown: did you mean {nearest(name, allowed)!r}? "
-        f"(one of {', '.join(allowed)})"
-    )
 
 
 def ranges(kind: type) -> Mapping[str, Range]:

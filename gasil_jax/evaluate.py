@@ -12,22 +12,14 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gasil_jax import (
-    batch,
-    command_line,
-    environments,
-    numpy_policy,
-    output_file,
-    policy,
-    resources,
-    run_folder,
-    train,
-)
-from gasil_jax.command_line import InputError
-from gasil_jax.config import Config, validate
+from gasil_jax import numpy_policy, policy
+from gasil_jax.config import Config
+from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
-from gasil_jax.imitation import AGENTS
-from gasil_jax.progress import announced
+from gasil_jax.host import command_line, environments, output_file, resources
+from gasil_jax.host.members import member
+from gasil_jax.host.progress import announced
+from gasil_jax.sweeps.saved_states import load
 
 
 def evaluate_in_gymnasium(
@@ -96,69 +88,6 @@ class Options:
     out: pathlib.Path | None = None
 
 
-def check_key(key: int) -> None:
-    """Raise `InputError` for a key that is none of JAX's and of Gymnasium's."""
-    if not 0 <= key < 2**32:
-        raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
-
-
-def load(
-    folder: pathlib.Path,
-    which: str = "last",
-    point: int | None = None,
-    seed: int | None = None,
-) -> tuple[Any, Config, list[int], Any]:
-    """Environment, config, seed numbers and states (seed, ...) of a run or point.
-
-    Args:
-      folder: of the run or sweep, finished or not.
-      which: of its checkpoints, "last" or "best", the one with the best evaluation
-        on the way or, where there was none, the highest returns in training.
-      point: of a sweep; default the best by mean.
-      seed: its number; default all.
-
-    Raises:
-      InputError: it is not the folder of a run, or has no such checkpoint or seed, or
-        the best is asked for of a point that shares its checkpoints with others.
-    """
-    from gasil_jax import checkpoint, saved_states
-
-    described = run_folder.read(folder)
-    saved = saved_states.find(folder, described, point)
-    found, damages = checkpoint.latest(saved.root)
-    for damage in damages:
-        print(f"warning: {damage}", file=sys.stderr)
-    config, count = saved.program.config, len(saved.program.members)
-    if which == "best":
-        if len(saved.places) < count:
-            raise InputError(
-                "checkpoint is 'best': this point was trained with others, and "
-                "checkpoints are scored over all of them: it must be 'last'"
-            )
-        found = checkpoint.best(saved.root)
-    if found is None:
-        scored = " with a score" if which == "best" else ""
-        raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    settings = dataclasses.asdict(described["settings"])
-    with command_line.input_checked():
-        validate(config, tuple(AGENTS))
-        env = environments.make_env(described["env"], **settings)
-        # All members have leaves of the same names.
-        init = lambda seed: train.init(
-            env, config, jax.random.key(seed), saved.program.hyperparameters[0]
-        )
-        like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-        states = found.restore(like)
-    seeds, places = saved.seeds, np.array(saved.places)
-    if seed is not None:
-        if seed not in seeds:
-            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
-        seeds, places = [seed], places[[seeds.index(seed)]]
-    if len(places) < count:
-        states = jax.tree.map(lambda x: x[places], states)
-    return env, config, seeds, states
-
-
 def _score(
     options: Options, env: Any, config: Config, states: Any, seeds: Sequence[int]
 ) -> dict[str, np.ndarray]:
@@ -186,7 +115,7 @@ def _score_in_gymnasium(
     scores = [
         evaluate_in_gymnasium(
             gymnasium_id,
-            numpy_policy.make(policy.weights(batch.member(states, index), env)),
+            numpy_policy.make(policy.weights(member(states, index), env)),
             num_episodes=options.episodes,
             seed=options.key,
         )
@@ -203,7 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
     command_line.check_least(options, episodes=1)
-    check_key(options.key)
+    command_line.check_key(options.key)
     if options.out is not None:
         output_file.check(options.out, (".csv",))
     env, config, seeds, states = load(

@@ -24,9 +24,12 @@ import jax
 import numpy as np
 import tyro
 
-from gasil_jax import batch, command_line, evaluate, run_folder, train
-from gasil_jax.command_line import InputError
+from gasil_jax import train
+from gasil_jax.errors import InputError
 from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.host import command_line, run_folder
+from gasil_jax.host.members import member
+from gasil_jax.sweeps import saved_states
 
 _DESCRIPTION = (
     "The good trajectories of {run}: whole episodes of {agent} on {env}, the best "
@@ -171,13 +174,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
     check_name(options.name)
-    env, config, seeds, states = evaluate.load(
+    env, config, seeds, states = saved_states.load(
         options.run, options.checkpoint, options.point, options.seed
     )
     limit = train.max_episode_steps(env, config)
     most = states.hyperparameters.buffer_steps
     buffers = jax.device_get((states.good_trajectories, most))
-    members = [batch.member(buffers, place) for place in range(len(seeds))]
+    members = [member(buffers, place) for place in range(len(seeds))]
     found = [
         episode
         for buffer, max_steps in members

@@ -7,13 +7,14 @@ curves.npz, summary.json and sweep.png. The shards are only read.
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import Sequence
+from typing import Annotated
 
 import tyro
 
-from gasil_jax import command_line, run_folder, shards, sweep_tables
-from gasil_jax.command_line import InputError
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, run_folder
+from gasil_jax.sweeps import merging, shards, tables
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,113 +29,6 @@ class Options:
 
     folders: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
     out: pathlib.Path | None = None
-
-
-def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The shards that a folder holds or is."""
-    inside = shards.root(folder)
-    found = sorted(inside.iterdir()) if inside.is_dir() else [folder]
-    described = [path for path in found if run_folder.is_described(path)]
-    if not described:
-        raise InputError(f"folder is {folder}: it must hold shards or be one")
-    return described
-
-
-def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: x for name, x in described.items() if name != "shard"}
-
-
-def _refuse_different(
-    first: tuple[pathlib.Path, Mapping[str, Any]],
-    other: tuple[pathlib.Path, Mapping[str, Any]],
-) -> None:
-    before, now = _comparable(first[1]), _comparable(other[1])
-    # total_steps may not grow here.
-    changed = run_folder.differences(before, now)
-    changed = changed or run_folder.differences(now, before)
-    if changed:
-        raise InputError(
-            f"{other[0]} is of another sweep than {first[0]}: {'; '.join(changed)}"
-        )
-
-
-def _read(folder: pathlib.Path) -> dict[str, Any]:
-    described = run_folder.read(folder)
-    if not isinstance(described.get("shard"), str) or "points" not in described:
-        raise InputError(f"folder is {folder}: it must be of a sweep's shard")
-    return described
-
-
-def _read_all(folders: Sequence[pathlib.Path]) -> dict[pathlib.Path, dict[str, Any]]:
-    """The shards' descriptions, all of one sweep and none missing."""
-    every = {path: _read(path) for folder in folders for path in _shard_folders(folder)}
-    (first, described), *others = every.items()
-    for other in others:
-        _refuse_different((first, described), other)
-    places: dict[shards.Shard, pathlib.Path] = {}
-    for path, content in every.items():
-        shard = shards.parse(content["shard"])
-        if shard in places:
-            raise InputError(f"shard {shard} is there twice: {places[shard]}, {path}")
-        places[shard] = path
-    counts = {shard.count for shard in places}
-    if len(counts) > 1:
-        raise InputError(
-            f"there are shards of {' and of '.join(map(str, sorted(counts)))}: name "
-            "the folders of those that belong together"
-        )
-    count = counts.pop()
-    wanted = [shards.Shard(number, count) for number in range(1, count + 1)]
-    missing = [str(shard) for shard in wanted if shard not in places]
-    if missing:
-        raise InputError(f"missing: shards {', '.join(missing)}, which have not begun")
-    return {places[shard]: every[places[shard]] for shard in wanted}
-
-
-def _refuse_used(
-    out: pathlib.Path, shard: tuple[pathlib.Path, Mapping[str, Any]]
-) -> None:
-    """Let only the tables of the same shards be written again: they come out alike."""
-    if run_folder.is_described(out):
-        _refuse_different((out, run_folder.read(out)), shard)
-        used = (out / "programs").is_dir()
-    else:
-        used = any(path.name not in ("shards", ".lock") for path in out.iterdir())
-    if used:
-        raise InputError(f"out is {out}, which holds something else: name another")
-
-
-def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
-    """Write the tables of a sweep that shards have trained; returns the summary.
-
-    Args:
-      folders: of the sweep, or of each shard.
-      out: where to; made where it is missing.
-
-    Raises:
-      InputError: shards are missing, not finished or of another sweep, or something
-        else is in `out`.
-    """
-    every = _read_all(folders)
-    described = next(iter(every.values()))
-    points = described["points"]
-    seeds = range(described["first_seed"], described["first_seed"] + described["seeds"])
-    parts = [sweep_tables.Trained.described(*shard) for shard in every.items()]
-    unfinished = [
-        content["shard"]
-        for part, content in zip(parts, every.values(), strict=True)
-        if part.unfinished()
-    ]
-    if unfinished:
-        raise InputError(
-            f"not finished: shards {', '.join(unfinished)}; run them again"
-        )
-    run_folder.create(out, out.name)
-    with run_folder.lock(out):
-        _refuse_used(out, next(iter(every.items())))
-        content = described | {"shard": None, "resume": False, "out": str(out)}
-        run_folder.describe(out, content)
-        return sweep_tables.write(out, points, seeds, parts)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -153,9 +47,9 @@ def _main(arguments: Sequence[str] | None) -> None:
         out = options.folders[0]
         if not shards.root(out).is_dir():
             raise InputError(f"folder is {out}: it must hold shards, or need --out")
-    summary = merge(options.folders, out)
+    summary = merging.merge(options.folders, out)
     points = run_folder.read(out)["points"]
-    print(*sweep_tables.report(points, summary), f"in {out}", sep="\n")
+    print(*tables.report(points, summary), f"in {out}", sep="\n")
 
 
 if __name__ == "__main__":

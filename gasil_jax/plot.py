@@ -9,19 +9,12 @@ from typing import Annotated, NamedTuple
 import numpy as np
 import tyro
 
-from gasil_jax import (
-    command_line,
-    logging,
-    output_file,
-    plotting,
-    run_folder,
-    statistics,
-)
-from gasil_jax.command_line import InputError
-from gasil_jax.run import final_returns
+from gasil_jax.errors import InputError
+from gasil_jax.figures import plotting, statistics
+from gasil_jax.figures.plotting import COLORS
+from gasil_jax.figures.statistics import final_returns
+from gasil_jax.host import command_line, metrics_files, output_file, run_folder
 
-#: Okabe and Ito's colours, which colour-blind readers tell apart.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", "-.", ":")
 
 
@@ -78,10 +71,10 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     path, evaluations = folder / "evaluations.csv", None
     # It may be too early for the first one.
     if path.is_file() and path.stat().st_size:
-        evaluations = logging.read_metrics(path, ("seed",), described["seeds"])
+        evaluations = metrics_files.read_metrics(path, ("seed",), described["seeds"])
     path = folder / "metrics.csv"
     try:
-        metrics = logging.read_metrics(path, ("seed",), described["seeds"])
+        metrics = metrics_files.read_metrics(path, ("seed",), described["seeds"])
         steps, returns = metrics["env_steps"][0], metrics["episode_return"]
     except (OSError, ValueError, KeyError, IndexError) as error:
         raise InputError(f"{path} has no curves to draw ({error})") from None

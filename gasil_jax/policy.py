@@ -1,7 +1,7 @@
 """Policies out of training states, and back into JAX."""
 
 import pathlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gasil_envs.precision import full_precision
-from gasil_jax import normalization, numpy_policy, output_file
+from gasil_jax import normalization, numpy_policy
 
 
 def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
@@ -30,31 +30,6 @@ def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
         arrays[f"kernel_{i}"] = layers[f"Dense_{i}"]["kernel"]
         arrays[f"bias_{i}"] = layers[f"Dense_{i}"]["bias"]
     return arrays
-
-
-def save(
-    path: pathlib.Path,
-    states: Any,
-    env: Any,
-    seeds: Sequence[int],
-    final_return: np.ndarray,
-) -> None:
-    """Write the policies of a batch of states as one ``.npz``, whole.
-
-    Args:
-      path: where to.
-      states: (seeds, ...).
-      env: that they were trained in.
-      seeds: their numbers.
-      final_return: (seeds,), NaN where unknown.
-    """
-    arrays: dict[str, Any] = {
-        "seeds": np.asarray(seeds, np.int64),
-        "final_return": np.asarray(final_return, np.float64),
-        **weights(states, env),
-    }
-    with output_file.whole(path) as partial, partial.open("wb") as file:
-        np.savez(file, **arrays)
 
 
 def load_policy(

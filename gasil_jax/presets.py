@@ -14,7 +14,8 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from gasil_jax.config import Config, unknown
+from gasil_jax.config import Config
+from gasil_jax.errors import unknown
 from gasil_jax.imitation import agents
 
 Overrides = Mapping[str, Any]

@@ -24,17 +24,12 @@ import numpy as np
 import tyro
 
 from gasil_envs import wrappers
-from gasil_jax import (
-    batch,
-    command_line,
-    environments,
-    evaluate,
-    output_file,
-    policy,
-    train,
-)
-from gasil_jax.command_line import InputError
-from gasil_jax.progress import announced
+from gasil_jax import policy, train
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, environments, output_file
+from gasil_jax.host.members import member
+from gasil_jax.host.progress import announced
+from gasil_jax.sweeps import saved_states
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
@@ -142,7 +137,7 @@ def point_mass_frames(
     import matplotlib.pyplot as plt
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    from gasil_jax import plotting
+    from gasil_jax.figures import plotting
 
     places = np.stack([state.position for state in states])
     figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
@@ -258,10 +253,10 @@ def _main(arguments: Sequence[str] | None) -> None:
             'install "gasil_jax[render]"); a .gif or .png needs nothing'
         )
     command_line.check_least(options, steps=1, width=1, height=1)
-    evaluate.check_key(options.key)
+    command_line.check_key(options.key)
     # A film's encoder takes no odd number of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
-    env, config, seeds, states = evaluate.load(
+    env, config, seeds, states = saved_states.load(
         options.run, options.checkpoint, options.point, options.seed
     )
     locomotion = environments.is_locomotion(env)
@@ -273,7 +268,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"must end in {', '.join(_PICTURES)}"
         )
     output_file.make_parent(options.out)
-    drawn = policy.from_state(batch.member(states, 0), env)
+    drawn = policy.from_state(member(states, 0), env)
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     steps = min(options.steps, train.max_episode_steps(env, config))
     with announced("render", "compiling and running the episode"):

@@ -21,27 +21,21 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from gasil_jax import (
-    command_line,
-    launch,
-    merge,
-    run,
-    run_folder,
-    shards,
-    sweep_tables,
-    trackers,
-)
-from gasil_jax.command_line import InputError
-from gasil_jax.interruption import Interrupted, Interruption
-from gasil_jax.points import Point, make_points
-from gasil_jax.shards import Program
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, run_folder, run_options
+from gasil_jax.host.driver import Outcome
+from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.members import Batch
+from gasil_jax.sweeps import assembly, launch, merging, shards, tables
+from gasil_jax.sweeps.points import Point, make_points
+from gasil_jax.sweeps.shards import Program
 
 _PROGRAM = "gasil_jax.sweep"
 
 
 @dataclasses.dataclass(frozen=True)
-class PointOptions(run.Options):
-    """What is trained at every point.
+class Options(run_options.Options):
+    """Train every point of a grid, or random points, with many seeds each.
 
     Attributes:
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
@@ -52,19 +46,6 @@ class PointOptions(run.Options):
       share_counts: points that differ in buffer_steps or discriminator_updates share
         a program too, which compiles once and has for each point the cost of the
         largest: best on a GPU.
-    """
-
-    grid: tuple[str, ...] = ()
-    random: int | None = None
-    points_file: str | None = None
-    share_counts: bool = False
-
-
-@dataclasses.dataclass(frozen=True)
-class Options(PointOptions):
-    """Train every point of a grid, or random points, with many seeds each.
-
-    Attributes:
       shard: train this part of all points and seeds alone, NUMBER/COUNT from 1/COUNT
         on, in a folder below out; the same command again goes on with it. See
         gasil_jax.merge.
@@ -73,6 +54,10 @@ class Options(PointOptions):
       shards: how many the launcher makes.
     """
 
+    grid: tuple[str, ...] = ()
+    random: int | None = None
+    points_file: str | None = None
+    share_counts: bool = False
     shard: str | None = None
     launcher: str | None = None
     shards: int | None = None
@@ -92,56 +77,31 @@ def train(
       OSError: the folder can't be written any more.
       ValueError: what is there to go on with does not fit.
     """
-    from gasil_jax import batch, driver
-    from gasil_jax.progress import Progress
+    run_options.write_config(options, folder, points=points)
 
-    run.write_config(options, folder, points=points)
-    steps_of = lambda program: (
-        program.config.num_iterations
-        * program.config.batch_steps
-        * len(program.members)
-    )
-    schedule = driver.CheckpointSchedule(
-        options.checkpoint_every, options.keep_checkpoints
-    )
-    steps_before = 0
+    def on_finished(job: assembly.Job, members: Batch, outcome: Outcome) -> None:
+        tables.write_training(
+            folder,
+            job.program,
+            env_steps=outcome.new_steps,
+            compile_seconds=outcome.compile_seconds,
+            train_seconds=outcome.train_seconds,
+            evaluation_seconds=outcome.evaluation_seconds,
+            device=members.device_kind,
+            device_count=len(members.devices),
+        )
+
+    jobs = [
+        assembly.Job(
+            program,
+            program.folder(folder),
+            dict(zip(tables.LABELS, zip(*program.members))),
+            finished=tables.read_training(folder, program) is not None,
+        )
+        for program in programs
+    ]
     title = f"{options.env} {options.config.agent} sweep"
-    with (
-        Interruption() as interruption,
-        Progress(title, sum(map(steps_of, programs))) as progress,
-    ):
-        for program in programs:
-            if sweep_tables.read_training(folder, program) is None:
-                indices, seeds = zip(*program.members)
-                runs = batch.make_batch(
-                    env, program.config, seeds, program.hyperparameters
-                )
-                place = program.folder(folder)
-                place.mkdir(parents=True, exist_ok=True)
-                outcome = driver.drive(
-                    runs,
-                    place,
-                    dict(zip(sweep_tables.LABELS, (indices, seeds))),
-                    schedule=schedule,
-                    evaluation_schedule=run.evaluation_schedule(options),
-                    progress=progress,
-                    interruption=interruption,
-                    steps_before=steps_before,
-                    trackers=trackers.make(
-                        options.log, place, run_folder.flat(vars(options))
-                    ),
-                )
-                sweep_tables.write_training(
-                    folder,
-                    program,
-                    env_steps=outcome.new_steps,
-                    compile_seconds=outcome.compile_seconds,
-                    train_seconds=outcome.train_seconds,
-                    evaluation_seconds=outcome.evaluation_seconds,
-                    device=runs.device_kind,
-                    device_count=len(runs.devices),
-                )
-            steps_before += steps_of(program)
+    assembly.train(options, env, jobs, title=title, on_finished=on_finished)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -152,13 +112,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     given, others = _placement(arguments)
     if given.launcher is not None:
-        options = run.parse(Options, arguments, _PROGRAM)
+        options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
     elif given.shard is not None:
         _train_shard(arguments, shards.parse(given.shard), given.out)
     else:
-        began = run.begun_run(arguments)
-        _train_whole(run.parse(Options, arguments, _PROGRAM, began), began)
+        began = run_options.begun_run(arguments)
+        _train_whole(run_options.parse(Options, arguments, _PROGRAM, began), began)
 
 
 def _placement(
@@ -172,13 +132,13 @@ def _placement(
     return parser.parse_known_args(arguments)
 
 
-def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
+def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
     """All points and programs, checked.
 
     Raises:
       InputError: the value and what is allowed.
     """
-    run.check(options)
+    run_options.check(options)
     points = make_points(
         options.grid,
         options.random,
@@ -188,43 +148,18 @@ def plan(options: PointOptions) -> tuple[list[dict[str, Any]], list[Program]]:
     )
     for point in points:
         config = options.config.replace(**point)
-        run.check(dataclasses.replace(options, config=config))
+        run_options.check(dataclasses.replace(options, config=config))
     programs = shards.programs(
-        options.config, points, seeds_of(options), options.share_counts
+        options.config, points, run_options.seeds_of(options), options.share_counts
     )
     return points, programs
-
-
-def seeds_of(options: PointOptions) -> range:
-    """Absolute numbers of the seeds of each point."""
-    return range(options.first_seed, options.first_seed + options.seeds)
-
-
-def prepare(
-    options: PointOptions, programs: Sequence[Program], saved: Sequence[Program]
-) -> Any:
-    """What must be done before anything compiles; returns the environment.
-
-    Args:
-      options: of the sweep.
-      programs: with the members that are trained at once.
-      saved: those whose checkpoints are still to be written.
-
-    Raises:
-      InputError: they don't fit the devices or the disk.
-    """
-    run.use_devices(options, sum(len(program.members) for program in programs))
-    env = run.make_env(options)
-    members = lambda programs: [(x.config, len(x.members)) for x in programs]
-    run.check_resources(options, env, members(programs), members(saved))
-    return env
 
 
 def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     """The programs that are not trained to their end in the folder that is named."""
     if options.out is None:
         return list(programs)
-    left = sweep_tables.Trained(options.out, programs).unfinished()
+    left = tables.Trained(options.out, programs).unfinished()
     return [program for program in programs if program.number in left]
 
 
@@ -251,13 +186,13 @@ def _train_whole(options: Options, began: pathlib.Path | None) -> None:
     points, programs = _plan_here(options, began)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
-    run.check_out(options)
-    env = prepare(options, programs, _untrained(options, programs))
-    with run.open_folder(options, _PROGRAM) as folder:
+    run_options.check_out(options)
+    env = assembly.prepare(options, programs, _untrained(options, programs))
+    with run_options.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
-        trained = sweep_tables.Trained(folder, programs)
-        summary = sweep_tables.write(folder, points, seeds_of(options), [trained])
-    print(*sweep_tables.report(points, summary), f"in {folder}", sep="\n")
+        trained = tables.Trained(folder, programs)
+        summary = tables.write(folder, points, run_options.seeds_of(options), [trained])
+    print(*tables.report(points, summary), f"in {folder}", sep="\n")
 
 
 def _train_shard(
@@ -271,19 +206,19 @@ def _train_shard(
     shards.refuse_recut(whole, shard)
     place = shard.folder(whole)
     began = place if run_folder.is_described(place) else None
-    options = run.parse(Options, arguments, _PROGRAM, began)
+    options = run_options.parse(Options, arguments, _PROGRAM, began)
     options = dataclasses.replace(options, out=place, resume=True)
     points, programs = _plan_here(options, began)
     programs = shards.share(programs, shard)
-    trained = sweep_tables.Trained(place, programs)
+    trained = tables.Trained(place, programs)
     if not trained.unfinished():
         print(f"shard {shard} is done, in {place}")
         return
-    run.check_out(options)
-    env = prepare(options, programs, _untrained(options, programs))
-    with run.open_folder(options, _PROGRAM) as folder:
+    run_options.check_out(options)
+    env = assembly.prepare(options, programs, _untrained(options, programs))
+    with run_options.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
-    speed = sweep_tables.speed(trained.trainings())
+    speed = tables.speed(trained.trainings())
     print(
         f"shard {shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
         f"on {speed['device']}, in {folder}"
@@ -315,8 +250,8 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     except Interrupted as interrupted:
         interrupted.add_note("go on with the same command")
         raise
-    summary = merge.merge([options.out], options.out)
-    print(*sweep_tables.report(points, summary), f"in {options.out}", sep="\n")
+    summary = merging.merge([options.out], options.out)
+    print(*tables.report(points, summary), f"in {options.out}", sep="\n")
 
 
 if __name__ == "__main__":

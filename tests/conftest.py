@@ -15,6 +15,7 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 
 from gasil_envs.physics import native
+from gasil_jax.host import run_options
 
 native.reserve_threads(2)
 
@@ -23,7 +24,6 @@ native.reserve_threads(2)
 # of their time. What compares numbers is compiled as it is for users.
 _OF_COMMANDS = {
     "test_engine",
-    "test_halving",
     "test_input",
     "test_periodic_evaluation",
     "test_plot",
@@ -67,18 +67,18 @@ def untrained_hopper(tmp_path_factory):
     import numpy as np
 
     import gasil_jax
-    from gasil_jax import checkpoint, run
-    from gasil_jax.environments import Settings
+    from gasil_jax.host import checkpoint
+    from gasil_jax.host.environments import Settings
 
     out = tmp_path_factory.mktemp("hopper") / "run"
     config = gasil_jax.Config(
         num_envs=1, batch_steps=64, hidden_sizes=(8,), discriminator_hidden_sizes=(8,)
     )
     settings = Settings(physics="mujoco")
-    options = run.Options(env="hopper", settings=settings, config=config)
+    options = run_options.Options(env="hopper", settings=settings, config=config)
     out.mkdir()
-    run.write_config(options, out)
-    env = run.make_env(options)
+    run_options.write_config(options, out)
+    env = run_options.make_env(options)
     init = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))
     states = jax.jit(init)(np.arange(1, dtype=np.uint32))
     checkpoint.write(out / "checkpoints", 0, states, {"score": None})

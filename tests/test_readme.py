@@ -13,19 +13,10 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import (
-    command_line,
-    evaluate,
-    halving,
-    merge,
-    plot,
-    policy,
-    render,
-    run,
-    shards,
-    sweep,
-)
+from gasil_jax import evaluate, halving, merge, plot, render, run, sweep
 from gasil_jax import export_minari as export
+from gasil_jax.host import command_line, policy_file, run_options
+from gasil_jax.sweeps import saved_states, shards
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
@@ -51,7 +42,6 @@ NOT_RUN = {
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
     "and tests/test_ray.py train shards",
     "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",
-    "python -m gasil_jax.halving": "tests/test_halving.py",
 }
 
 
@@ -115,7 +105,7 @@ def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
     started = calls_of(BASH[0], tmp_path)
     assert all(call[:2] == ["-m", "gasil_jax.run"] for call in started)
     agents = [
-        command_line.parse(run.Options, call[2:], "gasil_jax.run").config.agent
+        command_line.parse(run_options.Options, call[2:], "gasil_jax.run").config.agent
         for call in started
     ]
     assert sorted(agents) == ["ppo", "ppo+bc", "ppo+gasil", "ppo+sil"]
@@ -201,7 +191,7 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper):
 def test_options_in_the_table_exist():
     fields = re.findall(r"^\| `(--[a-z-]+)", TEXT, re.MULTILINE)
     assert len(fields) > 8
-    known = command_line.parse(run.Options, ["--env", "hopper"], "x")
+    known = command_line.parse(run_options.Options, ["--env", "hopper"], "x")
     names = {
         name
         for part in (known, known.settings, known.config, known.config.hyperparameters)
@@ -223,7 +213,7 @@ def test_the_python_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     folder = pathlib.Path("runs", "hopper")
     folder.mkdir(parents=True)
-    policy.save(folder / "policy.npz", states, env, range(4), np.zeros(4))
+    policy_file.save(folder / "policy.npz", states, env, range(4), np.zeros(4))
     names = {"observation": np.zeros(env.observation_size, np.float32)}
     for block in blocks:
         small = block.replace('"walker2d"', '"point_mass"')
@@ -237,8 +227,8 @@ def test_the_python_runs(tmp_path, monkeypatch):
 def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     import runpy
 
-    env, _, _, states = evaluate.load(untrained_hopper)
-    policy.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
+    env, _, _, states = saved_states.load(untrained_hopper)
+    policy_file.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
     script = README.parent / "examples" / "gymnasium_rollout.py"
     arguments = [str(script), str(tmp_path), "Hopper-v5", "--episodes", "2"]
     monkeypatch.setattr(sys, "argv", arguments)

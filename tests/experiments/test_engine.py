@@ -18,8 +18,8 @@ from experiments.figures import FIGURES, Curve, Figure
 from experiments.search import Search
 from experiments.store import Run, Store
 from gasil_jax.config import Config
-from gasil_jax.interruption import Interrupted
-from gasil_jax.shards import Shard
+from gasil_jax.host.interruption import Interrupted
+from gasil_jax.sweeps.shards import Shard
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
 SMALL |= {"discriminator_hidden_sizes": (8,), "total_steps": 1024}

@@ -11,7 +11,7 @@ from experiments.figures import FIGURES, Curve, Figure, difference
 from experiments.report import Page, compare
 from experiments.search import Search
 from experiments.store import RESULTS, Record, Store
-from gasil_jax.command_line import InputError
+from gasil_jax.errors import InputError
 
 STORE = Store(RESULTS / "runs")
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.store import RESULTS, Record, Run, Store, merge, read, write
-from gasil_jax.command_line import InputError
 from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.errors import InputError
 
 
 def run(seed=0, env="hopper", **changes):

@@ -1,0 +1,1 @@
+"""Curves and statistics of finished runs."""

@@ -1,0 +1,113 @@
+"""Learning curves from metrics."""
+
+import pathlib
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+#: Okabe and Ito's colours, which colour-blind readers tell apart.
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+
+
+def smooth(curve: np.ndarray, window: int) -> np.ndarray:
+    """Mean of the last `window` entries that are not NaN: (..., n) -> (..., n).
+
+    NaN where there are none.
+    """
+    finite = np.isfinite(curve)
+    pad = lambda x: np.concatenate([np.zeros((*x.shape[:-1], window)), x], axis=-1)
+    total = np.cumsum(pad(np.where(finite, curve, 0.0)), axis=-1)
+    count = np.cumsum(pad(finite.astype(float)), axis=-1)
+    total = total[..., window:] - total[..., :-window]
+    count = count[..., window:] - count[..., :-window]
+    return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+
+
+def draw_band(
+    axes: Any,
+    steps: np.ndarray,
+    mean: np.ndarray,
+    spread: np.ndarray,
+    color: str,
+    label: str | None = None,
+) -> None:
+    """A curve with `spread` shaded on both sides of it; all arrays are (n,)."""
+    low, high = mean - spread, mean + spread
+    axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+    axes.plot(steps, mean, color=color, label=label)
+
+
+def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
+    """Write a figure as its path ends in, the folder too if missing, and close it."""
+    import matplotlib.pyplot as plt
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=dpi)
+    plt.close(figure)
+
+
+def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
+    """The point mass' box and objects; those that are `collected` (objects,) pale."""
+    import matplotlib.pyplot as plt
+
+    kinds = (
+        (layout.blue, "#0072B2", layout.blue_reward),
+        (layout.green, "#009E73", layout.green_reward),
+        (layout.orange, "#E69F00", layout.orange_reward),
+    )
+    objects = [(x, y, c, r) for places, c, r in kinds for x, y in places]
+    for (x, y, color, reward), taken in zip(objects, collected, strict=True):
+        alpha = 0.12 if taken else 0.6
+        axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=alpha))
+        axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
+    (x, y), spread = layout.start, layout.start_spread
+    corner = (x - spread, y - spread)
+    axes.add_patch(
+        plt.Rectangle(corner, 2 * spread, 2 * spread, color="0.85", zorder=0)
+    )
+    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")
+
+
+def learning_curve(
+    path: pathlib.Path,
+    env_steps: np.ndarray,
+    episode_return: np.ndarray,
+    title: str,
+    *,
+    evaluations: Mapping[str, np.ndarray] | None = None,
+) -> None:
+    """Save mean, spread and each seed's return over environment steps as a PNG.
+
+    Each point is the mean of the last fiftieth of training. The mean of evaluations is
+    dashed.
+
+    Args:
+      path: where to.
+      env_steps: (iterations,).
+      episode_return: (seeds, iterations); NaN where no episode ended.
+      title: of the plot.
+      evaluations: "env_steps" and "mean" of those on the way, (seeds, evaluations)
+        each; None without any.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    episode_return = smooth(episode_return, max(1, len(env_steps) // 50))
+    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
+    for curve in episode_return:
+        axes.plot(env_steps, curve, color="0.75", linewidth=0.8)
+    some = np.isfinite(episode_return).any(axis=0)
+    if some.any():
+        seen, steps = episode_return[:, some], env_steps[some]
+        mean, spread = np.nanmean(seen, axis=0), np.nanstd(seen, axis=0)
+        draw_band(axes, steps, mean, spread, "#0072B2", "mean ± standard deviation")
+    if evaluations is not None:
+        steps, mean = evaluations["env_steps"][0], evaluations["mean"].mean(axis=0)
+        axes.plot(steps, mean, "--", color="#D55E00", label="mean of the evaluations")
+    if some.any() or evaluations is not None:
+        axes.legend(frameon=False, loc="upper left")
+    axes.set(xlabel="environment steps", ylabel="episode return", title=title)
+    save(figure, path, dpi=150)

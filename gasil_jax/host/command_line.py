@@ -1,0 +1,195 @@
+"""From a command line to a dataclass, and from its errors to a line and a status."""
+
+import contextlib
+import dataclasses
+import io
+import re
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, TypeVar, get_type_hints
+
+import tyro
+from tyro.constructors import (
+    ConstructorRegistry,
+    PrimitiveConstructorSpec,
+    PrimitiveTypeInfo,
+)
+
+from gasil_jax.config import Schedule
+from gasil_jax.errors import InputError
+from gasil_jax.host.interruption import Interrupted
+
+T = TypeVar("T")
+
+_REGISTRY = ConstructorRegistry()
+
+
+@contextlib.contextmanager
+def input_checked() -> Iterator[None]:
+    """Raise a `ValueError` that is raised inside as an `InputError`."""
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(str(error)) from None
+
+
+@_REGISTRY.primitive_rule
+def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    # A command line names points; an Optax schedule comes from Python alone.
+    if info.type != Schedule:
+        return None
+
+    def from_words(words: list[str]) -> Schedule:
+        numbers = [float(word) for word in words]
+        if len(numbers) % 2:
+            raise ValueError(f"{len(words)} numbers: they must be STEPS FACTOR pairs")
+        return tuple(zip(numbers[::2], numbers[1::2]))
+
+    return PrimitiveConstructorSpec(
+        nargs="*",
+        metavar="STEPS FACTOR ...",
+        instance_from_str=from_words,
+        is_instance=lambda value: isinstance(value, tuple),
+        str_from_instance=lambda points: [str(x) for point in points for x in point],
+    )
+
+
+def whole_number(word: str) -> int:
+    """A whole number in words: step counts are written as 1e6, too.
+
+    Raises:
+      ValueError: it is none.
+    """
+    try:
+        return int(word)
+    except ValueError:
+        with contextlib.suppress(ValueError):
+            if (number := float(word)).is_integer():
+                return int(number)
+        raise
+
+
+@_REGISTRY.primitive_rule
+def _whole_number(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
+    if info.type is not int:
+        return None
+
+    def from_words(words: list[str]) -> int:
+        (word,) = words
+        return whole_number(word)
+
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar="INT",
+        instance_from_str=from_words,
+        is_instance=lambda value: isinstance(value, int),
+        str_from_instance=lambda number: [str(number)],
+    )
+
+
+def parse(
+    options: type[T],
+    arguments: Sequence[str] | None,
+    program: str,
+    default: T | None = None,
+) -> T:
+    """Options from the command line; prints help and exits where that is asked for.
+
+    Args:
+      options: a dataclass.
+      arguments: default what the program was started with.
+      program: the module that was started.
+      default: what stands where no flag is given; default the dataclass' own.
+
+    Raises:
+      InputError: what tyro refuses, its message in one line.
+    """
+    # Of these tyro says the value and not the name.
+    switches = _switches(options)
+    for argument in sys.argv[1:] if arguments is None else arguments:
+        flag, equals, value = argument.partition("=")
+        name = flag.removeprefix("--").replace("-", "_")
+        if equals and flag.startswith("--") and name in switches:
+            raise InputError(f"{name} is {value!r}: it takes no value")
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(printed), _REGISTRY:
+            return tyro.cli(
+                options,
+                args=arguments,
+                prog=f"python -m {program}",
+                config=(tyro.conf.OmitArgPrefixes,),
+                default=tyro.MISSING_NONPROP if default is None else default,
+            )
+    except SystemExit as exit_:
+        if exit_.code in (0, None):
+            raise
+        raise InputError(_in_one_line(printed.getvalue())) from None
+
+
+def _switches(kind: Any) -> set[str]:
+    """Names of what is on or off, in a dataclass and in those inside it."""
+    found = set()
+    for name, hint in get_type_hints(kind).items():
+        if hint is bool:
+            found |= {name, f"no_{name}"}
+        elif dataclasses.is_dataclass(hint):
+            found |= _switches(hint)
+    return found
+
+
+def _in_one_line(refusal: str) -> str:
+    """What a framed message of tyro says, without frame, title and pointers."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
+    # Drawn with lines, with ASCII or with blanks, as the terminal's encoding allows.
+    lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
+    _title, *rest = [line for line in lines if line.strip("-")]
+    message = " ".join(" ".join(rest).split())
+    message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
+    number = re.match(
+        r"Error parsing --([\w-]+): (?:.*invalid literal for (int)|could not convert"
+        r"|no type matching \{None\}\|FLOAT).*: '(.*)'$",
+        message,
+    )
+    if number is None:
+        return message
+    name, whole, value = number.groups()
+    kind = "a whole number" if whole else "a number"
+    return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
+
+
+def check_least(options: Any, **least: int) -> None:
+    """Raise `InputError` for numbers below what is allowed; None is no number.
+
+    Args:
+      options: a dataclass.
+      least: of its fields by name.
+    """
+    for name, low in least.items():
+        value = getattr(options, name)
+        if value is not None and value < low:
+            raise InputError(f"{name} is {value}: it must be {low} or more")
+
+
+def check_key(key: int) -> None:
+    """Raise `InputError` for a key that is none of JAX's and of Gymnasium's."""
+    if not 0 <= key < 2**32:
+        raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
+
+
+def exit_status(work: Callable[[], int | None]) -> int:
+    """Do the work of a command line; its errors become lines on stderr.
+
+    Returns:
+      what the work says, or 0: done; 1: a folder or file can't be read or written,
+      or a program that was started failed; 2: bad input; 128 and the signal's
+      number: interrupted, and saved.
+    """
+    try:
+        return work() or 0
+    except (InputError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2 if isinstance(error, InputError) else 1
+    except Interrupted as interrupted:
+        print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
+        return 128 + interrupted.signal

@@ -1,0 +1,182 @@
+"""The files of a run folder: config.json, summary.json, and its tables in CSV."""
+
+import csv
+import dataclasses
+import importlib.metadata
+import json
+import os
+import pathlib
+import platform
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from gasil_jax.errors import InputError
+from gasil_jax.host import output_file
+
+#: Metrics that every metrics.csv has, in this order; an agent's own follow.
+COLUMNS = (
+    "env_steps",
+    "episode_return",
+    "episode_length",
+    "good_return",
+    "discriminator_loss",
+    "policy_loss",
+    "value_loss",
+    "entropy",
+    "approx_kl",
+    "explained_variance",
+)
+
+
+def versions() -> dict[str, str | None]:
+    """Versions of what a result depends on; None for what isn't installed."""
+    packages = (
+        *("gasil_jax", "jax", "jaxlib", "flax", "optax", "brax"),
+        *("mujoco", "mujoco-mjx", "gymnasium", "numpy"),
+    )
+    return {"python": platform.python_version()} | {
+        name: _version(name) for name in packages
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
+    """Write a whole file, or none."""
+    text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
+    with output_file.whole(path) as partial:
+        partial.write_text(text + "\n")
+
+
+def _to_json(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return np.asarray(value).tolist()
+    raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+class MetricsWriter:
+    """Appends a row for each member and iteration to a table such as metrics.csv.
+
+    A value that is not finite (no episode ended yet, no discriminator) is left empty;
+    the others are written so that float32 reads them back unchanged.
+
+    Args:
+      path: of the file.
+      labels: columns that tell the members apart, (members,) each: "seed" and others.
+      size: where to go on: the file is cut there and the rest is kept beside it;
+        None for a new file.
+      columns: metrics that are written first, in this order; others follow.
+
+    Raises:
+      FileExistsError: a new file would replace one.
+      ValueError: the file that is to go on is missing or shorter than `size`.
+    """
+
+    def __init__(
+        self,
+        path: pathlib.Path,
+        labels: Mapping[str, Sequence[Any]],
+        size: int | None = None,
+        *,
+        columns: Sequence[str] = COLUMNS,
+    ):
+        self._first = tuple(columns)
+        self._columns: tuple[str, ...] | None = None
+        self._labels = labels
+        if size is None:
+            self._file = path.open("x", newline="")
+        else:
+            if not path.is_file() or path.stat().st_size < size:
+                raise ValueError(f"{path} lacks rows that the checkpoint has seen")
+            _cut(path, size)
+            with path.open(newline="") as file:
+                self._columns = tuple(next(csv.reader(file), ())) or None
+            self._file = path.open("a", newline="")
+        self._writer = csv.writer(self._file)
+
+    def write(self, metrics: Mapping[str, np.ndarray]) -> None:
+        """Write (members, iterations) arrays, one for each metric."""
+        if self._columns is None:
+            own = tuple(sorted(set(metrics) - set(self._first)))
+            self._columns = (*self._labels, *self._first, *own)
+            self._writer.writerow(self._columns)
+        members, iterations = metrics["env_steps"].shape
+        labels = list(zip(*self._labels.values(), strict=True))
+        names = self._columns[len(self._labels) :]
+        for iteration in range(iterations):
+            for member in range(members):
+                cells = (
+                    _cell(metrics[name][member, iteration]) if name in metrics else ""
+                    for name in names
+                )
+                self._writer.writerow([*labels[member], *cells])
+        self._file.flush()
+
+    def size(self) -> int:
+        """Bytes of the file, all of them on the disk."""
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        return os.fstat(self._file.fileno()).st_size
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def _cut(path: pathlib.Path, size: int) -> None:
+    """Shorten a file; what is cut off goes into a new file beside it."""
+    with path.open("rb+") as file:
+        file.seek(size)
+        rest = file.read()
+        if not rest:
+            return
+        number = 1
+        while True:
+            beside = path.with_name(f"{path.stem}-cut-{number}{path.suffix}")
+            try:
+                beside.open("xb").write(rest)
+                break
+            except FileExistsError:
+                number += 1
+        file.truncate(size)
+
+
+def _cell(value: Any) -> str:
+    if not np.isfinite(value):
+        return ""
+    return str(int(value)) if value == int(value) else str(np.float32(value))
+
+
+def read_metrics(
+    path: pathlib.Path, labels: Sequence[str], num_members: int
+) -> dict[str, np.ndarray]:
+    """Every column of a `MetricsWriter`, (members, iterations); NaN where empty.
+
+    Args:
+      path: of the file.
+      labels: names of the columns that are not metrics.
+      num_members: rows of an iteration.
+
+    Raises:
+      InputError: it is damaged.
+    """
+    first = len(labels)
+    try:
+        with path.open(newline="") as file:
+            header, *rows = csv.reader(file)
+        values = np.array(
+            [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
+        ).reshape(-1, num_members, len(header) - first)
+    except ValueError as error:
+        raise InputError(f"{path} is damaged: {error}") from None
+    return {name: values[:, :, i].T for i, name in enumerate(header[first:])}

@@ -1,0 +1,35 @@
+"""Writes policy.npz, the trained policies of a run."""
+
+import pathlib
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax import policy
+from gasil_jax.host import output_file
+
+
+def save(
+    path: pathlib.Path,
+    states: Any,
+    env: Any,
+    seeds: Sequence[int],
+    final_return: np.ndarray,
+) -> None:
+    """Write the policies of a batch of states as one ``.npz``, whole.
+
+    Args:
+      path: where to.
+      states: (seeds, ...).
+      env: that they were trained in.
+      seeds: their numbers.
+      final_return: (seeds,), NaN where unknown.
+    """
+    arrays: dict[str, Any] = {
+        "seeds": np.asarray(seeds, np.int64),
+        "final_return": np.asarray(final_return, np.float64),
+        **policy.weights(states, env),
+    }
+    with output_file.whole(path) as partial, partial.open("wb") as file:
+        np.savez(file, **arrays)

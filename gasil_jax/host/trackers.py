@@ -1,0 +1,164 @@
+"""Metrics for TensorBoard and Weights & Biases, beside metrics.csv.
+
+A tracker is given what metrics.csv is given: "mean/NAME" is a metric's mean over the
+members, "episode_return/LABEL" a member's own; "evaluation/mean" and "evaluation/LABEL"
+are the same of an evaluation's mean return. Steps are environment steps of a member.
+"""
+
+import contextlib
+import importlib
+import os
+import pathlib
+import uuid
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from gasil_jax.errors import InputError
+
+
+class Tracker(Protocol):
+    """Where scalars go."""
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        """Take the scalars of one iteration."""
+
+    def close(self) -> None:
+        """Write what is left."""
+
+
+class _TensorBoard:
+    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+        import tensorboardX
+
+        self._writer = tensorboardX.SummaryWriter(str(folder / "tensorboard"))
+        self._writer.add_text("config", f"```\n{_as_text(config)}\n```")
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        for name, value in scalars.items():
+            self._writer.add_scalar(name, value, step)
+
+    def close(self) -> None:
+        self._writer.close()
+
+
+class _WeightsAndBiases:
+    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+        import wandb
+
+        # A run that goes on is the same run there, though it may get more steps;
+        # WANDB_MODE=offline needs no account.
+        try:
+            self._run = wandb.init(
+                project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
+                name=folder.name,
+                dir=str(folder),
+                id=_identifier(folder / "wandb-id"),
+                resume="allow",
+                config=dict(config),
+                allow_val_change=True,
+            )
+        except wandb.errors.Error as error:
+            raise InputError(
+                f"log is 'wandb', which says: {' '.join(str(error).split())} (once it "
+                "is mended, or with WANDB_MODE=offline, go on with --resume)"
+            ) from None
+
+    def log(self, step: int, scalars: Mapping[str, float]) -> None:
+        self._run.log(dict(scalars), step=step)
+
+    def close(self) -> None:
+        self._run.finish()
+
+
+def _identifier(path: pathlib.Path) -> str:
+    """What a file holds that is written once: folders of one name are told apart."""
+    with contextlib.suppress(FileExistsError), path.open("x") as file:
+        file.write(uuid.uuid4().hex)
+    return path.read_text()
+
+
+def _as_text(config: Mapping[str, Any]) -> str:
+    return "\n".join(f"{name}: {value}" for name, value in config.items())
+
+
+#: name -> (the package that it needs, what makes it).
+TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
+    "tensorboard": ("tensorboardX", _TensorBoard),
+    "wandb": ("wandb", _WeightsAndBiases),
+}
+
+
+def check(names: Sequence[str]) -> None:
+    """Raise `ValueError` for a tracker that is unknown or not installed."""
+    for name in names:
+        if name not in TRACKERS:
+            allowed = ", ".join(TRACKERS)
+            raise ValueError(f"log is {name!r}: it must be of {allowed}")
+        package = TRACKERS[name][0]
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            raise ValueError(
+                f"log is {name!r}: it needs the package {package} "
+                f'(pip install "gasil_jax[{name}]")'
+            ) from None
+
+
+def make(
+    names: Sequence[str], folder: pathlib.Path, config: Mapping[str, Any]
+) -> list[Tracker]:
+    """The trackers of a run.
+
+    Args:
+      names: of `TRACKERS`.
+      folder: of the run; its name is the run's.
+      config: what to show of the run.
+
+    Raises:
+      InputError: one can't begin.
+    """
+    return [TRACKERS[name][1](folder, config) for name in names]
+
+
+def log(
+    trackers: Sequence[Tracker],
+    labels: Mapping[str, Sequence[Any]],
+    metrics: Mapping[str, np.ndarray],
+) -> None:
+    """Give a chunk of metrics, (members, iterations) each, to all trackers."""
+    for index, step in enumerate(metrics["env_steps"][0] if trackers else ()):
+        scalars = {}
+        for name, values in metrics.items():
+            column = values[:, index][np.isfinite(values[:, index])]
+            if column.size and name != "env_steps":
+                scalars[f"mean/{name}"] = float(column.mean())
+        returns = metrics["episode_return"][:, index]
+        scalars |= _by_member("episode_return", labels, returns)
+        for tracker in trackers:
+            tracker.log(int(step), scalars)
+
+
+def log_evaluation(
+    trackers: Sequence[Tracker],
+    labels: Mapping[str, Sequence[Any]],
+    scores: Mapping[str, np.ndarray],
+) -> None:
+    """Give the scores of an evaluation, (members,) each, to all trackers."""
+    mean = {"evaluation/mean": float(scores["mean"].mean())}
+    scalars = mean | _by_member("evaluation", labels, scores["mean"])
+    for tracker in trackers:
+        tracker.log(int(scores["env_steps"][0]), scalars)
+
+
+def _by_member(
+    name: str, labels: Mapping[str, Sequence[Any]], values: np.ndarray
+) -> dict[str, float]:
+    """The finite values, (members,), by the name with each member's label."""
+    members = zip(*labels.values(), strict=True)
+    return {
+        f"{name}/{'-'.join(map(str, member))}": float(value)
+        for member, value in zip(members, values, strict=True)
+        if np.isfinite(value)
+    }

@@ -1,0 +1,170 @@
+"""The points of a sweep: hyperparameters, and counts of `Config`, by name."""
+
+import itertools
+import json
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax.config import Config, Hyperparameters, ranges
+from gasil_jax.errors import InputError, nearest
+from gasil_jax.host.command_line import whole_number
+from gasil_jax.imitation import unused
+
+Point = Mapping[str, Any]
+
+_FIXED = ("total_steps", "num_envs", "max_episode_steps")
+#: What a sweep may vary, and what its values are.
+KINDS: Mapping[str, type] = {
+    name: int if allowed.whole else float
+    for kind in (Hyperparameters, Config)
+    for name, allowed in ranges(kind).items()
+    if name not in _FIXED and not name.endswith("hidden_sizes")
+}
+
+#: The ranges of the paper's appendix, from which `--random` draws.
+PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
+    "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
+    "discriminator_updates": (1, 5, 10, 20),
+    "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+    "buffer_steps": (1000, 10000),
+    "alpha": (0.02, 0.1, 0.2, 1.0),
+}
+
+
+def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
+    """From NAME=VALUE,VALUE,... to values by name.
+
+    Raises:
+      InputError: no such name, or one twice, or not a number.
+    """
+    values = {}
+    for entry in grid:
+        name, _, listed = entry.partition("=")
+        name = name.replace("-", "_")
+        if name not in KINDS:
+            raise InputError(f"grid: {_unknown_name(name)}")
+        if name in values:
+            raise InputError(f"grid has {name} twice: all its values must be in one")
+        try:
+            read = float if KINDS[name] is float else whole_number
+            found = [read(value) for value in listed.split(",")]
+            values[name] = tuple(dict.fromkeys(found))
+        except ValueError:
+            kind = "numbers" if KINDS[name] is float else "whole numbers"
+            raise InputError(
+                f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
+            ) from None
+    return values
+
+
+def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
+    """The points that a file lists.
+
+    Raises:
+      InputError: it can't be read, or has something else in it.
+    """
+    try:
+        points = json.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
+    if not isinstance(points, list) or not points:
+        raise InputError(
+            f"points_file is {path}: it must hold a list of points, one or more"
+        )
+    for point in points:
+        if not isinstance(point, dict):
+            raise InputError(f"points_file is {path}: {point!r} is not a point")
+        for name, value in point.items():
+            if name not in KINDS:
+                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
+            whole = KINDS[name] is int
+            if isinstance(value, bool) or not isinstance(
+                value, int if whole else int | float
+            ):
+                kind = "a whole number" if whole else "a number"
+                raise InputError(
+                    f"points_file is {path}: {name} is {value!r}, not {kind}"
+                )
+    read = [
+        {name: KINDS[name](value) for name, value in point.items()} for point in points
+    ]
+    for index, point in enumerate(read):
+        if point in read[:index]:
+            raise InputError(f"points_file is {path}: it has {point} twice")
+    return read
+
+
+def _unknown_name(name: str) -> str:
+    return (
+        f"{name!r} can't vary: did you mean {nearest(name, tuple(KINDS))!r}? "
+        f"(one of {', '.join(KINDS)})"
+    )
+
+
+def _refuse_unused(names: Iterable[str], agent: str) -> None:
+    idle = unused(agent)
+    for name in names:
+        if name in idle:
+            kinds = [x for x in KINDS if x not in idle]
+            raise InputError(
+                f"{name} can't vary: agent {agent!r} does not look at it (one of "
+                f"{', '.join(kinds)})"
+            )
+
+
+def make_points(
+    grid: Sequence[str],
+    random: int | None,
+    points_file: str | None,
+    seed: int,
+    agent: str,
+) -> list[dict[str, Any]]:
+    """The points of a sweep, without repetitions.
+
+    Args:
+      grid: NAME=VALUE,VALUE,... for what varies.
+      random: draw so many of the grid's points, or of `PAPER_RANGES` without a grid.
+      points_file: a file that lists them, in place of both.
+      seed: of the draws.
+      agent: that is swept. What it does not look at is refused, and left out of
+        `PAPER_RANGES`.
+
+    Raises:
+      InputError: there is nothing to vary, or it can't.
+    """
+    if points_file is not None:
+        if grid or random is not None:
+            raise InputError("points_file stands in place of grid and random")
+        points = read_points(pathlib.Path(points_file))
+        _refuse_unused((name for point in points for name in point), agent)
+        return points
+    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid)
+    _refuse_unused(values, agent)
+    if random is None:
+        if not values:
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random or "
+                "--points-file"
+            )
+        return [
+            dict(zip(values, point, strict=True))
+            for point in itertools.product(*values.values())
+        ]
+    if random < 1:
+        raise InputError(f"random is {random}: it must be 1 or more")
+    values = values or {
+        name: PAPER_RANGES[name] for name in PAPER_RANGES if name not in unused(agent)
+    }
+    every = list(itertools.product(*values.values()))
+    if random > len(every):
+        raise InputError(
+            f"random is {random}: it must be at most {len(every)}, which is how many "
+            "points there are"
+        )
+    chosen = np.random.default_rng(seed).choice(len(every), random, replace=False)
+    return [dict(zip(values, every[i], strict=True)) for i in chosen]

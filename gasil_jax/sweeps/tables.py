@@ -1,0 +1,321 @@
+"""What a sweep comes to: from its programs' folders to results.csv and the others.
+
+A program's folder holds metrics.csv, a row for each member and iteration, and, once it
+is trained, training.json; and evaluations.csv where policies were evaluated. Whether
+one process trained all programs or shards did on many hosts, the tables are made here,
+from those files alone.
+"""
+
+import csv
+import dataclasses
+import json
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax.errors import InputError
+from gasil_jax.figures.statistics import final_returns
+from gasil_jax.host import metrics_files
+from gasil_jax.sweeps import shards
+from gasil_jax.sweeps.points import Point
+from gasil_jax.sweeps.shards import Program
+
+#: What metrics.csv calls the members.
+LABELS = ("point", "seed")
+_TRAINING = "training.json"
+
+Member = tuple[int, int]
+
+
+def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> None:
+    """Note that a program is trained to its end.
+
+    Args:
+      folder: of the sweep or shard.
+      program: which one.
+      **measured: "env_steps" (over all members), "compile_seconds", "train_seconds"
+        and "evaluation_seconds" (None without evaluations), all of the process that
+        ended it; "device" and "device_count".
+    """
+    iterations = program.config.num_iterations
+    content = {"iterations": iterations, "members": len(program.members), **measured}
+    content["versions"] = metrics_files.versions()
+    metrics_files.write_json(program.folder(folder) / _TRAINING, content)
+
+
+def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
+    """What `write_training` wrote; None if the program is not trained to its end.
+
+    Args:
+      folder: of the sweep or shard.
+      program: which one; its config says where the end is.
+    """
+    try:
+        content = json.loads((program.folder(folder) / _TRAINING).read_text())
+        ended = content["iterations"] == program.config.num_iterations
+        same = content["members"] == len(program.members)
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+    return content if ended and same else None
+
+
+@dataclasses.dataclass(frozen=True)
+class Trained:
+    """A folder and the programs that are trained in it: a whole sweep or a shard.
+
+    Attributes:
+      folder: of the sweep or shard.
+      programs: with the members that are trained there.
+    """
+
+    folder: pathlib.Path
+    programs: Sequence[Program]
+
+    @classmethod
+    def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
+        """What a folder trains, by its config.json as `run_folder.read` reads it."""
+        first = content["first_seed"]
+        seeds = range(first, first + content["seeds"])
+        programs = shards.programs(
+            content["config"], content["points"], seeds, content["share_counts"]
+        )
+        if content["shard"] is not None:
+            programs = shards.share(programs, shards.parse(content["shard"]))
+        return cls(folder, programs)
+
+    def unfinished(self) -> list[int]:
+        """Numbers of the programs that are not trained to their end."""
+        return [
+            program.number
+            for program in self.programs
+            if read_training(self.folder, program) is None
+        ]
+
+    def trainings(self) -> list[dict[str, Any]]:
+        """What `read_training` reads, of each program that is finished."""
+        read = [read_training(self.folder, program) for program in self.programs]
+        return [training for training in read if training is not None]
+
+    def members(self) -> dict[Member, dict[str, np.ndarray]]:
+        """Every metric of every member, (iterations,) each; NaN where there is none.
+
+        Raises:
+          InputError: metrics.csv is not what training has written.
+        """
+        every: dict[Member, dict[str, np.ndarray]] = {}
+        for program in self.programs:
+            every |= self._table(program, "metrics.csv", program.config.num_iterations)
+        return every
+
+    def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
+        """The same of every evaluation, (evaluations,) each; empty without evaluations.
+
+        Raises:
+          InputError: evaluations.csv is not what training has written.
+        """
+        every: dict[Member, dict[str, np.ndarray]] = {}
+        for program, training in zip(self.programs, self.trainings(), strict=True):
+            if training.get("evaluation_seconds") is not None:
+                every |= self._table(program, "evaluations.csv")
+        return every
+
+    def _table(
+        self, program: Program, name: str, rows: int | None = None
+    ) -> dict[Member, dict[str, np.ndarray]]:
+        """A program's table by member, to its end; `rows` are a member's, if known."""
+        path, config = program.folder(self.folder) / name, program.config
+        try:
+            columns = metrics_files.read_metrics(path, LABELS, len(program.members))
+            steps = columns["env_steps"][0]
+            whole = steps[-1] == config.num_iterations * config.batch_steps
+        except (OSError, ValueError, KeyError, IndexError) as error:
+            raise InputError(f"{path} is damaged: {error}") from None
+        if not whole or rows not in (None, len(steps)):
+            raise InputError(f"{path} is damaged: it lacks iterations")
+        return {
+            member: {column: x[position] for column, x in columns.items()}
+            for position, member in enumerate(program.members)
+        }
+
+
+def write(
+    folder: pathlib.Path,
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    parts: Sequence[Trained],
+) -> dict[str, Any]:
+    """Write results.csv, curves.npz, summary.json and sweep.png; returns the summary.
+
+    A cell of results.csv is empty where the point leaves the sweep's own value.
+
+    Args:
+      folder: where to.
+      points: all of them.
+      seeds: absolute seed numbers.
+      parts: finished, every point with every seed in one of them.
+    """
+    members: dict[Member, dict[str, np.ndarray]] = {}
+    evaluations: dict[Member, dict[str, np.ndarray]] = {}
+    for part in parts:
+        members |= part.members()
+        evaluations |= part.evaluations()
+    curves = _curves(points, seeds, members)
+    of_point = lambda name, i: np.stack([members[i, seed][name] for seed in seeds])
+    final = np.array(
+        [final_returns(of_point("episode_return", i)) for i in range(len(points))]
+    )
+    length = np.array(
+        [final_returns(of_point("episode_length", i)) for i in range(len(points))]
+    )
+    # (points, seeds) each, in columns and fields of this name.
+    finals = {"final_return": final, "final_length": length}
+    if evaluations:
+        scores = _curves(points, seeds, evaluations)
+        curves |= {f"evaluation_{name}": values for name, values in scores.items()}
+        last = lambda member: evaluations[member]["mean"][-1]
+        finals["final_evaluation"] = np.array(
+            [[last((i, seed)) for seed in seeds] for i in range(len(points))]
+        )
+    diverged = np.any(curves["skipped_updates"] > 0, axis=2)
+    names = sorted({name for point in points for name in point})
+    with (folder / "results.csv").open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*LABELS, *names, *finals, "diverged"])
+        for index, point in enumerate(points):
+            own = [point.get(name, "") for name in names]
+            for position, seed in enumerate(seeds):
+                values = (x[index, position] for x in finals.values())
+                cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
+                bad = int(diverged[index, position])
+                writer.writerow([index, seed, *own, *cells, bad])
+    np.savez_compressed(folder / "curves.npz", **curves)
+    trainings = [training for part in parts for training in part.trainings()]
+    fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
+    best = lambda scores: int(fine[scores[fine].argmax()]) if fine.size else None
+    summary = {
+        "points": [
+            {
+                **point,
+                "mean": _finite(final[i].mean()),
+                "worst_seed": _finite(final[i].min()),
+                **{
+                    name: _finite(values[i].mean())
+                    for name, values in finals.items()
+                    if name != "final_return"
+                },
+                "diverged_seeds": int(diverged[i].sum()),
+            }
+            for i, point in enumerate(points)
+        ],
+        "best_by_mean": best(final.mean(axis=1)),
+        "best_by_worst_seed": best(final.min(axis=1)),
+        **speed(trainings),
+        "versions": _joined([training["versions"] for training in trainings]),
+    }
+    metrics_files.write_json(folder / "summary.json", summary)
+    _plot(folder / "sweep.png", points, final)
+    return summary
+
+
+def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Seconds, steps/s and devices of programs that were trained one by one.
+
+    "evaluation_seconds" are there where policies were evaluated.
+
+    Of shards, which run side by side, "env_steps_per_second" is one shard's on average.
+    """
+    total = lambda name: sum(training[name] for training in trainings)
+    devices = _joined([{"device": training["device"]} for training in trainings])
+    evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
+    return {
+        "compile_seconds": total("compile_seconds"),
+        "train_seconds": total("train_seconds"),
+        "env_steps_per_second": total("env_steps") / max(total("train_seconds"), 1e-9),
+        **({"evaluation_seconds": total("evaluation_seconds")} if evaluated else {}),
+        **devices,
+        "device_count": max(training["device_count"] for training in trainings),
+    }
+
+
+def _joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """The values of all records; where they differ, all of them in one string."""
+    every = {name: {record.get(name) for record in records} for name in records[0]}
+    return {
+        name: values.pop() if len(values) == 1 else ", ".join(sorted(map(str, values)))
+        for name, values in every.items()
+    }
+
+
+def _curves(
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    members: Mapping[Member, Mapping[str, np.ndarray]],
+) -> dict[str, Any]:
+    """Every metric, (points, seeds, iterations), NaN beyond a member's last."""
+    # Points may differ in batch_steps, and so in iterations.
+    length = max(len(metrics["env_steps"]) for metrics in members.values())
+    pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
+    return {
+        name: np.array(
+            [
+                [pad(members[i, seed][name]) for seed in seeds]
+                for i in range(len(points))
+            ]
+        )
+        for name in members[0, seeds[0]]
+    }
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
+    """Lines that say how fast it was and which points are best."""
+    seconds = f"{summary['train_seconds']:,.0f} s of training"
+    if "evaluation_seconds" in summary:
+        seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
+    lines = [
+        f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}"
+        f" ({seconds})"
+    ]
+    for title in ("best_by_mean", "best_by_worst_seed"):
+        best = summary[title]
+        if best is None:
+            lines.append(
+                f"{title}: none, every point has a seed that diverged or never ended"
+            )
+            continue
+        scores = summary["points"][best]
+        lines.append(
+            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
+            f"worst seed {scores['worst_seed']:.1f})"
+        )
+    return lines
+
+
+def _label(point: Point) -> str:
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+
+
+def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> None:
+    """Every seed's final return and their mean, a row for each point."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    size = (11.0, 1.4 + 0.35 * len(points))
+    figure, axes = plt.subplots(figsize=size, layout="constrained")
+    for row in range(len(points)):
+        axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
+        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
+    labels = [_label(point) for point in points]
+    axes.set_yticks(range(len(points)), labels, fontsize=8)
+    axes.set(xlabel="final return (each seed; the bar is their mean)")
+    axes.invert_yaxis()
+    figure.savefig(path, dpi=150)
+    plt.close(figure)

@@ -1,0 +1,96 @@
+"""Saved policies: in JAX, in NumPy, and what is refused."""
+
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import gasil_jax
+from gasil_jax import normalization, numpy_policy
+from gasil_jax.host import policy_file
+from gasil_jax.networks import Policy
+
+# With the other tests that use it, so that it is trained once.
+pytestmark = pytest.mark.xdist_group("trained_point_mass")
+
+
+@pytest.fixture
+def saved(trained_point_mass, tmp_path_factory):
+    env, config, states = trained_point_mass
+    folder = tmp_path_factory.mktemp("run")
+    policy_file.save(
+        folder / "policy.npz", states, env, [5, 6, 7], np.array([1, 3, np.nan])
+    )
+    return env, config, states, folder
+
+
+@pytest.mark.parametrize("seed", [5, 6, 7, None])
+def test_it_is_the_networks_gaussian(saved, seed):
+    env, config, states, folder = saved
+    state = gasil_jax.member(states, 1 if seed is None else seed - 5)
+    observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
+    normalized = normalization.normalize(state.normalizer, observation)
+    network = Policy(config.hidden_sizes, env.action_size)
+    mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
+
+    act = gasil_jax.load_policy(folder, seed)
+    expected = jnp.clip(mean, -1.0, 1.0)
+    np.testing.assert_allclose(act(observation), expected, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.vmap(act))(observation), expected, atol=1e-5)
+    in_numpy = numpy_policy.load(folder / "policy.npz", seed)(np.asarray(observation))
+    assert in_numpy.dtype == np.float32
+    np.testing.assert_allclose(in_numpy, expected, atol=1e-5)
+
+    key = jax.random.key(3)
+    noise = jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    expected = jnp.clip(mean + noise, -1.0, 1.0)
+    np.testing.assert_allclose(act(observation, key), expected, atol=1e-5)
+
+
+def test_draws_in_numpy_have_the_policys_spread(saved):
+    env, _, _, folder = saved
+    weights = numpy_policy.read(folder, 5)
+    weights["low"], weights["high"] = -100 * np.ones(2), 100 * np.ones(2)
+    observation = np.zeros((20_000, env.observation_size), np.float32)
+    draws = numpy_policy.make(weights)(observation, np.random.default_rng(0))
+    np.testing.assert_allclose(draws.std(axis=0), np.exp(weights["log_std"]), rtol=0.05)
+
+
+def test_it_needs_no_jax(saved):
+    _, _, _, folder = saved
+    code = (
+        "import sys, numpy as np\n"
+        "for name in ('jax', 'jaxlib', 'flax', 'optax', 'mujoco'):\n"
+        "    sys.modules[name] = None\n"
+        "from gasil_jax import numpy_policy\n"
+        "act = numpy_policy.load(sys.argv[1])\n"
+        "print(act(np.zeros(numpy_policy.read(sys.argv[1])['mean'].shape)).shape)\n"
+    )
+    result = subprocess.run(
+        [sys.executable, "-c", code, str(folder)], capture_output=True, text=True
+    )
+    assert result.stdout.strip() == "(2,)", result.stderr
+
+
+def test_bad_files_and_seeds_are_refused(saved, tmp_path):
+    _, _, _, folder = saved
+    with pytest.raises(ValueError, match=r"seed is 9: .* has 5, 6, 7"):
+        gasil_jax.load_policy(folder, 9)
+    with pytest.raises(ValueError, match="is not a saved policy"):
+        gasil_jax.load_policy(tmp_path)
+    whole = (folder / "policy.npz").read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b"\x80\x04N."):
+        (tmp_path / "policy.npz").write_bytes(content)
+        with pytest.raises(ValueError, match="is not a saved policy"):
+            gasil_jax.load_policy(tmp_path)
+
+
+def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_path):
+    env, _, states = trained_point_mass
+    path = tmp_path / "best.weights"
+    policy_file.save(path, states, env, [5, 6, 7], np.zeros(3))
+    assert list(tmp_path.iterdir()) == [path]
+    assert set(numpy_policy.read(path, 5)) >= {"mean", "log_std"}

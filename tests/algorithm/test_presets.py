@@ -1,0 +1,79 @@
+"""Presets: valid, what the search found, used by default, and overridden by flags."""
+
+import pytest
+
+import gasil_envs
+import gasil_jax
+from experiments.figures import NORMALIZED
+from experiments.search import AGENTS, DELAY, NUM_ENVS, NUM_ENVS_OF, TASKS, Search
+from experiments.store import RESULTS, Store
+from gasil_jax import presets, run
+from gasil_jax.config import Config, validate
+from gasil_jax.host import run_options
+
+
+def parse(*arguments):
+    return run_options.parse(run_options.Options, ["--env", *arguments], "x").config
+
+
+@pytest.mark.parametrize("name", presets.names())
+@pytest.mark.parametrize("reward_delay", [1, 20])
+def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
+    rows = presets.PRESETS[name][reward_delay > 1]
+    for (env, agent), overrides in rows.items():
+        assert env in gasil_envs.names() and agent in gasil_jax.agents()
+        config = gasil_jax.preset(env, agent, name, reward_delay)
+        validate(config, gasil_jax.agents())
+        assert overrides and config != Config(agent=agent)
+
+
+@pytest.mark.parametrize("reward_delay", [1, DELAY])
+@pytest.mark.parametrize("env", TASKS)
+def test_the_tuned_rows_are_what_the_search_found(env, reward_delay):
+    normalized, store = env in NORMALIZED, Store(RESULTS / "runs")
+    changes = {
+        "num_envs": NUM_ENVS_OF.get(env, NUM_ENVS),
+        "normalize_rewards": normalized,
+    }
+    for agent in AGENTS:
+        search = Search(env, agent, reward_delay, normalize_rewards=normalized)
+        expected = Config(agent=agent).replace(**search.chosen(store), **changes)
+        assert gasil_jax.preset(env, agent, "tuned", reward_delay) == expected
+
+
+def test_the_command_line_starts_from_the_preset():
+    assert parse("point_mass", "--agent", "gasil") == gasil_jax.preset(
+        "point_mass", "gasil"
+    )
+    assert parse("humanoid", "--agent", "gasil") == Config(agent="gasil")
+    delayed = parse("walker2d", "--reward-delay", "20")
+    assert delayed == gasil_jax.preset("walker2d", "ppo+gasil", reward_delay=20)
+    assert delayed != parse("walker2d")
+
+
+def test_flags_override_the_preset():
+    config = parse("point_mass", "--agent", "gasil", "--alpha", "0.3")
+    assert config.hyperparameters.alpha == 0.3
+    assert config.hyperparameters.discriminator_updates == 20
+
+
+@pytest.mark.parametrize("env", ["walker2d", "point_mass"])
+def test_the_papers_batch_is_of_one_environment(env):
+    config = parse(env, "--preset", "paper")
+    assert (config.num_envs, config.num_steps) == (1, 2048)
+    assert parse(env, "--preset", "paper", "--num-envs", "8").num_envs == 8
+
+
+def test_the_papers_rule_for_humanoid():
+    config = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper")
+    assert config.hyperparameters.alpha == 0.02
+    assert config.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
+
+
+def test_what_is_unknown_is_refused(capsys):
+    assert run.main(["--env", "hopper", "--preset", "papre"]) == 2
+    assert "did you mean 'paper'" in capsys.readouterr().err
+    with pytest.raises(ValueError, match="did you mean 'tuned'"):
+        gasil_jax.preset("hopper", "ppo", "tunde")
+    with pytest.raises(ValueError, match=r"did you mean 'ppo\+gasil'"):
+        gasil_jax.preset("hopper", "ppo+gasill")

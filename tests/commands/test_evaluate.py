@@ -1,0 +1,134 @@
+"""Saving, loading and scoring a run's policies."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import Wrapper
+
+import gasil_jax
+from gasil_jax import evaluate, numpy_policy, policy, run
+from gasil_jax.host import checkpoint
+
+# With the other tests that use it, so that it is trained once.
+pytestmark = pytest.mark.xdist_group("trained_point_mass")
+
+
+def test_a_saved_state_is_loaded_bit_by_bit(trained_point_mass, tmp_path):
+    _, _, states = trained_point_mass
+    checkpoint.save(tmp_path / "state", states)
+    like = jax.eval_shape(lambda: states)
+    loaded = checkpoint.restore(tmp_path / "state", like)
+    assert jax.tree.structure(loaded) == jax.tree.structure(states)
+    plain = lambda x: (
+        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    )
+    jax.tree.map(
+        lambda a, b: np.testing.assert_array_equal(plain(a), plain(b)), loaded, states
+    )
+
+
+def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
+    _, _, states = trained_point_mass
+    checkpoint.save(tmp_path / "state", states)
+    other = jax.eval_shape(lambda: jax.tree.map(lambda x: x[:1], states))
+    with pytest.raises(ValueError, match="holds another state"):
+        checkpoint.restore(tmp_path / "state", other)
+    with pytest.raises(ValueError, match="holds another state"):
+        checkpoint.restore(tmp_path / "state", other.replace(imitation=()))
+
+
+def test_scores_are_those_of_a_plain_loop(trained_point_mass):
+    env, config, states = trained_point_mass
+    state = gasil_jax.member(states, 1)
+    key = jax.random.key(3)
+    scores = jax.jit(lambda s: evaluate.evaluate(env, config, s, key, num_episodes=3))(
+        state
+    )
+    act = numpy_policy.make(policy.weights(state, env))
+    step = jax.jit(env.step)
+    for i, reset_key in enumerate(jax.random.split(jax.random.split(key)[0], 3)):
+        running, total, length = env.reset(reset_key), 0.0, 0
+        while not running.done:
+            running = step(running, jnp.asarray(act(np.asarray(running.obs))))
+            total += float(running.info["true_reward"])
+            length += 1
+        np.testing.assert_allclose(scores["episode_return"][i], total, rtol=1e-3)
+        assert int(scores["episode_length"][i]) == length == 50
+
+
+def test_stochastic_scores_vary_more(trained_point_mass):
+    env, config, states = trained_point_mass
+    score = lambda deterministic: evaluate.evaluate(
+        env,
+        config,
+        gasil_jax.member(states, 0),
+        jax.random.key(0),
+        num_episodes=50,
+        deterministic=deterministic,
+    )["episode_return"]
+    assert float(jnp.std(score(False))) > float(jnp.std(score(True)))
+
+
+def test_one_seed_scores_as_among_all_and_every_episode_is_written(tmp_path, capsys):
+    folder = str(tmp_path / "run")
+    toy = ("--hidden-sizes", "8", "--batch-steps", "64", "--num-envs", "4")
+    begin = ("--seeds", "2", "--first-seed", "4", "--total-steps", "64")
+    arguments = ("--env", "point_mass", "--agent", "ppo", *begin, *toy, "--out", folder)
+    assert run.main(arguments) == 0
+    capsys.readouterr()
+    out = tmp_path / "new" / "scores.csv"
+    flags = ["--episodes", "3", "--stochastic"]
+    assert evaluate.main([folder, *flags, "--out", str(out)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["seed"], row["episode"]) for row in rows] == [
+        (seed, episode) for seed in ("4", "5") for episode in "012"
+    ]
+    for line, seed in zip(lines[1:3], "45", strict=True):
+        returns = [float(row["episode_return"]) for row in rows if row["seed"] == seed]
+        assert line.split()[2] == f"{np.mean(returns):.2f}"
+    assert {row["episode_length"] for row in rows} == {"50"}
+    assert evaluate.main([folder, *flags, "--seed", "5"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == lines[2]
+    # Nothing is written over, and what can't be scored is refused before it is.
+    for arguments, message in (
+        (("--out", str(out)), "which exists: name a new file"),
+        (("--out", str(out.with_suffix(".txt"))), "it must end in .csv"),
+        (("--out", str(out / "x.csv")), "can't be written"),
+        (("--out", "/proc/scores.csv"), "/proc/scores.csv, which can't be written"),
+        (("--seed", "6"), "seed is 6: the run has 4 to 5"),
+    ):
+        assert evaluate.main([folder, *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+
+
+def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
+    """As in training; `done` need not be set beside `truncation`."""
+    env, config, states = trained_point_mass
+
+    class CutOff(Wrapper):
+        def reset(self, rng):
+            state = self.env.reset(rng)
+            info = {"time": jnp.int32(0), "truncation": jnp.float32(0)}
+            return state.replace(info={**state.info, **info})
+
+        def step(self, state, action):
+            time = state.info["time"] + 1
+            stepped = self.env.step(state, action)
+            cut_off = jnp.where(time == 7, 1.0, 0.0)
+            info = {**stepped.info, "time": time, "truncation": cut_off}
+            return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
+
+    scores = evaluate.evaluate(
+        CutOff(env),
+        config,
+        gasil_jax.member(states, 0),
+        jax.random.key(0),
+        num_episodes=3,
+    )
+    assert scores["episode_length"].tolist() == [7, 7, 7]

@@ -1,0 +1,138 @@
+"""Good trajectories as a Minari data set, and back."""
+
+import shutil
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from gasil_jax import export_minari, good_trajectories
+from gasil_jax.host import checkpoint
+from gasil_jax.imitation import expert
+from gasil_jax.sweeps import saved_states
+
+minari = pytest.importorskip("minari")
+
+LENGTHS, RETURNS = (400, 350, 250), (9.0, 4.5, -1.0)
+
+
+def buffer(lengths, returns, capacity, observation_size, action_size):
+    """One that holds episodes of these lengths and returns, of random steps."""
+    rng, size = np.random.default_rng(0), sum(lengths)
+    filled = lambda values, empty: np.append(values, [empty] * (capacity - size))
+    return good_trajectories.GoodTrajectories(
+        observation=jnp.float32(rng.normal(size=(capacity, observation_size))),
+        action=jnp.float32(rng.normal(size=(capacity, action_size))),
+        return_=jnp.float32(filled(np.repeat(returns, lengths), -np.inf)),
+        time=jnp.int32(filled(np.concatenate([np.arange(n) for n in lengths]), 0)),
+        size=jnp.int32(size),
+    )
+
+
+@pytest.fixture
+def filled(untrained_hopper, tmp_path, monkeypatch):
+    """A run whose buffer is full, its last episode cut, and the steps in it."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    out = shutil.copytree(untrained_hopper, tmp_path / "run")
+    env, config, _, states = saved_states.load(out)
+    sizes = (env.observation_size, env.action_size)
+    kept = buffer(LENGTHS, RETURNS, config.hyperparameters.buffer_steps, *sizes)
+    lead = {name: jnp.asarray(value)[None] for name, value in vars(kept).items()}
+    states = states.replace(good_trajectories=kept.replace(**lead))
+    checkpoint.write(out / "checkpoints", 1, states, {"score": 1.0})
+    return out, kept
+
+
+def test_whole_episodes_come_back(filled, capsys):
+    out, kept = filled
+    assert export_minari.main([str(out), "--name", "hopper/good-v0"]) == 0
+    assert "2 episodes, 750 steps in hopper/good-v0" in capsys.readouterr().out
+    observation, action = expert.load("minari:hopper/good-v0")
+    np.testing.assert_array_equal(observation, kept.observation[:750])
+    np.testing.assert_array_equal(action, kept.action[:750])
+
+    dataset = minari.load_dataset("hopper/good-v0")
+    first, second = dataset.iterate_episodes()
+    for episode, length, return_ in zip((first, second), LENGTHS, RETURNS):
+        assert episode.observations.shape == (length + 1, 11)
+        assert episode.actions.shape == (length, 3)
+        np.testing.assert_array_equal(episode.rewards[:-1], 0.0)
+        assert episode.rewards[-1] == return_
+        assert not episode.terminations.any()
+        assert np.flatnonzero(episode.truncations).tolist() == [length - 1]
+        np.testing.assert_array_equal(*episode.observations[-2:])
+    metadata = dataset.storage.metadata
+    assert metadata["algorithm_name"] == "ppo+gasil"
+    assert "discounted return (gamma 0.99)" in metadata["description"]
+
+
+def test_the_discount_is_that_of_the_states(filled, monkeypatch):
+    out, _ = filled
+    told = {}
+    load = saved_states.load
+
+    def of_a_swept_point(folder, which, point, seed):
+        env, config, seeds, states = load(folder)
+        floats = states.hyperparameters
+        floats = floats.replace(gamma=0.9 * jnp.ones_like(floats.gamma))
+        return env, config, seeds, states.replace(hyperparameters=floats)
+
+    monkeypatch.setattr(saved_states, "load", of_a_swept_point)
+    monkeypatch.setattr(
+        export_minari, "write", lambda *_, **settings: told.update(settings)
+    )
+    assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
+    assert "(gamma 0.9)" in told["description"]
+
+
+def test_a_buffer_s_last_episode_is_kept_if_it_is_whole():
+    lengths = lambda kept, *limits: [
+        len(episode.action) for episode in export_minari.episodes(kept, *limits)
+    ]
+    full = buffer((30, 20, 50), (3.0, 2.0, 1.0), 100, 4, 2)
+    assert lengths(full, 1000) == [30, 20]
+    assert lengths(full, 50) == [30, 20, 50]
+    partly = buffer((30, 20), (3.0, 2.0), 100, 4, 2)
+    assert lengths(partly, 1000) == [30, 20]
+    assert lengths(partly, 1000, 50.0) == [30]
+    assert lengths(partly, 1000, 51.0) == [30, 20]
+    assert lengths(good_trajectories.init(100, 4, 2), 1000) == []
+
+
+def test_bad_input_is_one_line_and_status_2(filled, untrained_hopper, capsys):
+    out, _ = filled
+    assert export_minari.main([str(out), "--name", "there-v0"]) == 0
+    capsys.readouterr()
+    for arguments, message in (
+        ([str(out), "--name", "there-v0"], "'there-v0', which exists"),
+        ([str(out), "--name", "../there-v0"], "must be like hopper/good-v0"),
+        ([str(out), "--name", "there"], "must be like hopper/good-v0"),
+        ([str(out), "--name", "new-v0", "--seed", "7"], "seed is 7: the run has 0"),
+        ([str(untrained_hopper), "--name", "new-v0"], "no whole episode"),
+        ([str(out.parent), "--name", "new-v0"], "must be the folder of a run"),
+    ):
+        assert export_minari.main(arguments) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+    assert [*minari.list_local_datasets()] == ["there-v0"]
+
+
+def test_a_failure_leaves_nothing(filled, monkeypatch, capsys):
+    from minari.dataset.minari_storage import MinariStorage
+
+    def full(*_):
+        raise OSError("no space left on device")
+
+    out, _ = filled
+    with monkeypatch.context() as patched:
+        patched.setattr(MinariStorage, "update_metadata", full)
+        assert export_minari.main([str(out), "--name", "new-v0"]) == 1
+    assert "no space left" in capsys.readouterr().err
+    assert "new-v0" not in minari.list_local_datasets()
+
+
+def test_a_missing_package_is_named(untrained_hopper, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "minari.dataset.minari_dataset", None)
+    assert export_minari.main([str(untrained_hopper), "--name", "new-v0"]) == 2
+    assert 'pip install "gasil_jax[minari]"' in capsys.readouterr().err

@@ -1,0 +1,105 @@
+"""Statistics against plain twins, and the figures."""
+
+import csv
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from gasil_jax import plot, run
+from gasil_jax.figures import statistics
+
+
+@pytest.mark.parametrize("count", [4, 8, 20])
+def test_the_interquartile_mean_is_scipys_trimmed_mean(count):
+    scores = np.random.default_rng(count).normal(size=(count, 3))
+    np.testing.assert_allclose(
+        statistics.interquartile_mean(scores, axis=0),
+        scipy.stats.trim_mean(scores, 0.25, axis=0),
+    )
+
+
+def test_the_interquartile_mean_of_counts_that_no_four_divides():
+    assert statistics.interquartile_mean(np.array([7.0])) == 7.0
+    assert statistics.interquartile_mean(np.array([1.0, 3.0])) == 2.0
+    # Of five: a quarter of 5 is 1.25, so 2 and 4 count 0.75 each and 3 whole.
+    scores = np.array([100.0, 3.0, 2.0, 4.0, -50.0])
+    assert statistics.interquartile_mean(scores) == pytest.approx(
+        (0.75 * 2 + 3 + 0.75 * 4) / 2.5
+    )
+
+
+def test_the_interval_is_scipys():
+    scores = np.random.default_rng(0).gamma(2.0, size=(30, 2))
+    low, high = statistics.bootstrap_interval(scores, resamples=4000)
+    for i in range(2):
+        expected = scipy.stats.bootstrap(
+            (scores[:, i],),
+            statistics.interquartile_mean,
+            n_resamples=4000,
+            method="percentile",
+            rng=np.random.default_rng(1),
+        ).confidence_interval
+        np.testing.assert_allclose([low[i], high[i]], expected, atol=0.05)
+
+
+def test_the_profile_counts():
+    scores, levels = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 2.0, 3.5, 9.0])
+    profile = statistics.performance_profile(scores, levels)
+    np.testing.assert_array_equal(profile, [1.0, 0.5, 0.25, 0.0])
+
+
+def test_runs_are_drawn(tmp_path, capsys):
+    small = (
+        *("--env", "point_mass", "--seeds", "3", "--total-steps", "2048"),
+        *(
+            "--batch-steps",
+            "256",
+            "--num-envs",
+            "4",
+            "--num-epochs",
+            "1",
+            "--no-stagger-episodes",
+        ),
+        *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    )
+    folders = []
+    for name, first_seed in (("ppo", "0"), ("others", "3")):
+        folders.append(str(tmp_path / name))
+        more = ("--agent", "ppo", "--first-seed", first_seed, "--out", folders[-1])
+        assert run.main([*small, *more]) == 0
+    capsys.readouterr()
+    out = tmp_path / "figure.png"
+    assert plot.main([*folders, "--out", str(out)]) == 0
+    printed = capsys.readouterr().out
+    assert "point_mass, ppo" in printed and "95% interval" in printed
+    assert out.read_bytes().startswith(b"\x89PNG")
+    assert plot.main([*folders, "--out", "/proc/nowhere/figure.png"]) == 2
+    assert "error: out is /proc/nowhere/figure.png" in capsys.readouterr().err
+    assert plot.main([*folders, "--out", str(tmp_path / "new" / "er" / "x.svg")]) == 0
+    capsys.readouterr()
+    curves = plot.read(tmp_path / "ppo")
+    assert curves.returns.shape == (3, 8) and curves.env_steps[-1] == 2048
+
+    # Where none ended in the last tenth, the last that did count, as in the summary.
+    path = tmp_path / "ppo" / "metrics.csv"
+    with path.open() as file:
+        rows = list(csv.DictReader(file))
+    with path.open("w") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        for row in rows:
+            late = {"episode_return": "nan"} if float(row["env_steps"]) == 2048 else {}
+            writer.writerow(row | late)
+    final = [float(x["episode_return"]) for x in rows if float(x["env_steps"]) == 1792]
+    np.testing.assert_allclose(plot.read(tmp_path / "ppo").final, final)
+
+    for arguments, message in (
+        ([*folders, "--out", str(out)], "which exists"),
+        ([str(tmp_path)], "must be the folder of a run"),
+        ([folders[0], "--out", "x.txt"], "must end in .png"),
+        ([*folders, "--labels", "a"], "labels are 1: runs are 2"),
+    ):
+        assert plot.main(arguments) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1

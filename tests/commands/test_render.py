@@ -1,0 +1,147 @@
+"""Films of a run's policy."""
+
+import base64
+import json
+import pathlib
+import re
+import subprocess
+import sys
+import types
+import zlib
+
+import gymnasium
+import jax
+import mujoco
+import numpy as np
+import pytest
+from PIL import Image
+
+from gasil_envs import locomotion
+from gasil_jax import policy, render, run
+from gasil_jax.host.members import member
+from gasil_jax.sweeps import saved_states
+
+SMALL = (
+    *("--seeds", "2", "--total-steps", "256", "--batch-steps", "128"),
+    *("--num-envs", "4", "--num-epochs", "1", "--minibatch-size", "32"),
+    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+)
+
+
+@pytest.fixture(scope="module")
+def point_mass(tmp_path_factory):
+    out = tmp_path_factory.mktemp("render") / "run"
+    assert run.main(["--env", "point_mass", *SMALL, "--out", str(out)]) == 0
+    return out
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".png", ".mp4"])
+def test_the_point_mass_is_drawn(point_mass, suffix, tmp_path, capsys):
+    path = tmp_path / f"film{suffix}"
+    size = ("--width", "161", "--height", "120")
+    assert render.main([str(point_mass), "--out", str(path), *size]) == 0
+    assert "51 frames" in capsys.readouterr().out
+    if suffix == ".mp4":
+        assert b"ftyp" in path.read_bytes()[:12]
+        return
+    image = Image.open(path)
+    assert image.size == ((162, 120) if suffix == ".gif" else (8 * 162, 120))
+    if suffix == ".gif":
+        first = np.asarray(image.convert("RGB"), int)
+        image.seek(image.n_frames - 1)
+        assert np.abs(np.asarray(image.convert("RGB"), int) - first).max() > 50
+
+
+def test_locomotion_is_drawn(untrained_hopper, tmp_path):
+    out, path = untrained_hopper, tmp_path / "film.gif"
+    # In a process of its own: MuJoCo chooses its OpenGL when it is imported.
+    command = [sys.executable, "-m", "gasil_jax.render", str(out), "--steps", "40"]
+    result = subprocess.run(
+        [*command, "--out", str(path)], capture_output=True, text=True
+    )
+    if result.returncode == 1:
+        assert "no OpenGL for MuJoCo" in result.stderr
+        pytest.skip("no OpenGL here")
+    assert result.returncode == 0, result.stderr
+    image = Image.open(path)
+    assert image.size == (480, 360)
+    # Not one colour, as where nothing is drawn.
+    assert np.asarray(image.convert("RGB")).std() > 10
+
+
+def system_in(page):
+    """The model and states that a page for Brax's viewer holds."""
+    encoded = re.search(r'"([A-Za-z0-9+/=]{300,})"', page).group(1)
+    return json.loads(zlib.decompress(base64.b64decode(encoded)))
+
+
+def test_a_page_has_the_simulations_bodies(untrained_hopper, tmp_path, capsys):
+    path = tmp_path / "walk.html"
+    arguments = [str(untrained_hopper), "--out", str(path), "--steps", "3"]
+    assert render.main(arguments) == 0
+    assert "4 frames" in capsys.readouterr().out
+    shown = system_in(path.read_text())
+    env, _, _, states = saved_states.load(untrained_hopper)
+    act = policy.from_state(member(states, 0), env)
+    mean = lambda observation, key: act(observation)
+    frames, _ = render.episode(env, mean, jax.random.key(0), 3)
+    model = env.unwrapped.model
+    assert shown["opt"]["timestep"] == pytest.approx(env.unwrapped.dt)
+    assert set(shown["geoms"]) == {"torso", "thigh", "leg", "foot", "world"}
+    assert len(shown["states"]["x"]) == len(frames) == 4
+    data = mujoco.MjData(model)
+    for placed, state in zip(shown["states"]["x"], frames, strict=True):
+        data.qpos[:] = state.physics.qpos
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(placed["pos"], data.xpos[1:], atol=1e-6)
+        np.testing.assert_allclose(placed["rot"], data.xquat[1:], atol=1e-6)
+    # The model that simulates is as it was: Brax opens limits of what it is given.
+    assert np.isfinite(model.jnt_range).all()
+
+
+@pytest.mark.parametrize("name", locomotion.TASKS)
+def test_every_model_makes_a_page(name):
+    assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+    path = assets / locomotion.TASKS[name].xml
+    model = mujoco.MjModel.from_xml_path(str(path))
+    env = types.SimpleNamespace(model=model, dt=0.02)
+    env.unwrapped = env
+    start = types.SimpleNamespace(qpos=model.qpos0)
+    page = render.locomotion_page(env, [types.SimpleNamespace(physics=start)])
+    assert len(system_in(page)["states"]["x"][0]["pos"]) == model.nbody - 1
+
+
+def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
+    (tmp_path / "there.gif").touch()
+    for arguments, message in (
+        (["--out", "film.avi"], "must end in .mp4, .gif, .png, .html"),
+        (["--out", "film.html"], "of the point mass it must end in .mp4, .gif, .png"),
+        (["--out", str(tmp_path / "there.gif")], "which exists"),
+        (["--seed", "9"], "seed is 9: the run has 0 to 1"),
+        (["--steps", "0"], "steps is 0"),
+        (["--key", "-1"], "key is -1: it must be from 0 to 4294967295"),
+        (["--out", "/proc/nowhere/film.gif"], "out is /proc/nowhere/film.gif"),
+        (["--out", "/proc/film.png"], "out is /proc/film.png, which can't be written"),
+    ):
+        assert render.main([str(point_mass), *arguments]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+
+
+def test_a_film_is_whole_or_not_there(point_mass, tmp_path, monkeypatch, capsys):
+    def half(frames, fps, path):
+        path.write_bytes(b"x")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(render, "write", half)
+    path = tmp_path / "film.gif"
+    assert render.main([str(point_mass), "--out", str(path), "--steps", "2"]) == 1
+    assert "No space left on device" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_package_is_named(point_mass, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    path = tmp_path / "film.mp4"
+    assert render.main([str(point_mass), "--out", str(path)]) == 2
+    assert "needs the package imageio-ffmpeg" in capsys.readouterr().err

@@ -1,0 +1,265 @@
+"""Any input at all: refused in one line before anything compiles, or it runs."""
+
+import contextlib
+import dataclasses
+import io
+import json
+import math
+import pickle
+import re
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import gasil_jax
+from gasil_jax import evaluate, run
+from gasil_jax.config import validate
+from gasil_jax.host import run_folder
+from gasil_jax.host.environments import Settings, check
+from gasil_jax.imitation import expert
+
+
+def names(kind):
+    """Fields that are numbers, and tuples of them."""
+    return [
+        f.name
+        for f in dataclasses.fields(kind)
+        if f.name not in ("agent", "expert", "hyperparameters", "physics", "solver")
+        and f.name != "integrator"
+    ]
+
+
+OPTIONS = [
+    *names(gasil_jax.Config),
+    *names(gasil_jax.Hyperparameters),
+    *names(Settings),
+    *("seeds", "first_seed", "devices", "checkpoint_every", "keep_checkpoints"),
+    *("evaluate_every", "evaluate_episodes"),
+]
+NEVER_VALID = st.one_of(
+    st.sampled_from(["-1", "-0.5", "nan", "inf", "-inf", "", "true", "1e999", "0x10"]),
+    st.text(
+        st.characters(categories=["L", "S"], codec="ascii"), min_size=1, max_size=8
+    ),
+    st.integers(max_value=-1).map(str),
+    st.floats(max_value=-1e-9).map(str),
+)
+
+
+@settings(max_examples=300, deadline=None, derandomize=True)
+@given(name=st.sampled_from(OPTIONS), value=NEVER_VALID)
+def test_a_value_that_is_never_valid_is_refused(name, value):
+    out, err = io.StringIO(), io.StringIO()
+    argument = f"--{name.replace('_', '-')}={value}"
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            # An unknown environment stops the run should all else be accepted.
+            status = run.main(["--env", "hopper", argument, "--out", "/proc/no/run"])
+        except SystemExit as exit_:
+            pytest.fail(f"{argument} exits with {exit_.code}")
+    assert status == 2, argument
+    message = err.getvalue()
+    assert out.getvalue() == "" and len(message.splitlines()) == 1, message
+    assert name in message.replace("-", "_"), (argument, message)
+
+
+@settings(
+    max_examples=200,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+@given(words=st.lists(st.text(max_size=12), max_size=6))
+def test_words_without_meaning_are_refused(words):
+    err = io.StringIO()
+    if any(word in ("-h", "--help") for word in words):
+        return
+    with contextlib.redirect_stderr(err):
+        assert run.main(words) == 2
+    assert len(err.getvalue().splitlines()) == 1
+
+
+SIZES = st.integers(-1, 9)
+ANY_FLOAT = st.one_of(
+    st.floats(0, 1),
+    st.sampled_from([0.0, -1.0, math.nan, math.inf, 1e-30, 1e30, 2.0]),
+)
+
+
+@st.composite
+def configurations(draw):
+    """Small ones, about half of them valid."""
+    floats = {"buffer_steps": draw(st.integers(1, 60))} | {
+        field.name: draw(ANY_FLOAT)
+        for field in dataclasses.fields(gasil_jax.Hyperparameters)
+        if draw(st.integers(0, 9)) == 0
+    }
+    factor = draw(st.integers(1, 4))
+    num_envs = draw(st.sampled_from([1, 2, 3]))
+    return gasil_jax.Config(
+        agent=draw(st.sampled_from([*gasil_jax.agents()[:5], "gasill"])),
+        total_steps=draw(st.integers(1, 100)),
+        num_envs=num_envs,
+        batch_steps=draw(st.sampled_from([num_envs * factor * 4, 7])),
+        minibatch_size=draw(st.sampled_from([1, 4, num_envs])),
+        num_epochs=draw(st.integers(1, 2)),
+        hidden_sizes=tuple(draw(st.lists(st.integers(1, 5), max_size=2))),
+        discriminator_hidden_sizes=tuple(draw(st.lists(st.integers(0, 5), max_size=1))),
+        discriminator_minibatch_size=draw(st.integers(1, 70)),
+        sil_buffer_steps=draw(st.integers(1, 60)),
+        sil_minibatch_size=draw(st.integers(1, 70)),
+        max_episode_steps=draw(st.sampled_from([None, 1, 5])),
+        alpha_schedule=draw(
+            st.sampled_from([(), ((0.0, 0.0), (9.0, 1.0)), ((5, -1),)])
+        ),
+        hyperparameters=gasil_jax.Hyperparameters(**floats),
+    )
+
+
+def accepted(config):
+    try:
+        validate(config, gasil_jax.agents())
+    except ValueError as error:
+        fields = [f.name for f in dataclasses.fields(gasil_jax.Config)]
+        fields += [f.name for f in dataclasses.fields(gasil_jax.Hyperparameters)]
+        assert any(re.search(rf"\b{name}\b", str(error)) for name in fields), error
+        assert "\n" not in str(error)
+        return False
+    return True
+
+
+@settings(max_examples=500, deadline=None, derandomize=True)
+@given(config=configurations())
+def test_a_refused_configuration_names_its_field(config):
+    accepted(config)
+
+
+@settings(
+    max_examples=3,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
+)
+@given(config=configurations().filter(accepted))
+def test_an_accepted_configuration_completes_an_iteration(config):
+    env = gasil_jax.make_env("point_mass", reward_delay=2)
+    step = jax.jit(lambda state: gasil_jax.iterate(env, config, state))
+    init = jax.jit(lambda key: gasil_jax.init(env, config, key))
+    state, _ = step(init(jax.random.key(0)))
+    assert int(state.iteration) == 1
+    for leaf in jax.tree.leaves((state.actor_critic, state.imitation)):
+        assert np.isfinite(leaf).all()
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(delay=st.integers(-2, 2), noise=ANY_FLOAT)
+def test_settings_are_refused_or_made(delay, noise):
+    chosen = Settings(reward_delay=delay, obs_noise=noise)
+    try:
+        check("point_mass", chosen)
+    except ValueError as error:
+        assert "reward_delay" in str(error) or "obs_noise" in str(error)
+        return
+    env = gasil_jax.make_env("point_mass", reward_delay=delay, obs_noise=noise)
+    assert env.observation_size > 0
+
+
+class Bomb:
+    """Unpickling it would leave a mark."""
+
+    def __reduce__(self):
+        return (exec, ("import builtins; builtins.exploded = True",))
+
+
+def saved(kind, *arguments, **arrays):
+    file = io.BytesIO()
+    kind(file, *arguments, **arrays)
+    return file.getvalue()
+
+
+WHOLE = saved(
+    np.savez_compressed,
+    observation=np.random.default_rng(0).normal(size=(50, 3)),
+    action=np.zeros((50, 1)),
+)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        WHOLE[: len(WHOLE) // 2],
+        WHOLE[:300] + b"xxxx" + WHOLE[304:],
+        saved(np.save, np.zeros(3)),
+        saved(np.savez, observation=np.zeros((3, 2))),
+        b"",
+        b"PK\x03\x04 not a zip",
+        b"\x80\x04N.",
+        pickle.dumps({"observation": [1]}),
+    ],
+)
+def test_a_foreign_demonstration_file_is_refused(content, tmp_path):
+    path = tmp_path / "expert.npz"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"must be an \.npz file") as refusal:
+        expert.load(str(path))
+    assert "\n" not in str(refusal.value)
+
+
+def test_a_demonstration_file_is_never_unpickled(tmp_path):
+    import builtins
+
+    path = tmp_path / "bomb.npz"
+    bomb = np.array([Bomb()], dtype=object)
+    np.savez(path, observation=bomb, action=bomb)
+    with pytest.raises(ValueError, match="must be an"):
+        expert.load(str(path))
+    assert not hasattr(builtins, "exploded")
+
+
+GOOD = {
+    "env": "point_mass",
+    "seeds": 1,
+    "first_seed": 0,
+    "settings": {},
+    "config": {"hyperparameters": {}},
+}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "[]",
+        "{}",
+        "\x80\x04N.",
+        json.dumps(GOOD | {"seeds": "two"}),
+        json.dumps(GOOD | {"settings": {"gravity": 3}}),
+        json.dumps(GOOD | {"config": {"hyperparameters": {"alpa": 1}}}),
+        json.dumps(GOOD | {"config": {"hyperparameters": {}, "agnt": "ppo"}}),
+    ],
+)
+def test_a_foreign_run_folder_is_refused(content, tmp_path, capsys):
+    (tmp_path / "config.json").write_text(content)
+    for main, arguments in (
+        (evaluate.main, [str(tmp_path)]),
+        (run.main, ["--resume", "--out", str(tmp_path)]),
+    ):
+        assert main(arguments) == 2
+        error = capsys.readouterr().err
+        assert len(error.splitlines()) == 1
+        assert "damaged or of another program" in error
+
+
+def test_a_run_folder_of_another_state_is_refused(tmp_path, capsys):
+    from gasil_jax.host import checkpoint
+
+    (tmp_path / "config.json").write_text(json.dumps(GOOD))
+    assert evaluate.main([str(tmp_path)]) == 2
+    assert "no whole checkpoint" in capsys.readouterr().err
+    checkpoint.write(tmp_path / "checkpoints", 1, {"x": np.zeros(2)}, {})
+    assert evaluate.main([str(tmp_path)]) == 2
+    assert "holds another state" in capsys.readouterr().err
+    assert run_folder.read(tmp_path)["env"] == "point_mass"

@@ -1,0 +1,34 @@
+"""Members side by side, over devices."""
+
+import jax
+import numpy as np
+
+import gasil_jax
+from gasil_jax.host.members import make_batch
+
+SMALL = gasil_jax.Config(
+    total_steps=256,
+    num_envs=4,
+    batch_steps=128,
+    minibatch_size=32,
+    num_epochs=1,
+    hidden_sizes=(8,),
+    discriminator_hidden_sizes=(8,),
+)
+
+
+def test_a_seed_does_not_depend_on_the_number_of_devices():
+    """With host calls; without them: test_determinism.py."""
+    env = gasil_jax.make_env("halfcheetah", physics="mujoco")
+    config = SMALL.replace(agent="ppo")
+    results = []
+    # Three members on two devices: one is padding.
+    for devices, seeds in ((1, [6]), (2, [5, 6, 7])):
+        runs = make_batch(env, config, seeds, devices=jax.devices()[:devices])
+        states, advance = runs.compile()
+        last, _ = runs.train(advance, states, 0, 1)
+        last, _ = runs.train(advance, last, 1, 1)
+        results.append(jax.tree.map(np.asarray, runs.trim(last).actor_critic.params))
+    alone, two = results
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+    jax.tree.map(lambda a, b: close(a[1], b[0]), two, alone)

@@ -1,0 +1,357 @@
+"""Policies that are scored while they train."""
+
+import csv
+import json
+import logging as standard_logging
+import os
+import pathlib
+import re
+import shutil
+import signal
+
+import jax
+import numpy as np
+import pytest
+import test_members
+
+import gasil_jax
+from gasil_jax import plot, run, sweep
+from gasil_jax.evaluation import evaluate as evaluate_directly
+from gasil_jax.figures import plotting, statistics
+from gasil_jax.host import checkpoint, trackers
+from gasil_jax.host.members import make_batch
+from gasil_jax.host.periodic_evaluation import (
+    EvaluationSchedule,
+    PeriodicEvaluation,
+    evaluation_key,
+)
+from gasil_jax.sweeps import saved_states
+
+ITERATIONS, EVERY, EPISODES = 22, 5, 3
+SEEDS = (5, 6, 7)
+# Three members on two devices: one is padding.
+SMALL = (
+    *("--env", "point_mass", "--agent", "ppo", "--seeds", "3", "--first-seed", "5"),
+    *("--devices", "2", "--total-steps", str(ITERATIONS * 128), "--num-envs", "4"),
+    *("--batch-steps", "128", "--minibatch-size", "32", "--num-epochs", "1"),
+    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--buffer-steps", "300", "--reward-delay", "7", "--learning-rate", "0.01"),
+    *("--checkpoint-every", str(8 * 128), "--keep-checkpoints", "99"),
+)
+# Rounded up to five iterations.
+EVALUATED = ("--evaluate-every", "600", "--evaluate-episodes", str(EPISODES))
+TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
+
+
+class Collector:
+    """A tracker that keeps what it is given."""
+
+    taken: list = []  # noqa: RUF012
+
+    def __init__(self, folder, config):
+        pass
+
+    def log(self, step, scalars):
+        self.taken.append((step, dict(scalars)))
+
+    def close(self):
+        pass
+
+
+@pytest.fixture(scope="module")
+def evaluated(tmp_path_factory):
+    """The folder of a run with evaluations, and what its tracker was given."""
+    out = tmp_path_factory.mktemp("evaluated") / "out"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(trackers.TRACKERS, "collector", ("json", Collector))
+        patch.setattr(Collector, "taken", [])
+        arguments = (*SMALL, *EVALUATED, "--log", "collector", "--out", str(out))
+        assert run.main(arguments) == 0
+        yield out, list(Collector.taken)
+
+
+def rows(out):
+    with (out / "evaluations.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def means(out):
+    """The mean over seeds by iteration."""
+    by_iteration = {}
+    for row in rows(out):
+        iteration = int(row["env_steps"]) // 128
+        by_iteration.setdefault(iteration, []).append(float(row["mean"]))
+    return {iteration: np.mean(x) for iteration, x in by_iteration.items()}
+
+
+def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
+    evaluated,
+):
+    out, _ = evaluated
+    table = rows(out)
+    assert list(table[0]) == ["seed", "env_steps", "mean", "min", "max", "length"]
+    assert [(int(row["env_steps"]), int(row["seed"])) for row in table] == [
+        (iteration * 128, seed) for iteration in (5, 10, 15, 20, 22) for seed in SEEDS
+    ]
+    for row in table:
+        low, mean, high = (float(row[name]) for name in ("min", "mean", "max"))
+        assert low <= mean <= high and row["length"] == "50"
+    summary = json.loads((out / "summary.json").read_text())
+    last = {row["seed"]: float(row["mean"]) for row in table[-3:]}
+    assert summary["final_evaluation"] == pytest.approx(last)
+    assert summary["final_evaluation_mean"] == pytest.approx(np.mean([*last.values()]))
+    assert summary["final_length"] == {"5": 50.0, "6": 50.0, "7": 50.0}
+    assert summary["final_length_mean"] == 50.0
+    assert summary["evaluation_seconds"] > 0
+
+
+def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
+    out, alone = evaluated[0], tmp_path / "alone"
+    assert run.main([*SMALL, "--out", str(alone)]) == 0
+    assert (alone / "metrics.csv").read_bytes() == (out / "metrics.csv").read_bytes()
+    assert not (alone / "evaluations.csv").exists()
+    summary = json.loads((alone / "summary.json").read_text())
+    assert not any("evaluation" in name for name in summary)
+    assert "evaluation" not in capsys.readouterr().out
+
+
+def test_the_scores_are_those_of_evaluate(evaluated):
+    out, _ = evaluated
+    env, config, seeds, states = saved_states.load(out)
+    for index, (seed, row) in enumerate(zip(seeds, rows(out)[-3:], strict=True)):
+        scores = evaluate_directly(
+            env,
+            config,
+            gasil_jax.member(states, index),
+            evaluation_key(seed, ITERATIONS),
+            num_episodes=EPISODES,
+        )
+        returns = np.asarray(scores["episode_return"])
+        direct = [returns.mean(), returns.min(), returns.max()]
+        written = [float(row[name]) for name in ("mean", "min", "max")]
+        np.testing.assert_allclose(written, direct, **TOLERANCE)
+
+
+def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
+    whole, _ = evaluated
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    # As if it had been killed after the checkpoint in the middle of two evaluations.
+    for path in (out / "checkpoints").iterdir():
+        if int(path.name) > 8:
+            shutil.rmtree(path)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    for name in ("evaluations.csv", "metrics.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    cut = (out / "evaluations-cut-1.csv").read_bytes()
+    assert (whole / "evaluations.csv").read_bytes().endswith(cut) and cut
+    # Once more there is nothing to do.
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    before, after = (json.loads((x / "summary.json").read_text()) for x in (whole, out))
+    for name in ("final_evaluation", "final_evaluation_mean"):
+        assert before[name] == after[name]
+    assert (out / "evaluations.csv").read_bytes() == (
+        whole / "evaluations.csv"
+    ).read_bytes()
+
+
+def test_an_interrupted_run_goes_on_with_its_scores(evaluated, tmp_path, monkeypatch):
+    whole, out = evaluated[0], tmp_path / "out"
+    score = PeriodicEvaluation.score
+
+    def interrupted(self, states, done):
+        if done == 10:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return score(self, states, done)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PeriodicEvaluation, "score", interrupted)
+        status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
+    assert status == 128 + signal.SIGTERM
+    assert len(rows(out)) == 2 * len(SEEDS)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    for name in ("evaluations.csv", "metrics.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    assert not list(out.glob("*-cut-*"))
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (("--evaluate-every", "640"), "evaluate_every was 600, is 640"),
+        (("--evaluate-episodes", "4"), "evaluate_episodes was 3, is 4"),
+    ],
+)
+def test_evaluations_may_not_change_on_the_way(more, message, evaluated, capsys):
+    assert run.main(["--resume", "--out", str(evaluated[0]), *more]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
+    out, _ = evaluated
+    root, by_iteration = out / "checkpoints", means(out)
+    best = max(by_iteration, key=by_iteration.__getitem__)
+    assert checkpoint.best(root).iteration == best
+    # Those that are due as ever, without a score, and one for each best so far.
+    scores = {
+        int(path.name): checkpoint.read(path).record["score"] for path in root.iterdir()
+    }
+    so_far = {
+        iteration
+        for iteration, mean in by_iteration.items()
+        if mean == max(x for i, x in by_iteration.items() if i <= iteration)
+    }
+    assert set(scores) == {8, 16, ITERATIONS} | so_far
+    for iteration, score in scores.items():
+        assert score == pytest.approx(by_iteration.get(iteration))
+    _, _, _, states = saved_states.load(out, "best")
+    assert set(np.asarray(states.iteration)) == {best}
+
+
+def test_the_tracker_is_given_the_scores(evaluated):
+    out, taken = evaluated
+    given = {
+        step: {name: x for name, x in scalars.items() if name.startswith("evaluation/")}
+        for step, scalars in taken
+        if "evaluation/mean" in scalars
+    }
+    expected = {}
+    for row in rows(out):
+        scalars = expected.setdefault(int(row["env_steps"]), {})
+        scalars[f"evaluation/{row['seed']}"] = float(row["mean"])
+    for iteration, mean in means(out).items():
+        expected[iteration * 128]["evaluation/mean"] = mean
+    assert set(given) == set(expected)
+    for step, scalars in given.items():
+        assert scalars == pytest.approx(expected[step], rel=1e-5, abs=1e-6)
+
+
+def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, monkeypatch):
+    out, _ = evaluated
+    curves = plot.read(out)
+    assert curves.evaluations["mean"].shape == (3, 5)
+    figures = []
+    monkeypatch.setattr(
+        plotting, "save", lambda figure, *_, **__: figures.append(figure)
+    )
+    plot.draw([curves], tmp_path / "x.png")
+    plotting.learning_curve(
+        tmp_path / "y.png",
+        curves.env_steps,
+        curves.returns,
+        "title",
+        evaluations=curves.evaluations,
+    )
+    scores = curves.evaluations["mean"]
+    middles = (statistics.interquartile_mean(scores, axis=0), scores.mean(axis=0))
+    for figure, middle in zip(figures, middles, strict=True):
+        lines = figure.axes[0].get_lines()
+        (dashed,) = (line for line in lines if line.get_linestyle() == "--")
+        iterations = np.array([5, 10, 15, 20, ITERATIONS])
+        np.testing.assert_array_equal(dashed.get_xdata(), 128 * iterations)
+        np.testing.assert_allclose(dashed.get_ydata(), middle)
+
+
+def scored(tmp_path, seeds, devices, times=1):
+    """Mean, least and greatest return of each seed's first policy, made to act."""
+    env = gasil_jax.make_env("point_mass", reward_delay=7)
+    config = test_members.SMALL.replace(agent="ppo")
+    runs = make_batch(env, config, seeds, devices=jax.devices()[:devices])
+    states = runs.init()
+    # The first policies hardly move.
+    params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
+    states = states.replace(actor_critic=params)
+    path = tmp_path / f"{devices}.csv"
+    evaluation = PeriodicEvaluation(
+        runs, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
+    )
+    for _ in range(times):
+        evaluation.score(states, 1)
+    evaluation.close()
+    with path.open() as file:
+        table = list(csv.DictReader(file))
+    return {
+        int(row["seed"]): [float(row[x]) for x in ("mean", "min", "max")]
+        for row in table
+    }
+
+
+def test_a_seeds_scores_are_its_own_and_compile_once(tmp_path, caplog):
+    with jax.log_compiles(), caplog.at_level(standard_logging.WARNING):
+        together = scored(tmp_path, [5, 6, 7], devices=2, times=3)
+        names = re.findall(r"Finished XLA compilation of (\S+)", caplog.text)
+    assert names.count("jit(score)") == 1
+    alone = scored(tmp_path, [6], devices=1)
+    np.testing.assert_allclose(alone[6], together[6], **TOLERANCE)
+    assert np.abs(np.subtract(together[5], together[6])).max() > 0.1
+
+
+def test_keys_differ_by_seed_and_iteration():
+    keys = {
+        tuple(jax.random.key_data(evaluation_key(np.uint32(seed), iteration)).tolist())
+        for seed in (0, 1, 2**32 - 1)
+        for iteration in (1, 2)
+    }
+    assert len(keys) == 6
+
+
+def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
+    out = tmp_path / "sweep"
+    # The points differ in their number of evaluations, and are two programs.
+    arguments = (*SMALL, "--seeds", "2", "--total-steps", "1024", *EVALUATED)
+    grid = ("--grid", "batch_steps=128,256")
+    assert sweep.main([*arguments, *grid, "--out", str(out)]) == 0
+    assert "s of evaluations)" in capsys.readouterr().out
+    curves = np.load(out / "curves.npz")
+    steps = curves["evaluation_env_steps"]
+    np.testing.assert_array_equal(steps[0, 0], [640, 1024])
+    np.testing.assert_array_equal(steps[1, 0], [768, 1024])
+    for name in ("mean", "min", "max", "length"):
+        assert curves[f"evaluation_{name}"].shape == (2, 2, 2)
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["evaluation_seconds"] > 0
+    final = curves["evaluation_mean"][:, :, -1]
+    with (out / "results.csv").open() as file:
+        table = list(csv.DictReader(file))
+    assert {float(row["final_length"]) for row in table} == {50.0}
+    np.testing.assert_allclose(
+        [float(row["final_evaluation"]) for row in table], final.ravel(), rtol=1e-6
+    )
+    for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
+        assert point["final_evaluation"] == pytest.approx(mean)
+        assert point["final_length"] == 50.0
+    # A sweep's table that is cut short is told.
+    path = out / "programs" / "1" / "evaluations.csv"
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
+    assert sweep.main(["--resume", "--out", str(out)]) == 2
+    error = capsys.readouterr().err
+    assert "evaluations.csv is damaged: it lacks iterations" in error
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--evaluate-every 0", "evaluate_every is 0: it must be 1 or more"),
+        ("--evaluate-every -5", "evaluate_every is -5: it must be 1 or more"),
+        (
+            "--evaluate-every x",
+            "evaluate_every is 'x': it must be a whole number",
+        ),
+        (
+            "--evaluate-every 9 --evaluate-episodes 0",
+            "evaluate_episodes is 0: it must be 1 or more",
+        ),
+        ("--evaluate-episodes 0", "evaluate_episodes is 0: it must be 1 or more"),
+        ("--evaluate-episodes 3", "evaluate_episodes is 3: it needs evaluate_every"),
+        ("--evaluate-every 9 --evaluate-episodes 1e12", "GB of memory"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, tmp_path, capsys):
+    for main, more in ((run.main, ()), (sweep.main, ("--grid", "gamma=0.9,0.99"))):
+        out = ("--out", str(tmp_path / "out"))
+        assert main([*SMALL, *out, *arguments.split(), *more]) == 2
+        error = capsys.readouterr().err
+        assert message in error and len(error.splitlines()) == 1
+        assert "evaluate_" in error
+        assert not pathlib.Path(out[1]).exists()

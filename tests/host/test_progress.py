@@ -1,0 +1,54 @@
+"""What a run says that it is doing, where there is no terminal."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from gasil_jax.host import progress
+
+
+def wait_for_text(capsys, seconds=20.0):
+    text, deadline = "", time.monotonic() + seconds
+    while not text and time.monotonic() < deadline:
+        time.sleep(0.005)
+        text = capsys.readouterr().err
+    return text
+
+
+def test_what_takes_long_is_said_in_one_line(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 0.01)
+    with progress.announced("hopper", "building"):
+        assert wait_for_text(capsys) == "hopper: building\n"
+    with pytest.raises(OSError, match="full"), progress.announced("hopper", "saving"):
+        assert wait_for_text(capsys) == "hopper: saving\n"
+        raise OSError("full")
+
+
+def test_what_is_quick_is_not_said(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 600.0)
+    before = threading.active_count()
+    with progress.announced("hopper", "building"):
+        assert threading.active_count() == before + 1
+    # What would have said it has ended, long before its time.
+    deadline = time.monotonic() + 20.0
+    while threading.active_count() > before and time.monotonic() < deadline:
+        time.sleep(0.005)
+    assert threading.active_count() == before
+    assert capsys.readouterr().err == ""
+
+
+def test_what_is_done_aside_does_not_count_in_the_speed(monkeypatch, capsys):
+    clock = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    with progress.Progress("hopper ppo", 2000) as shown:
+        shown.phase("training")
+        clock[0] += 10.0
+        with shown.aside("saving a checkpoint"):
+            clock[0] += 90.0
+        clock[0] += 10.0
+        shown.update(2000, np.array([[3.0, np.nan]]))
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "hopper ppo: training"
+    assert "2,000/2,000 steps, return 3.0 ± 0.0, 100 steps/s, 0 s left" in lines[1]

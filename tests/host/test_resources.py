@@ -1,0 +1,74 @@
+"""Memory: estimated before a run, and flat during one."""
+
+import pathlib
+
+import jax
+import numpy as np
+import pytest
+from test_resume import SMALL, finish, rows, start, wait_for
+
+import gasil_jax
+from gasil_jax import run
+from gasil_jax.host import resources
+from gasil_jax.host.members import make_batch
+
+
+@pytest.mark.parametrize(
+    ("agent", "changes"),
+    [
+        ("ppo+gasil", {"num_envs": 64, "batch_steps": 8192}),
+        ("ppo+sil", {"sil_buffer_steps": 50_000}),
+    ],
+)
+def test_the_estimate_is_within_a_factor_of_two(agent, changes):
+    env = gasil_jax.make_env("point_mass")
+    config = gasil_jax.Config(agent=agent, **changes)
+    runs = make_batch(env, config, range(3), devices=jax.devices()[:1])
+    states = jax.eval_shape(runs.init)
+    account = runs.advance.lower(states, np.int32(0)).compile().memory_analysis()
+    total = account.temp_size_in_bytes + account.argument_size_in_bytes
+    assert 0.5 < 3 * resources.need(env, config).memory / total < 2.0
+
+
+def test_what_cannot_fit_is_refused_with_the_numbers(monkeypatch, tmp_path, capsys):
+    arguments = [*SMALL, "--out", str(tmp_path / "out")]
+    monkeypatch.setattr(resources, "available", lambda devices: 10_000)
+    assert run.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "of memory" in error and "at most 0 fit" in error
+    assert len(error.splitlines()) == 1
+
+    monkeypatch.setattr(resources, "available", lambda devices: None)
+    monkeypatch.setattr(resources, "_free_disk", lambda folder: 10_000)
+    assert run.main(arguments) == 2
+    error = capsys.readouterr().err
+    assert "3 checkpoints of 3 seeds (over all points), and one that is" in error
+    assert not (tmp_path / "out").exists()
+
+    # Those of all points stay on the disk.
+    state = resources.need(gasil_jax.make_env("point_mass"), gasil_jax.Config()).state
+    monkeypatch.setattr(resources, "_free_disk", lambda folder: 9 * state)
+    env, members = gasil_jax.make_env("point_mass"), (gasil_jax.Config(), 2)
+    resources.check_disk(env, [members], tmp_path, 3)
+    with pytest.raises(ValueError, match="3 checkpoints of 4 seeds"):
+        resources.check_disk(env, [members, members], tmp_path, 3)
+
+
+def test_available_memory_is_read():
+    free = resources.available(jax.devices())
+    assert free is None or 10**7 < free < 10**14
+
+
+def test_a_thousand_iterations_take_no_more_memory(tmp_path):
+    out = tmp_path / "out"
+    child = start(out, *SMALL, "--total-steps", str(1_100 * 128))
+    resident = lambda: int(
+        pathlib.Path(f"/proc/{child.pid}/statm").read_text().split()[1]
+    )
+    pages = []
+    for iterations in (100, 400, 700, 1000):
+        wait_for(lambda: rows(out) > 3 * iterations, child)  # noqa: B023
+        pages.append(resident())
+    status, _, err = finish(child)
+    assert status == 0, err
+    assert max(pages[1:]) * 4096 - pages[0] * 4096 < 20e6, pages

@@ -1,0 +1,350 @@
+"""A run that ends before its time: nothing is lost, and it goes on bit for bit."""
+
+import json
+import os
+import pathlib
+import re
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import jax
+import numpy as np
+import pytest
+import test_members
+
+import gasil_jax
+from gasil_jax import run
+from gasil_jax.host import checkpoint, run_folder
+from gasil_jax.host.members import make_batch
+
+ITERATIONS = 400
+# PPO's state, which has the buffer too, compiles soonest; every agent's: below.
+SMALL = (
+    *("--env", "point_mass", "--agent", "ppo", "--seeds", "3", "--devices", "2"),
+    *("--total-steps", str(ITERATIONS * 128), "--batch-steps", "128"),
+    *("--minibatch-size", "32", "--num-envs", "4", "--num-epochs", "1"),
+    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--buffer-steps", "300", "--reward-delay", "7", "--obs-noise", "0.1"),
+)
+OFTEN = ("--checkpoint-every", str(20 * 128))
+
+
+def start(out, *arguments):
+    return subprocess.Popen(
+        [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def wait_for(condition, child, seconds=120):
+    """Poll until the condition holds; the child must be alive till then."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert child.poll() is None, child.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.0005)
+
+
+def finish(child, seconds=200):
+    out, err = child.communicate(timeout=seconds)
+    return child.returncode, out, err
+
+
+def checkpoints(out):
+    return sorted(p.name for p in (out / "checkpoints").glob("*[0-9]"))
+
+
+def rows(out):
+    path = out / "metrics.csv"
+    return path.read_text().count("\n") if path.exists() else 0
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A run that nothing disturbed, without checkpoints on the way."""
+    out = tmp_path_factory.mktemp("whole") / "out"
+    status, _, err = finish(start(out, *SMALL))
+    assert status == 0, err
+    return out
+
+
+def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
+    out = tmp_path / "out"
+    root = out / "checkpoints"
+    new = lambda: set(checkpoints(out)) - before
+
+    # Before the first save: begun anew.
+    before = set()
+    child = start(out, *SMALL, "--checkpoint-every", str(10**9))
+    wait_for(lambda: rows(out) > 30, child)
+    child.kill()
+    finish(child)
+    assert checkpoints(out) == []
+
+    # During one: what is half written does not count.
+    for _ in range(5):
+        child = start(out, "--resume", *OFTEN)
+        wait_for(lambda: list(root.glob("*.partial")), child)
+        child.kill()
+        finish(child)
+        if list(root.glob("*.partial")):
+            break
+    assert list(root.glob("*.partial"))
+
+    # After one, with rows in metrics.csv that it has not seen.
+    before = set(checkpoints(out))
+    child = start(out, "--resume", *OFTEN)
+    wait_for(lambda: new() and rows(out) > 1 + 3 * (int(max(new())) + 5), child)
+    child.kill()
+    finish(child)
+
+    # SIGTERM and Ctrl-C save and say how to go on.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        before = set(checkpoints(out))
+        child = start(out, "--resume", *OFTEN)
+        wait_for(new, child)
+        child.send_signal(number)
+        status, _, err = finish(child)
+        assert status == 128 + number
+        assert "Traceback" not in err and "all that was done is saved" in err
+        command = re.search(r"python -m gasil_jax.run --resume --out (\S+)", err)
+        assert command.group(1) == str(out)
+        done = int(max(checkpoints(out)))
+        assert done < ITERATIONS and rows(out) == 1 + 3 * done
+
+    status, _, err = finish(start(out, "--resume", *OFTEN))
+    assert status == 0, err
+    assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+    assert list(out.glob("metrics-cut-*.csv"))  # no row is thrown away
+    # The newest two and the best.
+    assert len(checkpoints(out)) in (2, 3)
+    final = [checkpoint.latest(x / "checkpoints")[0].folder for x in (whole, out)]
+    assert {x.name for x in final} == {f"{ITERATIONS:08d}"}
+    results = [json.loads((x / "summary.json").read_text()) for x in (whole, out)]
+    assert results[0]["final_return"] == results[1]["final_return"]
+
+
+def copy(whole, tmp_path):
+    return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--alpha 0.7", "alpha was 0.1, is 0.7"),
+        ("--obs-noise 0.2 --num-epochs 3", "num_epochs was 1, is 3"),
+        ("--seeds 4", "seeds was 3, is 4"),
+        ("--total-steps 100", "total_steps was 51200, is 100"),
+    ],
+)
+def test_changed_settings_are_refused(arguments, message, whole, capsys):
+    before = {p.name: p.stat().st_mtime_ns for p in whole.iterdir()}
+    assert run.main(["--resume", "--out", str(whole), *arguments.split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+    assert {p.name: p.stat().st_mtime_ns for p in whole.iterdir()} == before
+
+
+def test_resume_needs_a_folder(capsys):
+    assert run.main(["--resume"]) == 2
+    assert "resume needs --out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda path: path.unlink(), "lacks rows that the checkpoint has seen"),
+        (
+            lambda path: path.write_text(path.read_text().replace(",0.", ",z.")),
+            "metrics.csv",
+        ),
+    ],
+)
+def test_a_damaged_table_is_told_in_one_line(damage, message, whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    damage(out / "metrics.csv")
+    assert run.main(["--resume", "--out", str(out)]) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert "compiling" not in capsys.readouterr().err
+    for name in ("summary.json", "metrics.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    with np.load(out / "policy.npz") as ours, np.load(whole / "policy.npz") as theirs:
+        for name in theirs:
+            np.testing.assert_array_equal(ours[name], theirs[name])
+    assert checkpoints(out) == checkpoints(whole)
+
+
+def test_total_steps_may_grow(whole, tmp_path):
+    out = copy(whole, tmp_path)
+    more = str((ITERATIONS + 5) * 128)
+    status, _, err = finish(start(out, "--resume", "--total-steps", more))
+    assert status == 0, err
+    assert rows(out) == 1 + 3 * (ITERATIONS + 5)
+    assert (
+        (out / "metrics.csv")
+        .read_bytes()
+        .startswith((whole / "metrics.csv").read_bytes())
+    )
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["env_steps_per_seed"] == int(more)
+
+
+def truncate(folder):
+    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip_a_bit(folder):
+    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def delete_a_file(folder):
+    next(p for p in sorted((folder / "state").rglob("*")) if p.is_file()).unlink()
+
+
+def delete_the_manifest(folder):
+    (folder / "manifest.json").unlink()
+
+
+@pytest.mark.parametrize(
+    "damage", [truncate, flip_a_bit, delete_a_file, delete_the_manifest]
+)
+def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_path):
+    root = tmp_path / "checkpoints"
+    states = [{"x": np.full(1000, float(i), np.float32)} for i in range(3)]
+    for i, state in enumerate(states):
+        checkpoint.write(root, i, state, {"score": None})
+    damage(root / "00000002")
+    found, damages = checkpoint.latest(root)
+    assert found.iteration == 1
+    assert len(damages) == 1 and "00000002 is damaged" in damages[0]
+    np.testing.assert_array_equal(found.restore(states[1])["x"], states[1]["x"])
+    # Written again, it is whole.
+    checkpoint.write(root, 2, states[2], {"score": None})
+    assert checkpoint.latest(root)[0].iteration == 2
+
+
+def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(whole, tmp_path):
+    out = copy(whole, tmp_path)
+    # The best and the last.
+    *_, last = checkpoints(out)
+    flip_a_bit(out / "checkpoints" / last)
+    status, _, err = finish(start(out, "--resume"))
+    assert status == 0, err
+    assert f"{last} is damaged" in err
+    assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+    assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
+    assert (out / "checkpoints" / f"{last}.damaged").is_dir()
+
+
+def test_a_damaged_checkpoint_does_not_count_as_the_newest(tmp_path):
+    root = tmp_path / "checkpoints"
+    for iteration in (1, 5):
+        checkpoint.write(root, iteration, {"x": np.zeros(1000)}, {"score": None})
+    flip_a_bit(root / "00000005")
+    assert checkpoint.latest(root)[0].iteration == 1
+    checkpoint.set_aside(root, newer_than=1)
+    checkpoint.write(root, 2, {"x": np.zeros(1000)}, {"score": None})
+    checkpoint.prune(root, 1)
+    assert checkpoint.latest(root) == (checkpoint.read(root / "00000002"), [])
+
+
+def test_the_best_and_the_newest_are_kept(tmp_path):
+    root = tmp_path / "checkpoints"
+    for i, score in enumerate([None, 3.0, 9.0, 1.0, 2.0, None]):
+        checkpoint.write(root, i, {"x": np.zeros(3)}, {"score": score})
+        checkpoint.prune(root, 2)
+    assert sorted(p.name for p in root.iterdir()) == [
+        "00000002",
+        "00000004",
+        "00000005",
+    ]
+    assert checkpoint.best(root).iteration == 2
+
+
+def test_a_full_disk_in_mid_run_leaves_the_last_checkpoint(whole, tmp_path):
+    out = tmp_path / "out"
+    child = start(out, *SMALL, *OFTEN)
+    wait_for(lambda: len(checkpoints(out)) >= 2, child)
+    # No file may grow beyond this: writing fails as on a full disk.
+    resource.prlimit(child.pid, resource.RLIMIT_FSIZE, (2000, 2000))
+    status, _, err = finish(child)
+    assert status == 1, err
+    assert err.splitlines()[-1].startswith("error: ") and "Traceback" not in err
+    found, damages = checkpoint.latest(out / "checkpoints")
+    assert found is not None and damages == []
+    status, _, err = finish(start(out, "--resume"))
+    assert status == 0, err
+    assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
+
+
+def test_a_folder_in_use_is_refused_until_its_process_dies(tmp_path, capsys):
+    out = tmp_path / "out"
+    child = start(out, *SMALL)
+    wait_for(lambda: rows(out) > 1, child)
+    assert run.main(["--resume", "--out", str(out)]) == 2
+    assert f"process {child.pid}" in capsys.readouterr().err
+    child.kill()
+    finish(child)
+    with run_folder.lock(out):
+        pass
+
+
+AGENTS = [name for name in gasil_jax.agents() if name != "gail"]
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
+    """Three members on two devices: one is padding."""
+    env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
+    config = test_members.SMALL.replace(
+        agent=agent,
+        total_steps=4 * 128,
+        buffer_steps=100,
+        sil_buffer_steps=200,
+        sil_minibatch_size=32,
+    )
+    runs = make_batch(env, config, [3, 4, 5])
+    states, advance = runs.compile()
+    rest = []
+    states, _ = runs.train(advance, states, 0, 1)
+    states, _ = runs.train(advance, states, 1, 1)
+    checkpoint.write(tmp_path, 2, runs.trim(states), {})
+    found, _ = checkpoint.latest(tmp_path)
+    like = jax.eval_shape(lambda: runs.trim(runs.init()))
+    for before in (states, runs.place(found.restore(like))):
+        after, metrics = runs.train(advance, before, 2, 1)
+        after, more = runs.train(advance, after, 3, 1)
+        after = jax.tree.leaves(runs.trim(after))
+        rest.append(
+            [
+                metrics,
+                more,
+                [
+                    np.asarray(jax.device_get(x))
+                    for x in after
+                    if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+                ],
+            ]
+        )
+    jax.tree.map(np.testing.assert_array_equal, *rest)
+    # It has trained all the while, with delay and noise and without a NaN.
+    metrics, _, leaves = rest[0]
+    assert metrics["skipped_updates"].sum() == 0
+    assert np.isfinite(metrics["policy_loss"]).all()
+    assert (metrics["good_steps"] == 100).all()
+    assert len(leaves) > 20

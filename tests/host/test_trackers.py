@@ -1,0 +1,126 @@
+"""Metrics in TensorBoard and Weights & Biases."""
+
+import contextlib
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from gasil_jax import run
+from gasil_jax.host import progress, run_options, trackers
+from gasil_jax.sweeps import assembly
+
+SMALL = (
+    *("--env", "point_mass", "--seeds", "2", "--first-seed", "3"),
+    *("--total-steps", "512", "--batch-steps", "128", "--num-envs", "4"),
+    *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
+    *("--discriminator-hidden-sizes", "8"),
+)
+
+
+def test_the_means_and_the_members_are_given():
+    taken = []
+
+    class Collector:
+        def log(self, step, scalars):
+            taken.append((step, dict(scalars)))
+
+    metrics = {
+        "env_steps": np.array([[10, 20], [10, 20]]),
+        "episode_return": np.array([[1.0, 2.0], [3.0, np.nan]]),
+        "entropy": np.array([[np.nan, 1.0], [np.nan, 2.0]]),
+    }
+    trackers.log([Collector()], {"point": [0, 1], "seed": [5, 5]}, metrics)
+    assert taken == [
+        (
+            10,
+            {"mean/episode_return": 2.0, "episode_return/0-5": 1.0}
+            | {"episode_return/1-5": 3.0},
+        ),
+        (
+            20,
+            {"mean/episode_return": 2.0, "mean/entropy": 1.5}
+            | {"episode_return/0-5": 2.0},
+        ),
+    ]
+
+
+def test_a_run_in_tensorboard(tmp_path, monkeypatch):
+    pytest.importorskip("tensorboardX")
+    out, said = tmp_path / "out", []
+
+    def announced(title, name):
+        said.append(name)
+        return contextlib.nullcontext()
+
+    for module in (run, run_options, assembly, progress):
+        monkeypatch.setattr(module, "announced", announced)
+    assert (
+        run.main(
+            [*SMALL, "--no-stagger-episodes", "--log", "tensorboard", "--out", str(out)]
+        )
+        == 0
+    )
+    (path,) = (out / "tensorboard").iterdir()
+    content = path.read_bytes()
+    assert content.count(b"mean/policy_loss") == 4
+    # Episodes of 50 steps end in every second iteration.
+    for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
+        assert content.count(name) == 2
+    # What a run does before, beside and after training is said.
+    assert said == [
+        "building the environment",
+        "starting the devices",
+        "starting the trackers",
+        "reading the checkpoints",
+        "saving a checkpoint",
+        "closing the trackers",
+        "writing the curve, the policies and the summary",
+    ]
+
+
+def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
+    pytest.importorskip("wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    out = tmp_path / "out"
+    out.mkdir()
+    labels = {"seed": [3, 4]}
+    # A run and how it goes on, with more steps than it had.
+    for total_steps, steps in ((256, [128, 256]), (384, [384])):
+        (tracker,) = trackers.make(["wandb"], out, {"total_steps": total_steps})
+        returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
+        metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
+        trackers.log([tracker], labels, metrics)
+        tracker.close()
+        time.sleep(1.1)  # W&B names its folders by the second.
+    identifier = (out / "wandb-id").read_text()
+    paths = sorted(out.glob(f"wandb/offline-run-*/run-{identifier}.wandb"))
+    assert len(paths) == 2
+    for path, count in zip(paths, (2, 1), strict=True):
+        for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
+            assert path.read_bytes().count(name) >= count
+    # Another run in a folder of the same name is another one there.
+    (tmp_path / "other" / "out").mkdir(parents=True)
+    assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
+
+
+def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
+    wandb = pytest.importorskip("wandb")
+
+    def refuse(**settings):
+        raise wandb.errors.UsageError("No API key\nconfigured.")
+
+    monkeypatch.setattr(wandb, "init", refuse)
+    out = ("--out", str(tmp_path / "out"))
+    assert run.main([*SMALL, "--log", "wandb", *out]) == 2
+    *_, told = capsys.readouterr().err.splitlines()
+    assert "error: log is 'wandb', which says: No API key configured." in told
+
+
+def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
+    assert run.main([*SMALL, "--log", "tensorbord"]) == 2
+    assert "log is 'tensorbord': it must be of tensorboard" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert run.main([*SMALL, "--log", "wandb"]) == 2
+    assert 'pip install "gasil_jax[wandb]"' in capsys.readouterr().err

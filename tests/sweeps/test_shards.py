@@ -1,0 +1,269 @@
+"""Shards of a sweep: each member in one of them, and one table out of all."""
+
+import json
+import shutil
+import signal
+import sys
+import textwrap
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gasil_jax import merge, sweep
+from gasil_jax.config import Config
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, metrics_files, run_folder, run_options
+from gasil_jax.host.interruption import Interrupted
+from gasil_jax.sweeps import launch, shards, tables
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    updates=st.lists(st.integers(1, 3), min_size=1, max_size=6),
+    num_seeds=st.integers(1, 4),
+    count=st.integers(1, 24),
+)
+def test_shards_hold_each_member_once(updates, num_seeds, count):
+    points = [{"discriminator_updates": n, "alpha": 0.1} for n in updates]
+    whole = shards.programs(Config(), points, range(num_seeds))
+    total = len(points) * num_seeds
+    every = [shards.Shard(number, count) for number in range(1, count + 1)]
+    if count > total:
+        with pytest.raises(InputError, match=f"{total} members"):
+            shards.share(whole, every[0])
+        return
+    parts = [shards.share(whole, shard) for shard in every]
+    sizes = [sum(len(program.members) for program in part) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    seen = [program for part in parts for program in part]
+    members = [(p.number, p.config, member) for p in seen for member in p.members]
+    assert members == [(p.number, p.config, m) for p in whole for m in p.members]
+    # No more is compiled than cutting must cost.
+    assert len(seen) <= len(whole) + count - 1
+
+
+def test_counts_share_a_program_where_that_is_asked_for():
+    points = [
+        {"discriminator_updates": 5, "buffer_steps": 1000, "alpha": 1.0},
+        {"discriminator_updates": 20, "alpha": 0.1},
+        {"num_epochs": 3},
+    ]
+    config = Config().replace(buffer_steps=500)
+    shared = shards.programs(config, points, [7], share_counts=True)
+    assert [program.members for program in shared] == [((0, 7), (1, 7)), ((2, 7),)]
+    for program in shared:
+        assert program.config.hyperparameters.discriminator_updates == 20
+        assert program.config.hyperparameters.buffer_steps == 1000
+    counts = [
+        (x.discriminator_updates, x.buffer_steps, x.alpha)
+        for program in shared
+        for x in program.hyperparameters
+    ]
+    assert counts == [(5, 1000, 1.0), (20, 500, 0.1), (5, 500, 0.1)]
+    (second,) = shards.share(shared[:1], shards.Shard(2, 2))
+    assert second.members == ((1, 7),)
+    assert second.hyperparameters == shared[0].hyperparameters[1:]
+
+
+GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
+
+
+def train(folder, shard=None, *arguments):
+    """What training leaves, with made-up metrics that are a member's own."""
+    small = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
+    small += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
+    options = command_line.parse(
+        sweep.Options,
+        [*small, "--grid", *GRID, *arguments, *(("--shard", shard) if shard else ())],
+        "x",
+    )
+    folder = folder if shard is None else shards.parse(shard).folder(folder)
+    folder.mkdir(parents=True)
+    points, programs = sweep.plan(options)
+    if shard is not None:
+        programs = shards.share(programs, shards.parse(shard))
+    run_options.write_config(options, folder, points=points)
+    for program in programs:
+        place = program.folder(folder)
+        place.mkdir(parents=True)
+        labels = dict(zip(tables.LABELS, zip(*program.members)))
+        writer = metrics_files.MetricsWriter(place / "metrics.csv", labels)
+        steps = np.array([100.0, 200.0, 300.0])
+        value = np.array([[10.0 * i + seed] for i, seed in program.members]) + steps
+        zero = np.zeros_like(value)
+        writer.write(
+            {
+                "env_steps": zero + steps,
+                "episode_return": np.where(value % 100 == 12, np.nan, value),
+                "skipped_updates": np.where(value == 220.0, 1.0, 0.0),
+            }
+        )
+        writer.close()
+        tables.write_training(
+            folder,
+            program,
+            env_steps=300 * len(program.members),
+            compile_seconds=1.0,
+            train_seconds=0.5 * len(program.members),
+            device="1 x cpu",
+            device_count=1,
+        )
+    return tables.Trained(folder, programs), points
+
+
+TABLES = ("results.csv", "curves.npz", "sweep.png")
+
+
+@pytest.mark.parametrize("count", [1, 5, 12])
+def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
+    """Five of twelve members: points are cut through, and programs."""
+    trained, points = train(tmp_path / "whole")
+    expected = tables.write(tmp_path / "whole", points, range(3), [trained])
+    assert expected["points"][1]["mean"] is None  # never ended
+    assert [point["diverged_seeds"] for point in expected["points"]] == [0, 0, 1, 0]
+    assert expected["env_steps_per_second"] == pytest.approx(600)
+    parts = tmp_path / "parts"
+    for number in range(1, count + 1):
+        train(parts, f"{number}/{count}")
+    assert merge.main([str(parts)]) == 0
+    assert "600 steps/s on 1 x cpu" in capsys.readouterr().out
+    # From where they were copied to, too; and merging again is nothing new.
+    apart = [str(path) for path in sorted((parts / "shards").iterdir())]
+    for _ in range(2):
+        assert merge.main([*apart, "--out", str(tmp_path / "apart")]) == 0
+    for out in (parts, tmp_path / "apart"):
+        for name in TABLES:
+            whole = (tmp_path / "whole" / name).read_bytes()
+            assert (out / name).read_bytes() == whole, name
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["points"] == expected["points"]
+        described = run_folder.read(out)
+        assert described["shard"] is None and described["points"] == tuple(points)
+
+
+def test_what_does_not_belong_together_is_not_merged(tmp_path, capsys):
+    def refused(*arguments):
+        assert merge.main([str(x) for x in arguments]) == 2
+        error = capsys.readouterr().err
+        assert len(error.splitlines()) == 1
+        return error
+
+    out = tmp_path / "out"
+    assert "folders is empty" in refused()
+    assert "must hold shards" in refused(out)
+    first, _ = train(out, "1/3")
+    train(out, "3/3")
+    assert "missing: shards 2/3" in refused(out)
+    train(out, "2/3", "--gamma", "0.9")
+    second = out / "shards" / "2-of-3"
+    assert "gamma was 0.99, is 0.9" in refused(out)
+    shutil.rmtree(second)
+    train(out, "2/3", "--total-steps", "400")
+    assert "total_steps was" in refused(out)
+    shutil.rmtree(second)
+    trained, _ = train(out, "2/3")
+    assert "several folders need --out" in refused(first.folder, second)
+    assert "1/3 is there twice" in refused(out, copy(first.folder), "--out", tmp_path)
+    # Begun and killed; then cut short while it was copied.
+    place = trained.programs[0].folder(second)
+    training = place / "training.json"
+    kept = training.read_text()
+    training.unlink()
+    assert "not finished: shards 2/3" in refused(out)
+    training.write_text(kept)
+    metrics = place / "metrics.csv"
+    content = metrics.read_bytes()
+    rows = content.splitlines(keepends=True)
+    for part in (rows[:-1], rows[: 1 + len(trained.programs[0].members)], []):
+        metrics.write_bytes(b"".join(part))
+        assert "metrics.csv is damaged" in refused(out)
+    metrics.write_bytes(content)
+    # Never onto another sweep or anything else.
+    whole = tmp_path / "whole"
+    train(whole)
+    assert "holds something else" in refused(out, "--out", whole)
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "results.csv").touch()
+    assert "holds something else" in refused(out, "--out", tmp_path / "thesis")
+    assert not (out / "results.csv").exists()
+    assert merge.main([str(out)]) == 0
+    train(out, "1/2")
+    assert "shards of 2 and of 3" in refused(out)
+
+
+def copy(folder):
+    return shutil.copytree(folder, folder.parent.parent.parent / "copy")
+
+
+def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, capsys):
+    train(tmp_path / "whole")
+    train(tmp_path / "parts", "1/2")
+    train(tmp_path / "parts", "2/2")
+    assert merge.main([str(tmp_path / "parts")]) == 0
+    more = ["--env", "point_mass", "--grid", *GRID, "--out"]
+    assert sweep.main([*more, str(tmp_path / "whole"), "--shard", "1/2"]) == 2
+    assert "not in shards" in capsys.readouterr().err
+    assert sweep.main(["--resume", "--out", str(tmp_path / "parts")]) == 2
+    assert "go on with each of them" in capsys.readouterr().err
+    for again in (["--shard", "1/3"], ["--launcher", "local", "--shards", "3"]):
+        assert sweep.main([*more, str(tmp_path / "parts"), *again]) == 2
+        assert "is cut into 2" in capsys.readouterr().err
+    # With its own settings: where it is trained, nothing is left to do.
+    same = [*more, str(tmp_path / "parts"), "--shard", "1/2"]
+    assert sweep.main(same) == 0
+    assert "shard 1/2 is done" in capsys.readouterr().out
+    assert sweep.main([*same, "--gamma", "0.9"]) == 2
+    assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
+
+
+@pytest.fixture
+def program(tmp_path, monkeypatch):
+    """A module whose first argument names a folder, and the second what happens."""
+    (tmp_path / "job.py").write_text(
+        textwrap.dedent(
+            """
+            import os, pathlib, signal, sys, time
+            folder, what = pathlib.Path(sys.argv[1]), sys.argv[2]
+            tries = len(list(folder.iterdir()))
+            (folder / f"{what}-{tries}").touch()
+            if what == "killed" and tries < 2:
+                os.kill(os.getpid(), signal.SIGKILL)
+            if what == "waits":
+                signal.signal(signal.SIGTERM, lambda *_: (folder / "told").touch())
+                os.kill(os.getppid(), signal.SIGTERM)
+                signal.pause()
+            sys.exit(2 if what == "refused" else 0)
+            """
+        )
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return "job"
+
+
+def test_a_launched_job_runs_again_after_its_process_died(program, tmp_path):
+    folders = {}
+    for name in ("killed", "refused", "fine"):
+        folders[name] = tmp_path / name
+        folders[name].mkdir()
+    jobs = {name: [str(folder), name] for name, folder in folders.items()}
+    with pytest.raises(ChildProcessError, match=r"^refused \(status 2\) failed"):
+        launch.run_locally(program, jobs, None)
+    ran = {name: len(list(folder.iterdir())) for name, folder in folders.items()}
+    assert ran == {"killed": 3, "refused": 1, "fine": 1}
+
+
+def test_a_signal_reaches_the_job_and_ends_the_launch(program, tmp_path):
+    folder = tmp_path / "waits"
+    folder.mkdir()
+    with pytest.raises(Interrupted) as interrupted:
+        launch.run_locally(program, {"waits": [str(folder), "waits"]}, None)
+    assert interrupted.value.signal == signal.SIGTERM
+    assert (folder / "told").exists()
+
+
+def test_a_launcher_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"gasil_jax\[ray\]"):
+        launch.check("ray")

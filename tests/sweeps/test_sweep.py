@@ -1,0 +1,277 @@
+"""Sweeps: what runs, what is refused, and that a point is what it is alone."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+import types
+
+import jax
+import numpy as np
+import pytest
+from test_resume import finish, wait_for
+
+from gasil_jax import evaluate, merge, run, sweep
+from gasil_jax.config import Config
+from gasil_jax.errors import InputError
+from gasil_jax.host import command_line, run_options
+from gasil_jax.sweeps import saved_states, shards, tables
+from gasil_jax.sweeps.points import PAPER_RANGES
+
+SMALL = (
+    *("--env", "point_mass", "--total-steps", "512", "--batch-steps", "256"),
+    *("--num-envs", "4", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--num-epochs", "2", "--buffer-steps", "300"),
+)
+
+
+def points_of(*arguments):
+    given = ["--env", "point_mass", *arguments]
+    options = command_line.parse(sweep.Options, given, "x")
+    return sweep.plan(options)[0]
+
+
+def test_a_grid_is_every_combination():
+    assert points_of("--grid", "buffer_steps=1e3") == points_of(
+        "--grid", "buffer_steps=1000"
+    )
+    points = points_of("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
+    assert points == [
+        {"alpha": 0.1, "discriminator_updates": 1},
+        {"alpha": 0.1, "discriminator_updates": 5},
+        {"alpha": 1.0, "discriminator_updates": 1},
+        {"alpha": 1.0, "discriminator_updates": 5},
+    ]
+    programs = shards.programs(Config(), points, [7, 8])
+    assert [program.members for program in programs] == [
+        ((0, 7), (0, 8), (2, 7), (2, 8)),
+        ((1, 7), (1, 8), (3, 7), (3, 8)),
+    ]
+    assert [p.config.hyperparameters.discriminator_updates for p in programs] == [1, 5]
+
+
+def test_random_points_are_distinct_and_of_the_papers_ranges():
+    points = points_of("--random", "16")
+    assert len({tuple(point.items()) for point in points}) == 16
+    for point in points:
+        assert set(point) == set(PAPER_RANGES)
+        assert all(value in PAPER_RANGES[name] for name, value in point.items())
+
+
+def test_points_that_vary_in_different_things_have_a_table(tmp_path):
+    def metrics(value):
+        returns = np.array([np.nan, value, np.nan])
+        return {
+            "episode_return": returns,
+            "episode_length": 10 * returns,
+            "env_steps": np.arange(3.0),
+            "skipped_updates": np.zeros(3),
+        }
+
+    training = {"env_steps": 9, "compile_seconds": 1.0, "train_seconds": 1.0}
+    training |= {"device": "cpu", "device_count": 1, "versions": {}}
+    trained = types.SimpleNamespace(
+        members=lambda: {(0, 5): metrics(1.0), (1, 5): metrics(2.0)},
+        evaluations=lambda: {},
+        trainings=lambda: [training],
+    )
+    points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    summary = tables.write(tmp_path, points, [5], [trained])
+    assert summary["best_by_mean"] == 1
+    header, *rows = (tmp_path / "results.csv").read_text().splitlines()
+    assert header == (
+        "point,seed,alpha,buffer_steps,learning_rate,final_return,final_length,diverged"
+    )
+    assert rows == ["0,5,1.0,500,,1,10,0", "1,5,,,0.0001,2,20,0"]
+
+
+def test_points_from_a_file(tmp_path):
+    path = tmp_path / "points.json"
+    path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
+    points = points_of("--points-file", str(path))
+    assert points == [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    for text, message in (
+        ("[", "can't be read"),
+        ("{}", "a list of points"),
+        ("[3]", "3 is not a point"),
+        ('[{"alhpa": 1}]', "did you mean 'alpha'"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5, not a whole number"),
+        ('[{"alpha": 1}, {"alpha": 1.0}]', "it has {'alpha': 1.0} twice"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            points_of("--points-file", str(path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--grid alhpa=1", "did you mean 'alpha'"),
+        ("--agent ppo --grid alpha=1", "agent 'ppo' does not look at it (one of learn"),
+        ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not look at it"),
+        ("--agent ppo --random 5", "random is 5: it must be at most 4"),
+        ("--grid alpha=1,big", "commas between"),
+        ("--grid buffer_steps=1.5", "whole numbers"),
+        ("--grid alpha=0.1,-1", "alpha is -1.0"),
+        ("--grid minibatch_size=64,60", "minibatch_size is 60"),
+        ("--random 0", "random is 0"),
+        ("--random 3 --grid alpha=0.1,0.2,0.1", "random is 3: it must be at most 2"),
+        ("--grid alpha=0.02,0.1 alpha=0.2", "grid has alpha twice"),
+        ("", "grid is empty"),
+        ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
+        ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
+        ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
+        ("--grid alpha=1 --shard 1/1", "shard needs --out"),
+        ("--grid alpha=1 --shards 3", "shards is 3: it is of --launcher"),
+        ("--grid alpha=1 --launcher rya", "did you mean 'ray'"),
+        ("--grid alpha=1 --launcher local --out x", "shards is None"),
+        ("--grid alpha=1 --launcher local --shards 1", "launcher needs --out"),
+        ("--grid alpha=1 --launcher local --shards 2 --out x", "make 1 shards"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
+    assert sweep.main(["--env", "point_mass", *arguments.split()]) == 2
+    error = capsys.readouterr().err
+    assert message in error and len(error.splitlines()) == 1
+
+
+def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
+    out = tmp_path / "sweep"
+    arguments = (*SMALL, "--seeds", "2", "--out", str(out))
+    # The last point's first step is beyond float32: it must not harm the others.
+    grid = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=1,3")
+    assert sweep.main([*arguments, *grid]) == 0
+    assert "best_by_mean: learning_rate=0.0003" in capsys.readouterr().out
+
+    rows = list(csv.DictReader((out / "results.csv").open()))
+    assert [(row["point"], row["seed"]) for row in rows] == [
+        (str(point), str(seed)) for point in range(4) for seed in range(2)
+    ]
+    assert [int(row["diverged"]) for row in rows] == [0] * 4 + [1] * 4
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["best_by_mean"] in (0, 1)
+    assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
+    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+
+    alone = tmp_path / "alone"
+    more = ("--discriminator-updates", "3", "--out", str(alone))
+    assert run.main([*SMALL, "--seeds", "2", *more]) == 0
+    expected = json.loads((alone / "summary.json").read_text())["final_return"]
+    found = {
+        row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
+    }
+    assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    _, config, seeds, states = saved_states.load(out, point=1)
+    assert config.hyperparameters.discriminator_updates == 3 and seeds == [0, 1]
+    _, _, _, by_itself = saved_states.load(alone)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
+        states.actor_critic.params,
+        by_itself.actor_critic.params,
+    )
+    with pytest.raises(ValueError, match="it must be 'last'"):
+        saved_states.load(out, "best", point=1)
+    best = saved_states.load(out)[1]
+    assert best.hyperparameters.discriminator_updates == (1, 3)[summary["best_by_mean"]]
+    assert evaluate.main([str(out), "--point", "4"]) == 2
+    assert "has points 0 to 3" in capsys.readouterr().err
+    curves = np.load(out / "curves.npz")
+    assert {"env_steps", "approx_kl", "bonus"} < set(curves)
+    assert all(curves[name].shape == (4, 2, 2) for name in curves)
+    assert summary["env_steps_per_second"] > 0
+    assert summary["device_count"] == jax.local_device_count()
+
+    # One program for both numbers of updates.
+    shared = tmp_path / "shared"
+    where = ("--share-counts", "--out", str(shared))
+    assert sweep.main([*SMALL, "--seeds", "2", *grid, *where]) == 0
+    assert [path.name for path in (shared / "programs").iterdir()] == ["0"]
+    in_one = np.load(shared / "curves.npz")
+    for name in ("episode_return", "bonus", "discriminator_loss", "good_steps"):
+        # The last point has diverged: what is left of it is rounding.
+        np.testing.assert_allclose(
+            in_one[name][:2], curves[name][:2], rtol=1e-3, err_msg=name
+        )
+
+    # A half of the points has a program for itself, of the same shapes.
+    parts = tmp_path / "parts"
+    part = lambda number: sweep.main(
+        [*SMALL, "--seeds", "2", *grid, "--out", str(parts), "--shard", f"{number}/2"]
+    )
+    assert part(2) == 0
+    assert merge.main([str(parts)]) == 2
+    assert "missing: shards 1/2" in capsys.readouterr().err
+    assert part(1) == 0
+    before = {p: p.stat().st_mtime_ns for p in parts.rglob("*")}
+    assert part(1) == 0
+    assert "shard 1/2 is done" in capsys.readouterr().out
+    assert {p: p.stat().st_mtime_ns for p in parts.rglob("*")} == before
+    assert merge.main([str(parts)]) == 0
+    assert (parts / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
+    merged = np.load(parts / "curves.npz")
+    assert set(merged) == set(curves)
+    for name in curves:
+        np.testing.assert_array_equal(merged[name], curves[name])
+    merged = json.loads((parts / "summary.json").read_text())
+    assert set(merged) == set(summary)
+    for name in ("points", "best_by_mean", "best_by_worst_seed", "versions", "device"):
+        assert merged[name] == summary[name]
+    assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
+
+
+def test_a_sweep_goes_on_with_its_own_points_wherever_they_are_listed(tmp_path, capsys):
+    first, copy, other = (tmp_path / f"{name}.json" for name in ("a", "b", "c"))
+    points = [{"alpha": 0.1}, {"alpha": 1.0, "discriminator_updates": 2}]
+    for path, listed in ((first, points), (copy, points), (other, points[:1])):
+        path.write_text(json.dumps(listed))
+    out = tmp_path / "sweep"
+    out.mkdir()
+    begun = [*SMALL, "--out", str(out), "--points-file", str(first)]
+    options = command_line.parse(sweep.Options, begun, "x")
+    run_options.write_config(options, out, points=points)
+
+    arguments = [*SMALL, "--out", str(out), "--resume", "--points-file"]
+    assert sweep.main([*arguments, str(other)]) == 2
+    assert "a sweep of other points has begun" in capsys.readouterr().err
+    assert sweep.main([*arguments, str(copy), "--seeds", "3"]) == 2
+    assert "seeds was 1, is 3: only" in capsys.readouterr().err
+    options = run_options.parse(sweep.Options, [*arguments, str(copy)], "x", out)
+    assert sweep.plan(options)[0] == points
+    sweep.check_points(points, out)
+
+    # A folder of before an option that is off by default can still go on.
+    content = json.loads((out / "config.json").read_text())
+    del content["share_counts"]
+    (out / "config.json").write_text(json.dumps(content))
+    assert not run_options.parse(sweep.Options, arguments[:-1], "x", out).share_counts
+
+
+def test_an_interrupted_sweep_goes_on(tmp_path):
+    long = (*SMALL, "--total-steps", str(200 * 256), "--seeds", "2")
+    grid = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
+    results = []
+    for name in ("whole", "interrupted"):
+        out = tmp_path / name
+        command = [sys.executable, "-m", "gasil_jax.sweep", *long, *grid]
+        child = subprocess.Popen(
+            [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
+        )
+        if name == "interrupted":
+            second = out / "programs" / "1" / "metrics.csv"
+            wait_for(lambda: second.exists() and second.stat().st_size > 5000, child)  # noqa: B023
+            child.terminate()
+            status, _, err = finish(child)
+            assert status == 128 + signal.SIGTERM, err
+            assert f"gasil_jax.sweep --resume --out {out}" in err
+            assert not (out / "results.csv").exists()
+            command = [sys.executable, "-m", "gasil_jax.sweep", "--resume"]
+            child = subprocess.Popen(
+                [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
+            )
+        status, _, err = finish(child)
+        assert status == 0, err
+        results.append((out / "results.csv").read_bytes())
+    assert results[0] == results[1]
+    more = ["--resume", "--out", str(out), "--grid", "alpha=3"]
+    assert sweep.main(more) == 2

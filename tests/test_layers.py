@@ -1,0 +1,102 @@
+"""The direction of imports: a folder says what a module may touch."""
+
+import ast
+import pathlib
+
+import pytest
+
+ROOT = pathlib.Path(__file__).parent.parent
+COMMANDS = ("run", "sweep", "merge", "evaluate", "render", "plot", "export_minari")
+#: What modules of each layer may import of the package; "algorithm" is every other
+#: module at the top and those of `imitation`.
+ALLOWED = {
+    "errors": set(),
+    "algorithm": {"errors", "algorithm"},
+    "figures": {"errors", "algorithm", "figures"},
+    "host": {"errors", "algorithm", "host"},
+    "sweeps": {"errors", "algorithm", "figures", "host", "sweeps"},
+    "commands": {"errors", "algorithm", "figures", "host", "sweeps"},
+}
+
+
+def layer(module):
+    """Of a module's name below the package: "host.driver" is of host."""
+    top = module.split(".")[0]
+    if top in COMMANDS:
+        return "commands"
+    return top if top in ALLOWED else "algorithm"
+
+
+def imports(path):
+    """Names of all modules that a file imports, wherever in it."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}"
+
+
+def modules(package):
+    """Name and path of every module of a package, its top excepted."""
+    for path in sorted(package.rglob("*.py")):
+        name = ".".join(path.relative_to(package).with_suffix("").parts)
+        if name != "__init__":
+            yield name.removesuffix(".__init__"), path
+
+
+def edges():
+    """(importing module, imported module) below gasil_jax."""
+    package = ROOT / "gasil_jax"
+    names = {name for name, _ in modules(package)}
+    for name, path in modules(package):
+        for imported in imports(path):
+            below = imported.removeprefix("gasil_jax.")
+            if below == imported:
+                continue
+            # `from gasil_jax.host import driver`, or a name of such a module.
+            if below not in names:
+                below = below.rpartition(".")[0]
+            yield name, below
+
+
+def test_imports_point_one_way():
+    wrong = [
+        f"{name} ({layer(name)}) imports {imported} ({layer(imported)})"
+        for name, imported in edges()
+        if layer(imported) not in ALLOWED[layer(name)]
+    ]
+    assert not wrong
+
+
+def test_no_module_imports_itself_by_way_of_others():
+    graph = {}
+    for name, imported in edges():
+        graph.setdefault(name, set()).add(imported)
+    finished, path = set(), []
+
+    def visit(name):
+        assert name not in path, " -> ".join([*path, name])
+        if name in finished:
+            return
+        path.append(name)
+        for imported in graph.get(name, ()):
+            visit(imported)
+        finished.add(path.pop())
+
+    for name in list(graph):
+        visit(name)
+
+
+@pytest.mark.parametrize("package", ["envs/gasil_envs", "examples"])
+def test_environments_and_examples_know_their_neighbours_alone(package):
+    for path in (ROOT / package).rglob("*.py"):
+        for imported in imports(path):
+            forbidden = ("experiments",)
+            if package == "envs/gasil_envs":
+                forbidden += ("gasil_jax",)
+            assert imported.split(".")[0] not in forbidden, path
+
+
+def test_every_layer_has_modules():
+    assert {layer(name) for name, _ in modules(ROOT / "gasil_jax")} == set(ALLOWED)
