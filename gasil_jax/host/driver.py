@@ -24,8 +24,9 @@ from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvalu
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker, log
 
-# Time to a reaction to Ctrl-C, and between two updates of the display.
-_SECONDS_BETWEEN_LOOKS = 5.0
+# Between two calls of the compiled program: time to react to Ctrl-C, and between two
+# updates of the display.
+_SECONDS_OF_A_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
@@ -45,14 +46,15 @@ class CheckpointSchedule:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What came of it.
+    """What training has given.
 
     Attributes:
-      states: of the members, after the last iteration.
-      new_steps: environment steps over all members, without those of a checkpoint.
-      compile_seconds: of this process, for training.
-      train_seconds: of this process, without its evaluations.
-      evaluation_seconds: of this process, compiling included; None without evaluations.
+      states: of the members after the last iteration.
+      new_steps: environment steps over all members that this process took.
+      compile_seconds: spent in this process on compiling the training.
+      train_seconds: spent in this process on training, without its evaluations.
+      evaluation_seconds: spent in this process on evaluations, compiling included;
+        None without evaluations.
     """
 
     states: Any
@@ -60,6 +62,100 @@ class Outcome:
     compile_seconds: float
     train_seconds: float
     evaluation_seconds: float | None
+
+
+class _Tables:
+    """metrics.csv and evaluations.csv of a folder, and the trackers beside them.
+
+    Args:
+      runs: what is trained.
+      folder: of the files.
+      labels: columns that tell the members apart, (members,) each.
+      evaluation_schedule: of evaluations; None for none.
+      trackers: given the same numbers.
+      record: of the checkpoint that training goes on from: the tables are cut where
+        it was written. None without a checkpoint.
+    """
+
+    def __init__(
+        self,
+        runs: Batch,
+        folder: pathlib.Path,
+        labels: Mapping[str, Sequence[Any]],
+        *,
+        evaluation_schedule: EvaluationSchedule | None,
+        trackers: Sequence[Tracker],
+        record: Mapping[str, Any] | None,
+    ):
+        self._labels, self._trackers = labels, trackers
+        path = folder / "metrics.csv"
+        self._metrics = metrics_files.MetricsWriter(path, labels, _size(path, record))
+        self.evaluation = None
+        if evaluation_schedule is not None:
+            path = folder / "evaluations.csv"
+            self.evaluation = PeriodicEvaluation(
+                runs,
+                evaluation_schedule,
+                path,
+                labels=labels,
+                size=_size(path, record),
+                following=trackers,
+            )
+
+    def write(self, metrics: Mapping[str, np.ndarray]) -> None:
+        """Add the metrics of a chunk, (members, iterations) each."""
+        self._metrics.write(metrics)
+        log(self._trackers, self._labels, metrics)
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of each table on the disk, as a checkpoint's record has them."""
+        sizes = {"metrics_size": self._metrics.size()}
+        if self.evaluation is not None:
+            sizes["evaluations_size"] = self.evaluation.size()
+        return sizes
+
+    def close(self) -> None:
+        """Close the files and the trackers."""
+        self._metrics.close()
+        if self.evaluation is not None:
+            self.evaluation.close()
+        for tracker in self._trackers:
+            tracker.close()
+
+
+class _Checkpoints:
+    """When checkpoints of a run are due, and writing them.
+
+    Args:
+      root: folder of the checkpoints.
+      schedule: when they are written and how many are kept.
+      runs: what is trained.
+    """
+
+    def __init__(self, root: pathlib.Path, schedule: CheckpointSchedule, runs: Batch):
+        self.root, self._schedule, self._runs = root, schedule, runs
+        every = schedule.every
+        # None: by the clock.
+        self._interval = every and math.ceil(every / runs.config.batch_steps)
+        self._saved_at = time.monotonic()
+
+    def iterations_left(self, done: int) -> float:
+        """Iterations from `done` to the next checkpoint; infinity if by the clock."""
+        if self._interval is None:
+            return math.inf
+        return self._interval - done % self._interval
+
+    def is_due(self, done: int) -> bool:
+        """Whether a checkpoint is to be written after so many iterations."""
+        if self._interval is None:
+            return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
+        return done % self._interval == 0
+
+    def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
+        """Write a checkpoint, and delete those that are not kept."""
+        checkpoint.write(self.root, done, self._runs.trim(states), record)
+        checkpoint.prune(self.root, self._schedule.keep)
+        self._saved_at = time.monotonic()
 
 
 def _restored(
@@ -107,7 +203,6 @@ def drive(
     evaluation_schedule: EvaluationSchedule | None = None,
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
-    until: int | None = None,
 ) -> Outcome:
     """Train to the end, from the newest whole checkpoint in the folder if it has one.
 
@@ -121,31 +216,26 @@ def drive(
       evaluation_schedule: of evaluations on the way; None for none.
       steps_before: environment steps that `progress` has counted already.
       trackers: given the metrics too, and closed.
-      until: pause after so many iterations; a checkpoint is written then.
 
     Raises:
       Interrupted: after the checkpoint that an interruption asks for.
       InputError: the checkpoint is of another state, or a table is damaged.
       OSError: the folder can't be written, or the disk is full.
     """
-    config, root = runs.config, folder / "checkpoints"
-    last = config.num_iterations if until is None else until
+    config, last = runs.config, runs.config.num_iterations
     steps_of = lambda done: done * config.batch_steps * runs.num_members
-    states, first, record = _restored(runs, root, progress)
-    evaluation = None
+    checkpoints = _Checkpoints(folder / "checkpoints", schedule, runs)
+    states, first, record = _restored(runs, checkpoints.root, progress)
     with command_line.input_checked():
-        path = folder / "metrics.csv"
-        writer = metrics_files.MetricsWriter(path, labels, _size(path, record))
-        if evaluation_schedule is not None:
-            path = folder / "evaluations.csv"
-            evaluation = PeriodicEvaluation(
-                runs,
-                evaluation_schedule,
-                path,
-                labels=labels,
-                size=_size(path, record),
-                following=trackers,
-            )
+        tables = _Tables(
+            runs,
+            folder,
+            labels,
+            evaluation_schedule=evaluation_schedule,
+            trackers=trackers,
+            record=record,
+        )
+    evaluation = tables.evaluation
 
     started = time.monotonic()
     if first < last:
@@ -154,67 +244,54 @@ def drive(
     compile_seconds = time.monotonic() - started
 
     progress.phase("training", steps_before + steps_of(first))
-    saved_at = started = time.monotonic()
-    done, pace = first, math.inf
-    recent: list[np.ndarray] = []
-    # Of the evaluation of the states as they are now.
+    started = time.monotonic()
+    done, seconds_of_one = first, math.inf
+    # Since the last checkpoint, and of the states as they are now.
+    returns: list[np.ndarray] = []
     evaluated: float | None = None
-    every = schedule.every and math.ceil(schedule.every / config.batch_steps)
 
     def save() -> None:
-        record = {"metrics_size": writer.size(), "score": _mean(recent)}
-        if evaluation is not None:
-            # Where policies are evaluated, one that was not has no score.
-            record |= {"evaluations_size": evaluation.size(), "score": evaluated}
+        # Where policies are evaluated, one that was not has no score.
+        score = _mean(returns) if evaluation is None else evaluated
         with progress.aside("saving a checkpoint"):
-            checkpoint.write(root, done, runs.trim(states), record)
-            checkpoint.prune(root, schedule.keep)
+            checkpoints.save(done, states, tables.sizes() | {"score": score})
 
     while done < last and interruption.signal is None:
-        counts = [runs.chunk, last - done]
-        counts.append(max(1, int(_SECONDS_BETWEEN_LOOKS / pace)))
-        if every is not None:
-            counts.append(every - done % every)
-        if evaluation is not None:
-            counts.append(evaluation.iterations_left(done))
-        count = min(counts)
-        looked = time.monotonic()
-        states, metrics = runs.train(advance, states, done, count)
-        pace = (time.monotonic() - looked) / count
-        done += count
-        writer.write(metrics)
-        log(trackers, labels, metrics)
-        recent.append(metrics["episode_return"])
+        count = min(
+            runs.chunk,
+            last - done,
+            max(1, int(_SECONDS_OF_A_CHUNK / seconds_of_one)),
+            checkpoints.iterations_left(done),
+            math.inf if evaluation is None else evaluation.iterations_left(done),
+        )
+        chunk_started = time.monotonic()
+        states, metrics = runs.train(advance, states, done, int(count))
+        seconds_of_one = (time.monotonic() - chunk_started) / count
+        done += int(count)
+        tables.write(metrics)
+        returns.append(metrics["episode_return"])
         progress.update(steps_before + steps_of(done), metrics["episode_return"])
-        if every is None:
-            due = time.monotonic() - saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        else:
-            due = done % every == 0
-        evaluated = None
+        due, evaluated = checkpoints.is_due(done), None
         if evaluation is not None and evaluation.is_due(done):
             with progress.aside("evaluating the policies"):
                 evaluated = evaluation.score(states, done)
-            due |= evaluated > checkpoint.best_score(root)
+            due |= evaluated > checkpoint.best_score(checkpoints.root)
         if due:
             save()
-            saved_at, recent = time.monotonic(), []
+            returns = []
     train_seconds = time.monotonic() - started
     save()
-    writer.close()
-    if evaluation is not None:
-        evaluation.close()
-        train_seconds -= evaluation.seconds
     with progress.aside("closing the trackers"):
-        for tracker in trackers:
-            tracker.close()
+        tables.close()
     if interruption.signal is not None and done < last:
         raise Interrupted(interruption.signal)
+    evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
         states=runs.trim(states),
         new_steps=steps_of(done - first),
         compile_seconds=compile_seconds,
-        train_seconds=train_seconds,
-        evaluation_seconds=None if evaluation is None else evaluation.seconds,
+        train_seconds=train_seconds - (evaluation_seconds or 0.0),
+        evaluation_seconds=evaluation_seconds,
     )
 
 

@@ -1,6 +1,7 @@
 """Many runs in one program: vmapped, and sharded over devices."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -19,44 +20,123 @@ def member(states: Any, index: int) -> Any:
     return jax.tree.map(lambda x: x[index], states)
 
 
+def init_member(
+    env: Any, config: Config, seed: jax.Array, hyperparameters: Hyperparameters
+) -> train.TrainState:
+    """The first state of a member. Its key is of its seed number alone."""
+    return train.init(env, config, jax.random.key(seed), hyperparameters)
+
+
+def advance_members(
+    env: Any, config: Config, states: Any, num_iterations: jax.Array
+) -> tuple[Any, train.Metrics]:
+    """Train members side by side for at most `chunk_size(config)` iterations.
+
+    Args:
+      env: one environment.
+      config: of all members.
+      states: (members, ...) each leaf.
+      num_iterations: int32 (), how many.
+
+    Returns:
+      the states after them, and metrics (members, chunk), of which the first
+      `num_iterations` are written and the others NaN.
+    """
+    # Jitted, it is traced once for the shapes and the loop: seconds less.
+    step = jax.jit(jax.vmap(lambda state: train.iterate(env, config, state)))
+    chunk = chunk_size(config)
+    metrics = jax.tree.map(
+        lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype),
+        jax.eval_shape(step, states)[1],
+    )
+
+    def body(index: jax.Array, carry: Any) -> Any:
+        states, metrics = carry
+        states, new = step(states)
+        write = lambda all_, one: jax.lax.dynamic_update_index_in_dim(
+            all_, one, index, 1
+        )
+        return states, jax.tree.map(write, metrics, new)
+
+    return jax.lax.fori_loop(0, num_iterations, body, (states, metrics))
+
+
+def chunk_size(config: Config) -> int:
+    """Iterations between two looks at a run: about 50 looks, 100 iterations at most."""
+    return max(1, min(100, config.num_iterations // 50))
+
+
 @dataclasses.dataclass(frozen=True)
 class Batch:
-    """Functions that train many members, each a seed with its hyperparameters.
+    """Members that train in one program, each a seed with its hyperparameters.
+
+    Arrays of all members are padded to a multiple of the devices: (padded, ...).
 
     Attributes:
       env: one environment.
-      seeds: absolute seed number of each member.
       config: what runs.
-      chunk: most iterations in one call of `advance`.
-      init: () -> states, (padded, ...) each leaf.
-      advance: (states, num_iterations) -> states, metrics (padded, chunk), of which
-        the first `num_iterations` are written. Takes the states' memory.
-      init_members: what `init` does, for other members of the same number.
-      compiled: `advance`, compiled for such states; compiles once.
+      seeds: absolute seed number of each member.
+      hyperparameters: of each member.
       devices: what the members are sharded over.
-      sharding: of the states.
     """
 
     env: Any
-    seeds: Sequence[int]
     config: Config
-    chunk: int
-    init: Callable[[], Any]
-    advance: Callable[[Any, Any], Any]
-    init_members: Callable[[Sequence[int], Sequence[Hyperparameters]], Any]
-    compiled: Callable[[Any], Callable[[Any, Any], Any]]
+    seeds: Sequence[int]
+    hyperparameters: Sequence[Hyperparameters]
     devices: Sequence[jax.Device]
-    sharding: NamedSharding
 
     @property
     def num_members(self) -> int:
-        """How many are asked for; arrays are padded to a multiple of the devices."""
+        """How many members there are, without the padding."""
         return len(self.seeds)
+
+    @property
+    def chunk(self) -> int:
+        """Most iterations in one call of `advance`."""
+        return chunk_size(self.config)
 
     @property
     def device_kind(self) -> str:
         """How many devices of which kind: "2 x cpu"."""
         return f"{len(self.devices)} x {self.devices[0].device_kind}"
+
+    @functools.cached_property
+    def sharding(self) -> NamedSharding:
+        """Of the states: each device has its share of the members."""
+        return NamedSharding(Mesh(np.array(self.devices), ("members",)), P("members"))
+
+    def _shard(self, function: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
+        # Nothing passes between the members, so nothing is to be checked.
+        return jax.shard_map(
+            function,
+            mesh=self.sharding.mesh,
+            in_specs=in_specs,
+            out_specs=P("members"),
+            check_vma=False,
+        )
+
+    def init(self) -> Any:
+        """The first states of all members, (padded, ...) each leaf."""
+        pad = lambda values: [*values, *[values[-1]] * self._padding]
+        init_one = lambda seed, hyperparameters: init_member(
+            self.env, self.config, seed, hyperparameters
+        )
+        init = jax.jit(
+            self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
+        )
+        return init(
+            np.array(pad(self.seeds), np.uint32),
+            jax.tree.map(
+                lambda *x: np.array(x, np.float32), *pad(self.hyperparameters)
+            ),
+        )
+
+    @functools.cached_property
+    def advance(self) -> Any:
+        """`advance_members`, jitted and sharded: it takes the states' memory."""
+        advance = functools.partial(advance_members, self.env, self.config)
+        return jax.jit(self._shard(advance, (P("members"), P())), donate_argnums=0)
 
     def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
         """The states to start from, and `advance`, compiled.
@@ -66,36 +146,19 @@ class Batch:
         """
         states = self.init() if states is None else self.place(states)
         states = jax.block_until_ready(states)
-        return states, self.compiled(states)
-
-    def of(
-        self, seeds: Sequence[int], hyperparameters: Sequence[Hyperparameters]
-    ) -> "Batch":
-        """Other members, as many, for the same compiled program."""
-        init = lambda: self.init_members(seeds, hyperparameters)
-        return dataclasses.replace(self, init=init, seeds=seeds)
+        return states, self.advance.lower(states, np.int32(0)).compile()
 
     def of_members(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """A function of one member's arrays, for all members: sharded as in training.
 
         Compiles when it is first called. Takes and gives padded arrays, (padded, ...).
         """
-        mesh, spec = self.sharding.mesh, self.sharding.spec
-        # Nothing passes between the members, so nothing is to be checked.
-        return jax.jit(
-            jax.shard_map(
-                jax.vmap(function),
-                mesh=mesh,
-                in_specs=spec,
-                out_specs=spec,
-                check_vma=False,
-            )
-        )
+        return jax.jit(self._shard(jax.vmap(function), P("members")))
 
     def train(
         self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
-        """Some iterations, no more than a chunk.
+        """Train for some iterations, no more than a chunk.
 
         Args:
           advance: compiled.
@@ -117,20 +180,18 @@ class Batch:
         metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
         return states, metrics
 
+    @property
+    def _padding(self) -> int:
+        return -self.num_members % len(self.devices)
+
     def place(self, states: Any) -> Any:
         """States of the members, (members, ...), padded and on their devices."""
-        padding = -self.num_members % len(self.devices)
-        pad = lambda x: jnp.concatenate([x, *[x[-1:]] * padding])
+        pad = lambda x: jnp.concatenate([x, *[x[-1:]] * self._padding])
         return jax.device_put(jax.tree.map(pad, states), self.sharding)
 
     def trim(self, states: Any) -> Any:
         """States without the padding: (members, ...)."""
         return jax.tree.map(lambda x: x[: self.num_members], states)
-
-
-def chunk_size(config: Config) -> int:
-    """Iterations between two looks at a run: about 50 looks, 100 iterations at most."""
-    return max(1, min(100, config.num_iterations // 50))
 
 
 def make_batch(
@@ -154,69 +215,10 @@ def make_batch(
       devices: default all; no more of them are used than there are members.
 
     Raises:
-      ValueError: a bad configuration.
+      ValueError: the configuration is bad.
     """
     train.check(env, config)
     if hyperparameters is None:
         hyperparameters = [config.hyperparameters] * len(seeds)
     devices = list(devices or jax.devices())[: len(seeds)]
-    padding = -len(seeds) % len(devices)
-    pad = lambda values: [*values, *([values[-1]] * padding)]
-    arrays = lambda seeds, hyperparameters: (
-        np.array(pad(seeds), np.uint32),
-        jax.tree.map(lambda *x: np.array(x, np.float32), *pad(hyperparameters)),
-    )
-    chunk = chunk_size(config)
-    mesh = Mesh(np.array(devices), ("members",))
-
-    def init_one(member: tuple[jax.Array, Hyperparameters]) -> train.TrainState:
-        seed, hyperparameters = member
-        return train.init(env, config, jax.random.key(seed), hyperparameters)
-
-    def advance(states: Any, num_iterations: jax.Array) -> Any:
-        # Jitted, it is traced once for the shapes and the loop: seconds less.
-        step = jax.jit(jax.vmap(lambda state: train.iterate(env, config, state)))
-        metrics = jax.eval_shape(step, states)[1]
-        metrics = jax.tree.map(
-            lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype), metrics
-        )
-
-        def body(index: jax.Array, carry: Any) -> Any:
-            states, metrics = carry
-            states, new = step(states)
-            write = lambda all_, one: jax.lax.dynamic_update_index_in_dim(
-                all_, one, index, 1
-            )
-            return states, jax.tree.map(write, metrics, new)
-
-        return jax.lax.fori_loop(0, num_iterations, body, (states, metrics))
-
-    # No collective in the loop: each device trains its share of the members alone.
-    spec = P("members")
-    shard = lambda function, in_specs: jax.shard_map(
-        function, mesh=mesh, in_specs=in_specs, out_specs=spec, check_vma=False
-    )
-    init = jax.jit(
-        shard(jax.vmap(init_one), (spec,)), in_shardings=NamedSharding(mesh, spec)
-    )
-    init_members = lambda seeds, hyperparameters: init(arrays(seeds, hyperparameters))
-    jitted = jax.jit(shard(advance, (spec, P())), donate_argnums=0)
-    programs: list[Callable[[Any, Any], Any]] = []
-
-    def compiled(states: Any) -> Callable[[Any, Any], Any]:
-        if not programs:
-            programs.append(jitted.lower(states, np.int32(0)).compile())
-        return programs[0]
-
-    return Batch(
-        env=env,
-        seeds=seeds,
-        config=config,
-        chunk=chunk,
-        init=lambda: init_members(seeds, hyperparameters),
-        advance=jitted,
-        init_members=init_members,
-        compiled=compiled,
-        devices=devices,
-        sharding=NamedSharding(mesh, spec),
-    )
+    return Batch(env, config, seeds, hyperparameters, devices)
