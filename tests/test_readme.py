@@ -1,4 +1,4 @@
-"""What the README tells people to type works."""
+"""What README and documentation tell people to type works."""
 
 import itertools
 import os
@@ -13,18 +13,19 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import evaluate, halving, merge, plot, render, run, sweep
+from gasil_jax import evaluate, merge, plot, render, run, sweep
 from gasil_jax import export_minari as export
 from gasil_jax.host import command_line, policy_file, run_options
 from gasil_jax.sweeps import saved_states, shards
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
-DOCUMENTS = (README, *sorted((README.parent / "docs").glob("*.md")))
+DOCS = README.parent / "docs"
+DOCUMENTS = (README, *sorted(DOCS.glob("*.md")))
 
 PROGRAMS = {
     f"gasil_jax.{module.__name__.split('.')[-1]}": module
-    for module in (run, sweep, halving, merge, evaluate, plot, render, export)
+    for module in (run, sweep, merge, evaluate, plot, render, export)
 }
 SMALL = (
     *("--total-steps", "256", "--batch-steps", "128", "--num-envs", "2"),
@@ -32,12 +33,18 @@ SMALL = (
     *("--discriminator-hidden-sizes", "8"),
 )
 #: What stands for an option's value when a command is run.
-TOY = {"--env": "point_mass", "--seeds": "2", "--episodes": "2"}
+TOY = {
+    "--env": "point_mass",
+    "--seeds": "2",
+    "--episodes": "2",
+    "--evaluate-every": "128",
+}
 #: In a command that needs a run of a locomotion task.
 LOCOMOTION = ("--gymnasium", ".html")
 #: How commands begin that are not run here, and why.
 NOT_RUN = {
     "python -m pip install": "it changes the environment; .ci/run does it",
+    "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
     "and tests/test_ray.py train shards",
@@ -48,19 +55,25 @@ NOT_RUN = {
 def commands():
     """Lines that start with $, those that end with a backslash joined, once each.
 
-    Without the variables that are set before a command.
+    Without the variables that are set before a command; && divides a line.
     """
     text = "\n".join(path.read_text() for path in DOCUMENTS)
     found = {}
     for block in re.findall(r"```console\n(.*?)```", text, re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
-                line = re.sub(r"^[A-Z_]+=\S+ ", "", line[2:])
-                found[shlex.join(shlex.split(line, comments=True))] = None
+                for command in line[2:].split(" && "):
+                    command = re.sub(r"^[A-Z_]+=\S+ ", "", command)
+                    found[shlex.join(shlex.split(command, comments=True))] = None
     return list(found)
 
 
 OURS = [line for line in commands() if line.startswith("python -m gasil_jax")]
+FIGURES = [
+    line
+    for line in commands()
+    if line.startswith("python -m experiments") and "benchmark" not in line
+]
 
 
 @pytest.mark.parametrize("line", OURS)
@@ -72,12 +85,21 @@ def test_a_command_is_understood(line):
 
 def test_other_commands_are_named_with_a_reason():
     for line in commands():
-        assert line in OURS or any(map(line.startswith, NOT_RUN)), line
+        runs = line in OURS or line in FIGURES
+        assert runs or any(map(line.startswith, NOT_RUN)), line
     for start in NOT_RUN:
         assert any(line.startswith(start) for line in commands()), start
 
 
-SCALING = (README.parent / "docs" / "scaling.md").read_text()
+@pytest.mark.parametrize("line", FIGURES)
+def test_a_figure_is_there(line, capsys):
+    from experiments import __main__ as experiments
+
+    assert experiments.main([*shlex.split(line)[3:], "--list"]) == 0
+    assert "runs are missing" in capsys.readouterr().out
+
+
+SCALING = (DOCS / "scaling.md").read_text()
 
 
 def calls_of(script, folder, **variables):
@@ -189,8 +211,10 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper):
 
 
 def test_options_in_the_table_exist():
-    fields = re.findall(r"^\| `(--[a-z-]+)", TEXT, re.MULTILINE)
-    assert len(fields) > 8
+    table = (DOCS / "running.md").read_text()
+    rows = re.findall(r"^\| (`--.*?) \|", table, re.MULTILINE)
+    fields = [field for row in rows for field in re.findall(r"--[a-z-]+", row)]
+    assert len(fields) > 18
     known = command_line.parse(run_options.Options, ["--env", "hopper"], "x")
     names = {
         name
@@ -201,12 +225,16 @@ def test_options_in_the_table_exist():
         assert field[2:].replace("-", "_") in names, field
 
 
-def test_the_python_runs(tmp_path, monkeypatch):
-    """On the point mass, and for some thousand steps."""
-    blocks = re.findall(r"```python\n(.*?)```", TEXT, re.DOTALL)
-    assert len(blocks) >= 2
-    env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config()
+def test_the_agents_of_the_table_are_all_that_there_are():
+    table = TEXT[TEXT.index("| `--agent` |") :].split("\n\n")[0]
+    agents = re.findall(r"^\| `([a-z+]+)` \|", table, re.MULTILINE)
+    assert sorted(agents) == sorted(gasil_jax.agents())
+
+
+@pytest.fixture
+def finished_hopper(tmp_path, monkeypatch):
+    """The folder runs/hopper with policies, in the working directory."""
+    env, config = gasil_jax.make_env("point_mass"), gasil_jax.Config()
     states = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))(
         np.arange(4, dtype=np.uint32)
     )
@@ -214,14 +242,83 @@ def test_the_python_runs(tmp_path, monkeypatch):
     folder = pathlib.Path("runs", "hopper")
     folder.mkdir(parents=True)
     policy_file.save(folder / "policy.npz", states, env, range(4), np.zeros(4))
+
+
+def run_python(path):
+    """Run a document's Python on the point mass, for some thousand steps; the names."""
+    blocks = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+    assert blocks
+    env = gasil_jax.make_env("point_mass")
     names = {"observation": np.zeros(env.observation_size, np.float32)}
+    train = "make_train(env, config.replace(total_steps=4096))"
+    small = {
+        r'"(walker2d|hopper)", ': '"point_mass", ',
+        "1_000_000": "4096",
+        r"make_train\(env, config\)": train,
+        r"key\(0\), \d+\)": "key(0), 2)",
+        r"n_trials=\d+": "n_trials=2",
+    }
     for block in blocks:
-        small = block.replace('"walker2d"', '"point_mass"')
-        small = small.replace("1_000_000", "4096").replace("key(0), 10)", "key(0), 2)")
-        exec(compile(small, str(README), "exec"), names)
+        for pattern, value in small.items():
+            block = re.sub(pattern, value, block)
+        exec(compile(block, str(path), "exec"), names)
+    return names
+
+
+def test_the_python_of_the_readme_runs(finished_hopper):
+    names = run_python(README)
+    assert names["returns"].shape == (4, 2, 2)  # alphas, seeds, iterations
+    assert names["state"].iteration.shape == ()
+    assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+
+
+def test_the_python_of_the_documentation_runs(finished_hopper):
+    names = run_python(DOCS / "python.md")
     assert names["metrics"]["episode_return"].shape == (4, 2)  # alphas, iterations
     assert names["state"].iteration.shape == (2,)
+    assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+
+
+def test_the_search_with_optuna_runs():
+    pytest.importorskip("optuna")
+    study = run_python(DOCS / "scaling.md")["study"]
+    assert len(study.trials) == 2
+    assert np.isfinite(study.best_value)
+    assert 0.01 <= study.best_params["alpha"] <= 1.0
+
+
+def test_the_caption_of_the_film_is_what_the_film_says():
+    """Its comment was written with it."""
+    from PIL import Image
+
+    film = DOCS / "walker2d_delayed.gif"
+    assert film.stat().st_size < 2_000_000
+    with Image.open(film) as image:
+        assert image.n_frames > 50
+        comment = image.info["comment"].decode()
+    assert re.search(r"return \d+", comment)
+    assert comment in " ".join(TEXT.split())
+
+
+def test_every_page_and_plot_can_be_reached():
+    """Pages of results from the navigation, their plots from a page."""
+    results = README.parent / "experiments" / "results"
+    navigation = (README.parent / "mkdocs.yml").read_text()
+    pages = [*DOCS.glob("*.md"), *results.glob("*.md")]
+    for page in pages:
+        below = "results/" if page.parent == results else ""
+        assert f": {below}{page.name}\n" in navigation, page.name
+    text = "".join(page.read_text() for page in pages)
+    for plot_ in results.glob("*.png"):
+        assert re.search(rf"\]\((results/)?{plot_.name}\)", text), plot_.name
+
+
+def test_the_links_of_the_readme_lead_somewhere():
+    targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", TEXT)
+    assert len(targets) > 15
+    for target in targets:
+        assert (README.parent / target).exists(), target
 
 
 def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
@@ -240,7 +337,7 @@ def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
 def test_the_documented_agent_and_task_train(tmp_path, monkeypatch, capsys):
     from gasil_jax.imitation import AGENTS
 
-    text = (README.parent / "docs" / "extending.md").read_text()
+    text = (DOCS / "extending.md").read_text()
     agent, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     monkeypatch.setitem(AGENTS, "halved", None)  # and away again
     names = {}

@@ -212,6 +212,11 @@ def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
     text = summary.README.read_text()
     assert made.fill_blocks(text) == text
     assert text.count("<!-- begin ") == text.count("<!-- end -->") > 0
+    # Said as long as it is so.
+    guide = summary.README.parent / "docs" / "reproducing.md"
+    for document in (text, guide.read_text()):
+        told = "reset together, which" in " ".join(document.split())
+        assert told == (report.IN_STEP in made.text())
 
 
 def test_seeds_in_words():
