@@ -5,7 +5,7 @@ any leaf of `Hyperparameters`, shard it over devices, call it from other JAX cod
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import jax
@@ -150,17 +150,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
 
     # Sample policy trajectories.
-    environments, batch = rollout.collect(
-        env,
-        lambda observation: policy(
-            state.actor_critic.policy.params,
-            normalization.normalize(state.normalizer, observation),
-        ),
-        state.environments,
-        act_key,
-        num_steps=config.num_steps,
-        max_episode_steps=max_episode_steps(env, config),
-        gamma=hyperparameters.gamma,
+    environments, batch = sample_trajectories(
+        env, config, state, act_key, policy=policy, gamma=hyperparameters.gamma
     )
     # Update the good trajectory buffer.
     history, buffer = remember(
@@ -231,6 +222,42 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     return state, merge_metrics(
         config.agent, metrics, imitation_metrics, policy_metrics
+    )
+
+
+def sample_trajectories(
+    env: Any,
+    config: Config,
+    state: TrainState,
+    key: jax.Array,
+    *,
+    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    gamma: jax.Array | float,
+) -> tuple[rollout.EnvironmentStates, Rollout]:
+    """Act in the environments for one batch with the policy as it is.
+
+    Args:
+      env: one environment.
+      config: sizes of the batch.
+      state: with the policy and the running episodes.
+      key: consumed.
+      policy: (params, normalized observation) -> mean, log standard deviation.
+      gamma: discount of the episodes' returns.
+
+    Returns:
+      the running episodes after the batch, and the batch, (time, env, ...).
+    """
+    return rollout.collect(
+        env,
+        lambda observation: policy(
+            state.actor_critic.policy.params,
+            normalization.normalize(state.normalizer, observation),
+        ),
+        state.environments,
+        key,
+        num_steps=config.num_steps,
+        max_episode_steps=max_episode_steps(env, config),
+        gamma=gamma,
     )
 
 

@@ -96,3 +96,14 @@ def test_a_step_clips_the_gradients_norm_and_is_adams():
         corrected = np.sqrt(square / (1 - 0.999**step)) + 1e-5
         expected = expected - 0.1 * mean / (1 - 0.9**step) / corrected
         np.testing.assert_allclose(network.params["w"], expected, rtol=1e-5)
+
+
+def test_each_stream_is_standardized_for_itself():
+    rng = np.random.default_rng(2)
+    advantage = rng.normal(size=(7, 3, 2)) * np.array([5.0, 0.1]) + np.array([3.0, -2])
+    expected = np.empty_like(advantage)
+    for i in range(2):
+        stream = advantage[..., i]
+        expected[..., i] = (stream - stream.mean()) / (stream.std() + 1e-8)
+    result = ppo.standardize(jnp.asarray(advantage, jnp.float32))
+    np.testing.assert_allclose(result, expected, rtol=1e-4, atol=1e-5)

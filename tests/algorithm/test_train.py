@@ -10,6 +10,7 @@ import pytest
 
 import gasil_jax
 from gasil_jax import rollout
+from gasil_jax import train as training
 from gasil_jax.imitation import AGENTS
 
 SMALL = gasil_jax.Config(
@@ -205,3 +206,21 @@ def test_two_streams_of_the_same_reward_are_that_reward():
     (kernel, *_) = jax.tree.leaves(second.params)
     (other, *_) = jax.tree.leaves(first.params)
     assert not np.allclose(kernel, other)
+
+
+def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
+    old = {"weights": jnp.array([1.0, 2.0]), "count": jnp.int32(3)}
+    fine = {"weights": jnp.array([5.0, 6.0]), "count": jnp.int32(4)}
+    healthy, kept = training.keep_if_finite(fine, old)
+    assert healthy and kept["weights"].tolist() == [5.0, 6.0] and kept["count"] == 4
+    bad = {"weights": jnp.array([5.0, jnp.inf]), "count": jnp.int32(4)}
+    healthy, kept = training.keep_if_finite(bad, old)
+    assert not healthy and kept["weights"].tolist() == [1.0, 2.0] and kept["count"] == 3
+
+
+def test_metrics_of_one_name_are_refused():
+    merged = training.merge_metrics("ppo", {"a": jnp.int32(1)}, {"b": jnp.float32(2)})
+    assert merged == {"a": 1.0, "b": 2.0}
+    assert all(value.dtype == jnp.float32 for value in merged.values())
+    with pytest.raises(ValueError, match="agent 'ppo' have names that others have: a"):
+        training.merge_metrics("ppo", {"a": jnp.int32(1)}, {"a": jnp.float32(2)})
