@@ -192,7 +192,7 @@ class Config:
         return math.ceil(self.total_steps / self.batch_steps)
 
     def replace(self, **changes: Any) -> "Config":
-        """Return a copy with changed fields, its own or those of its hyperparameters."""
+        """Return a copy with changed fields, including those of `hyperparameters`."""
         own = {field.name for field in dataclasses.fields(self)}
         swept = {name: changes.pop(name) for name in set(changes) - own}
         if swept:
