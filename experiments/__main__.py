@@ -135,7 +135,10 @@ def _figure(name: str, options: Options) -> None:
             print(f"  {program}")
         return
     setup = engine.Setup(
-        *(work, options.physics, options.devices, options.evaluate),
+        work,
+        options.physics,
+        options.devices,
+        options.evaluate,
         source=engine.source(options.commit),
     )
     while missing and not options.report:

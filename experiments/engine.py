@@ -148,7 +148,8 @@ def train(program: Program, setup: Setup) -> dict[Run, Record]:
     """
     run, count = program.runs[0], len(program.runs)
     settings = Settings(
-        *(run.reward_delay, run.obs_noise),
+        run.reward_delay,
+        run.obs_noise,
         physics=program.physics,
         integrator=run.integrator,
     )

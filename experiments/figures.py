@@ -361,7 +361,10 @@ FIGURES: Mapping[str, Figure] = {
         {
             name_of(name, delay, *(["normalized"] if normalized else [])): {
                 str(value): tuned(
-                    *("walker2d", "ppo+gasil", delay, normalized),
+                    "walker2d",
+                    "ppo+gasil",
+                    delay,
+                    normalized,
                     changes={name: value},
                 )
                 for value in values

@@ -381,9 +381,12 @@ class Page:
         """Starting ages drawn and not, for each agent and number of environments."""
         rows = [
             [
-                *(panel, agent, str(count)),
+                panel,
+                agent,
+                str(count),
                 *(self.final(panel, name) for name in names),
-                *(str(comparison), comparison.verdict),
+                str(comparison),
+                comparison.verdict,
             ]
             for panel in self.results
             for agent in PAIR
@@ -574,7 +577,9 @@ def _draw_over(page: Page, panel: str, axes: Any) -> None:
         # Side by side, or one interval would hide another.
         steps = np.array(complete) * 1.06 ** (i - 1.5)
         axes.errorbar(
-            *(steps, middle, [middle - low, high - middle]),
+            steps,
+            middle,
+            [middle - low, high - middle],
             color=plotting.COLORS[PAIR.index(agent)],
             linestyle="-" if drawn else "--",
             **{"marker": "o", "markersize": 3, "capsize": 2},

@@ -120,8 +120,8 @@ def test_runs_side_by_side_are_those_of_one_program(trained, tmp_path):
     assert "agent 'pppo' is unknown" in log.read_text()
     assert store.missing([unknown, *RUNS[:2]]) == [unknown]
     for each in RUNS[:2]:
-        mine, other = store[each].episode_return, records[each].episode_return
-        np.testing.assert_allclose(mine, other, rtol=2e-3)
+        trained, other = store[each].episode_return, records[each].episode_return
+        np.testing.assert_allclose(trained, other, rtol=2e-3)
 
 
 def test_a_signal_ends_all_processes_and_they_have_saved(tmp_path):
