@@ -31,10 +31,10 @@ class Curve:
     """Seeds of one agent on one task.
 
     Attributes:
-      search: names both, and has chosen the hyperparameters.
-      seeds: how many, from 0.
-      total_steps: of a seed.
-      obs_noise: of the environment, where it is not the search's.
+      search: the search that chose the hyperparameters, for this agent and task.
+      seeds: number of seeds, from seed 0 on.
+      total_steps: environment steps per seed.
+      obs_noise: the environment's noise, if it is not the search's.
       preset: whether the tuned preset has the hyperparameters instead.
       changes: of these, and of other fields of `Config`.
     """
@@ -138,7 +138,7 @@ def difference(panel: str, ours: str, other: str) -> Terms:
 
 
 def name_of(env: str, reward_delay: int = 1, *more: str) -> str:
-    """The name of a panel: hopper-delayed."""
+    """Return the name of a panel, such as hopper-delayed."""
     return "-".join([env, *(["delayed"] if reward_delay > 1 else []), *more])
 
 
@@ -265,7 +265,7 @@ AGES = {True: "drawn", False: "not-drawn"}
 
 
 def geometry_curve(agent: str, drawn: bool, num_envs: int) -> str:
-    """The name of a curve of the figure on batch geometry."""
+    """Return the name of a curve of the figure on batch geometry."""
     return f"{agent}-{num_envs}-{AGES[drawn]}"
 
 

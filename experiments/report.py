@@ -147,14 +147,14 @@ def interval(scores: np.ndarray) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """What the store has of a curve: some of its seeds, or all."""
+    """The stored runs of a curve, of all or only a part of its seeds."""
 
     curve: Curve
     point: Mapping[str, Any]
@@ -163,7 +163,7 @@ class Results:
 
     @property
     def complete(self) -> bool:
-        """Whether all its seeds are there."""
+        """Whether the runs of all seeds are stored."""
         return len(self.runs) == self.curve.seeds
 
     @property
@@ -319,18 +319,20 @@ class Page:
             line = f"- {favourite} against {other}: {counts} of {len(complete)}"
             # A ratio has no meaning where a seed learned nothing or lost.
             both = lambda panel: (scores[panel, favourite], scores[panel, other])  # noqa: B023
-            some = [p for p in complete if all((side > 0).all() for side in both(p))]
-            if len(some) > 1:
-                which = f"the {len(some)} where every seed's return is above 0"
-                which = "all of them" if len(some) == len(complete) else which
-                line += f"; over {which} {together(scores, some, favourite, other)}"
+            positive = [
+                p for p in complete if all((side > 0).all() for side in both(p))
+            ]
+            if len(positive) > 1:
+                which = f"the {len(positive)} where every seed's return is above 0"
+                which = "all of them" if len(positive) == len(complete) else which
+                line += f"; over {which} {together(scores, positive, favourite, other)}"
             lines.append(f"{line}.")
         return "\n".join(lines)
 
     def added(self, *panels: str) -> str:
         """The tally of the seeds after the tenth alone."""
-        some = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
-        later = {(panel, label): results.final[10:] for panel, label, results in some}
+        curves = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
+        later = {(panel, label): results.final[10:] for panel, label, results in curves}
         return self.tally(*panels, scores=later)
 
     def best_value(self, panel: str) -> str:
@@ -415,9 +417,9 @@ class Page:
             words = [x for x in ("better", "not clear", "worse") if x in cells]
             counts = ", ".join(f"{word} on {cells.count(word)}" for word in words)
             over_all = [
-                f"{agent} {together(self.scores, some, *pair)}"
+                f"{agent} {together(self.scores, panels, *pair)}"
                 for agent, pair in pairs.items()
-                for some in [
+                for panels in [
                     [
                         panel
                         for panel in self.results
@@ -554,9 +556,10 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
         returns = np.array(
             [np.interp(steps, x.env_steps, x.episode_return) for x in results.records]
         )
-        some = np.isfinite(returns).all(axis=0)
-        if some.any():
-            steps, returns, color = steps[some] / 1e6, returns[:, some], color_of[label]
+        finite = np.isfinite(returns).all(axis=0)
+        if finite.any():
+            color = color_of[label]
+            steps, returns = steps[finite] / 1e6, returns[:, finite]
             low, high = bootstrap_interval(returns, resamples=500)
             axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
             axes.plot(steps, interquartile_mean(returns, 0), color=color, label=label)

@@ -74,13 +74,13 @@ _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
 
 
 def every_point(space: Space) -> tuple[Point, ...]:
-    """All points of a space."""
+    """Return all points of a space."""
     every = itertools.product(*space.values())
     return tuple(dict(zip(space, values, strict=True)) for values in every)
 
 
 def draw(space: Space) -> tuple[Point, ...]:
-    """At most sixteen points of a space of up to five hyperparameters.
+    """Return at most sixteen points of a space of up to five hyperparameters.
 
     All there are, if they are no more. Else an orthogonal array: any two
     hyperparameters have every pair of their values equally often, so that none is
@@ -118,11 +118,11 @@ class Search:
     """A search for an agent's hyperparameters on a task.
 
     Attributes:
-      env: environment's name.
-      agent: agent's name.
-      reward_delay: of the environment.
-      obs_noise: of the environment.
-      normalize_rewards: whether PPO's rewards are.
+      env: name of the environment.
+      agent: name of the agent.
+      reward_delay: the environment's reward delay.
+      obs_noise: the environment's observation noise.
+      normalize_rewards: whether PPO's rewards are normalized.
       after: a search to go on from: hyperparameters that are not `free` are fixed at
         the value whose points did best in it, on average.
       free: what is searched then: all points of these, on two seeds each.
@@ -152,7 +152,7 @@ class Search:
         ).replace(**point)
 
     def runs(self, stage: Stage) -> list[list[Run]]:
-        """The runs of a stage: a list for each point."""
+        """Return the runs of a stage, a list for each point."""
         return [
             [self.run(self.config(point), seed) for seed in stage.seeds]
             for point in stage.points
@@ -235,7 +235,7 @@ def _means(scores: np.ndarray) -> np.ndarray:
 def _by_value(
     name: str, points: Sequence[Point], means: np.ndarray
 ) -> dict[Any, float]:
-    """The mean over the points that have each value of a hyperparameter."""
+    """Return the mean over the points with each value of a hyperparameter."""
     values = np.array([point[name] for point in points])
     return {
         value: float(means[values == value].mean())
@@ -249,13 +249,13 @@ def _best_value(name: str, points: Sequence[Point], means: np.ndarray) -> Any:
 
 
 def point_in_words(point: Point) -> str:
-    """A point as "name value, name value"."""
+    """Return a point as "name value, name value"."""
     words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
     return ", ".join(f"{name} {words(value)}" for name, value in point.items())
 
 
 def table(searches: Mapping[str, Search], store: Store) -> str:
-    """What searches have found: Markdown."""
+    """Return the results of searches as Markdown."""
     head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
     lines = [f"| {' | '.join(head.split('|'))} |", "|---" * 8 + "|"]
     for name, search in searches.items():
