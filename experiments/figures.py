@@ -145,7 +145,7 @@ def name_of(env: str, reward_delay: int = 1, *more: str) -> str:
 def tuned(
     env: str, agent: str, delay: int = 1, normalized: bool = False, **more: Any
 ) -> Curve:
-    """A curve of what the search on its own task has chosen."""
+    """Return a curve with the hyperparameters chosen by the search on its own task."""
     # Noise of any strength has what was found in its middle.
     noise = NOISE if more.get("obs_noise") else 0.0
     return Curve(Search(env, agent, delay, noise, normalized), **more)
@@ -186,7 +186,7 @@ _NOISES = (0.0, 0.05, 0.1, 0.5)
 
 
 def _noise_comparisons() -> Comparisons:
-    """The gap at each noise, and by how much it is more than that without."""
+    """Return comparisons of the gap at each noise, and of its growth with noise."""
     compared: dict[tuple[str, ...], Terms] = {}
     for normalized in _BOTH:
         calm = _noise_panel(0.0, normalized)

@@ -119,7 +119,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
 
 
 def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
-    """By what share one is more than the other over panels alike, and its interval."""
+    """Return by what share one curve exceeds the other over all panels, in words."""
     drawn = [np.log(draws(scores, p, ours) / draws(scores, p, other)) for p in panels]
     mean = lambda panel, curve: interquartile_mean(scores[panel, curve])
     middle = np.mean([np.log(mean(p, ours) / mean(p, other)) for p in panels])
@@ -129,12 +129,12 @@ def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> st
 
 
 def number(value: float) -> str:
-    """A return in words: whole from 100 on."""
+    """Return a score as text, without decimals from 100 on."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
 def in_words(middle: float, low: float, high: float) -> str:
-    """A number and its interval."""
+    """Return a number and its interval as text."""
     return f"{number(middle)} [{number(low)}, {number(high)}]"
 
 
@@ -183,7 +183,7 @@ class Results:
         return np.array([record.final for record in self.records])
 
     def provenance(self) -> str:
-        """What trained its seeds, in words."""
+        """Return physics, versions, devices and commits of the seeds, in words."""
         seeds_of: dict[str, list[int]] = {}
         for run, record in zip(self.runs, self.records, strict=True):
             by = record.provenance
@@ -270,18 +270,18 @@ class Page:
         return markdown_table(head, rows)
 
     def final(self, panel: str, curve: str) -> str:
-        """The final return of a curve."""
+        """Return the final return of a curve as text."""
         return interval(self.scores[panel, curve])
 
     def compared(self, *key: str) -> str:
-        """A comparison in words."""
+        """Return a comparison in words."""
         panel, ours, other, comparison = *key[:3], self.comparisons[key]
         words = {"not clear": "is not clearly different from"}
         phrase = words.get(comparison.verdict, f"is {comparison.verdict} than")
         return f"{ours} {phrase} {other} on {panel} ({comparison})"
 
     def comparisons_list(self) -> str:
-        """Every comparison of the page, a line each."""
+        """Return every comparison of the page, in a line each."""
         lines = []
         for key in self.figure.compared():
             if comparison := self.comparisons.get(key):
@@ -330,18 +330,18 @@ class Page:
         return "\n".join(lines)
 
     def added(self, *panels: str) -> str:
-        """The tally of the seeds after the tenth alone."""
+        """Return the tally of only the seeds after the tenth."""
         curves = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
         later = {(panel, label): results.final[10:] for panel, label, results in curves}
         return self.tally(*panels, scores=later)
 
     def best_value(self, panel: str) -> str:
-        """The curve of a panel with the highest interquartile mean."""
+        """Return the curve of a panel with the highest interquartile mean."""
         mean = lambda label: float(interquartile_mean(self.scores[panel, label]))
         return max(self.figure.panels[panel], key=mean)
 
     def verdict(self, panel: str, ours: str, other: str) -> str:
-        """Of two curves of a panel, in either order."""
+        """Return the comparison of two curves of a panel, in either order."""
         if comparison := self.comparisons.get((panel, ours, other)):
             return comparison.verdict
         verdict = self.comparisons[panel, other, ours].verdict
@@ -474,7 +474,7 @@ class Page:
         )
 
     def text(self) -> str:
-        """The page, Markdown."""
+        """Return the page as Markdown."""
         parts = [f"# {self.figure.title}"]
         if self.in_step and self.figure.over is None:
             parts.append(IN_STEP)
@@ -504,12 +504,12 @@ class Page:
 
 
 def fill(note: str, value: Callable[..., str]) -> str:
-    """A note with its slots, {{NAME ARGUMENTS}}, filled in by `value`."""
+    """Fill the slots of a note, {{NAME ARGUMENTS}}, with what `value` returns."""
     return re.sub(r"{{(.+?)}}", lambda x: value(*shlex.split(x[1])), note)
 
 
 def _colors(curves: Sequence[str]) -> dict[str, Any]:
-    """An agent's is the same in every figure; values in order go from dark to light."""
+    """Return a color for each label: fixed for agents, dark to light for values."""
     import matplotlib
 
     if set(curves) & set(AGENTS):
@@ -521,7 +521,7 @@ def _colors(curves: Sequence[str]) -> dict[str, Any]:
 
 
 def _draw(page: Page) -> Any:
-    """A matplotlib figure with axes for each panel."""
+    """Return a matplotlib figure with axes for each panel."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -577,7 +577,7 @@ def _draw_over(page: Page, panel: str, axes: Any) -> None:
         scores = [page.scores[panel, names[n]] for n in complete]
         middle = np.array([interquartile_mean(x) for x in scores])
         low, high = np.array([bootstrap_interval(x) for x in scores]).T
-        # Side by side, or one interval would hide another.
+        # Shifted sideways, so that no interval hides another.
         steps = np.array(complete) * 1.06 ** (i - 1.5)
         axes.errorbar(
             steps,

@@ -82,9 +82,9 @@ def every_point(space: Space) -> tuple[Point, ...]:
 def draw(space: Space) -> tuple[Point, ...]:
     """Return at most sixteen points of a space of up to five hyperparameters.
 
-    All there are, if they are no more. Else an orthogonal array: any two
-    hyperparameters have every pair of their values equally often, so that none is
-    judged by what it happened to be drawn with.
+    If the space has no more points, these are all of them. Otherwise they are an
+    orthogonal array: any two hyperparameters have every pair of their values equally
+    often, so that no value's score depends on the values it was drawn with.
     """
     if len(every := every_point(space)) <= 16:
         return every
@@ -93,7 +93,7 @@ def draw(space: Space) -> tuple[Point, ...]:
             f"{dict(space)}: at most five hyperparameters of two or four values"
         )
     rng = np.random.default_rng(0)
-    # Which value is which level is left to chance; two levels are one of two values.
+    # Values are assigned to levels at random; each of two values has two levels.
     of_level = {
         name: [values[i % len(values)] for i in rng.permutation(4)]
         for name, values in space.items()
@@ -123,9 +123,9 @@ class Search:
       reward_delay: the environment's reward delay.
       obs_noise: the environment's observation noise.
       normalize_rewards: whether PPO's rewards are normalized.
-      after: a search to go on from: hyperparameters that are not `free` are fixed at
-        the value whose points did best in it, on average.
-      free: what is searched then: all points of these, on two seeds each.
+      after: an earlier search to continue. Hyperparameters that are not `free` are
+        fixed at the value whose points had the best average score in it.
+      free: the hyperparameters to search then: all their points, on two seeds each.
     """
 
     env: str
@@ -138,11 +138,11 @@ class Search:
 
     @property
     def space(self) -> Space:
-        """What its points are drawn from, if it goes on from no other search."""
+        """The space that points are drawn from, if no earlier search is continued."""
         return _OTHER_SPACES.get((self.env, self.agent), SPACES[self.agent])
 
     def config(self, point: Point) -> Config:
-        """The appendix's values with a point's, and our number of environments."""
+        """Return a point's config: its values, our batch and the appendix's values."""
         return Config(
             agent=self.agent,
             total_steps=STEPS.get(self.env, 1_000_000),
@@ -159,7 +159,7 @@ class Search:
         ]
 
     def run(self, config: Config, seed: int, **changes: Any) -> Run:
-        """A run on its task."""
+        """Return a run on the search's task."""
         fields = {
             "reward_delay": self.reward_delay,
             "obs_noise": self.obs_noise,
@@ -168,9 +168,9 @@ class Search:
         return Run(self.env, config, seed, **{**fields, **changes})
 
     def scores(self, stage: Stage, store: Store) -> np.ndarray | None:
-        """Mean return over the last fifth of training, (points, seeds).
+        """Return the mean return over the last fifth of training, (points, seeds).
 
-        None before all runs of the stage are in the store.
+        The result is None if the store lacks a run of the stage.
         """
         runs = self.runs(stage)
         if store.missing(run for of_point in runs for run in of_point):
@@ -178,7 +178,7 @@ class Search:
         return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
 
     def first(self, store: Store) -> Stage | None:
-        """The first stage; None before that of the search it goes on from has ended."""
+        """Return the first stage, or None if an earlier search must end first."""
         if self.after is None:
             points = draw(self.space)
             seeds = _RUNS_OF.get(self.env, _RUNS) // len(points)
@@ -196,7 +196,7 @@ class Search:
         return Stage(points, range(_FIRST_SEED, _FIRST_SEED + seeds))
 
     def stages(self, store: Store) -> list[Stage]:
-        """Those whose points are settled by what is in the store."""
+        """Return the stages whose points are known from the runs in the store."""
         first = self.first(store)
         if first is None:
             return []
@@ -208,7 +208,7 @@ class Search:
         return [first, Stage(tuple(first.points[i] for i in order), seeds)]
 
     def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """The best point and its scores in all stages; None before all are there."""
+        """Return the best point and its scores in all stages, or None if incomplete."""
         stages = self.stages(store)
         scores = [self.scores(stage, store) for stage in stages]
         if not stages or (all_scores := scores[0]) is None or scores[-1] is None:
@@ -221,13 +221,13 @@ class Search:
         return points[chosen], all_scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
-        """The point that it has chosen; None before it is complete."""
+        """Return the chosen point, or None if the search is incomplete."""
         best = self.best(store)
         return None if best is None else best[0]
 
 
 def _means(scores: np.ndarray) -> np.ndarray:
-    """(points, seeds) -> (points,); -inf where a seed ended no episode."""
+    """Return the mean over seeds, (points,); -inf if a seed ended no episode."""
     means = scores.mean(axis=1)
     return np.where(np.isfinite(means), means, -np.inf)
 

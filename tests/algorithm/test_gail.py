@@ -1,4 +1,4 @@
-"""GAIL: a scripted expert is imitated; what is no expert is refused."""
+"""GAIL imitates a scripted expert, and refuses files without expert data."""
 
 import gymnasium
 import jax

@@ -1,4 +1,4 @@
-"""That the installed JAX computes what we ask of it."""
+"""The installed JAX computes correct numbers."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""What the figures ask for."""
+"""The runs that the figures request."""
 
 import dataclasses
 

@@ -72,7 +72,7 @@ TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
 
 
 class Collector:
-    """A tracker that keeps what it is given."""
+    """A tracker that keeps the scalars it gets."""
 
     taken: list = []  # noqa: RUF012
 
@@ -349,7 +349,7 @@ def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
     for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
         assert point["final_evaluation"] == pytest.approx(mean)
         assert point["final_length"] == 50.0
-    # A sweep's table that is cut short is told.
+    # A sweep's truncated table is reported.
     path = out / "programs" / "1" / "evaluations.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     assert sweep.main(["--resume", "--out", str(out)]) == 2

@@ -1,4 +1,4 @@
-"""A run that ends before its time: nothing is lost, and it goes on bit for bit."""
+"""A run that is stopped early loses nothing, and continues bit for bit."""
 
 import json
 import os
@@ -102,7 +102,7 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
     root = out / "checkpoints"
     new = lambda: set(checkpoints(out)) - before
 
-    # Before the first save: begun anew.
+    # A run that was killed before its first checkpoint starts again.
     before = set()
     child = start(out, *SMALL, "--checkpoint-every", str(10**9))
     wait_for(lambda: rows(out) > 30, child)

@@ -1,4 +1,4 @@
-"""Sweeps: what runs, what is refused, and that a point is what it is alone."""
+"""Sweeps: which run, which are refused; a point's results are those of a single run."""
 
 import csv
 import json
