@@ -84,7 +84,7 @@ class Figure:
       panels: panel -> name -> curve.
       favourite: the curve that is compared with each other one of its panel; None
         compares all with all.
-      comparisons: what is compared in place of that.
+      comparisons: comparisons to make instead of those with the favourite.
       searches: that are trained before the curves, by the name in their table.
       quick: panels and searches of the small version.
       over: the field of `Config` that final returns are drawn over; None for learning
@@ -146,7 +146,7 @@ def tuned(
     env: str, agent: str, delay: int = 1, normalized: bool = False, **more: Any
 ) -> Curve:
     """Return a curve with the hyperparameters chosen by the search on its own task."""
-    # Noise of any strength has what was found in its middle.
+    # All noise levels use what the search chose at the middle one.
     noise = NOISE if more.get("obs_noise") else 0.0
     return Curve(Search(env, agent, delay, noise, normalized), **more)
 

@@ -215,7 +215,7 @@ class Page:
       name: of the figure.
       store: of its runs.
       searched: of the searches' runs; default the same.
-      figure: in place of the one of that name; default that, whose note has more.
+      figure: a figure to use instead; default the one of that name, which has a note.
     """
 
     def __init__(

@@ -100,7 +100,7 @@ def test_the_figure_on_geometry_is_the_tuned_presets_with_other_environments():
     assert {(x.config.num_envs, x.config.stagger_episodes) for x in runs} == {
         (count, drawn) for count in (1, 8, 32, 128) for drawn in (True, False)
     }
-    # What an earlier figure trained with the same settings is found.
+    # Runs that an earlier figure trained with the same settings are used.
     assert len(runs) - len(STORE.missing(runs)) >= 100
 
 

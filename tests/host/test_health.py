@@ -68,7 +68,7 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
     filled = int(after.good_trajectories.size[1])
     for leaf in (after.good_trajectories.observation, after.good_trajectories.return_):
         assert np.isfinite(leaf[1, :filled]).all()
-    # Of what it returned nothing is known.
+    # Its return is unknown.
     assert np.isnan(after.history.reward).sum(axis=(1, 2)).tolist() == [0, 1, 0, 0]
     # The others are what they were, bit for bit.
     others = np.array([0, 2, 3])
