@@ -39,20 +39,20 @@ class Options:
     """Train the runs that a figure lacks, then write its page.
 
     Attributes:
-      quick: three seeds of some panels, 100,000 steps each, below RUNS/quick.
-      list: print what is missing, and do nothing else.
-      report: train nothing, write the page of what is there.
+      quick: train three seeds of a few panels, 100,000 steps each, below RUNS/quick.
+      list: only print the missing runs.
+      report: do not train; write the page from the stored runs.
       only: panels (or searches) to train; default all.
-      part: I/N: train every N-th run, from the I-th on, to share them with other
-        machines, whose results `merge` adds.
-      processes: so many runs at a time, on the CPU, each a process on cores of its own:
-        best with physics mujoco on many cores. By default runs that can share a program
-        are trained in it side by side: best on a GPU.
-      physics: of locomotion: mjx or mujoco.
-      devices: host devices that members are sharded over; default the cores.
-      evaluate: episodes of the policy's mean after training.
-      commit: what the code is of, where there is no repository to ask.
-      runs: where training works; what was stopped goes on from there.
+      part: I/N: train every N-th run, from the I-th on. Other machines train the
+        others, and `merge` adds their results.
+      processes: number of runs to train at a time, on the CPU, each in a process with
+        its own cores; best with physics mujoco on many cores. By default runs that can
+        share a program are trained together, which is best on a GPU.
+      physics: physics engine of locomotion: mjx or mujoco.
+      devices: number of host devices to shard members over; default one per core.
+      evaluate: episodes of the evaluation after training; 0 for no evaluation.
+      commit: commit of the code, if there is no repository.
+      runs: folder of the training in progress; stopped training continues from there.
       results: folder of the pages and, below runs/, of the store.
     """
 
@@ -70,23 +70,23 @@ class Options:
     results: pathlib.Path = RESULTS
 
 
-def _some(figure: Figure, only: Sequence[str]) -> Figure:
-    """A figure with some of its panels and searches, or all.
+def _selected(figure: Figure, only: Sequence[str]) -> Figure:
+    """Return a figure with only the named panels and searches, or all for no names.
 
     Raises:
-      InputError: it has none of that name.
+      InputError: if the figure has no panel or search of that name.
     """
     names = (*figure.panels, *figure.searches)
     for name in only:
         if name not in names:
             raise InputError(unknown("only", name, names))
-    some = lambda values: {k: x for k, x in values.items() if not only or k in only}
-    panels, searches = some(figure.panels), some(figure.searches)
+    select = lambda values: {k: x for k, x in values.items() if not only or k in only}
+    panels, searches = select(figure.panels), select(figure.searches)
     return dataclasses.replace(figure, panels=panels, searches=searches)
 
 
 def _quick(figure: Figure) -> Figure:
-    """Three seeds of a figure's curves, with fewer steps."""
+    """Return a figure with three seeds of each curve and fewer steps."""
     small = lambda curve: dataclasses.replace(curve, seeds=3, total_steps=_QUICK_STEPS)
     panels = {
         panel: {label: small(curve) for label, curve in curves.items()}
@@ -96,7 +96,7 @@ def _quick(figure: Figure) -> Figure:
 
 
 def _quick_runs(figure: Figure, searched: Store) -> list[Run]:
-    """Its curves, and of each search one seed of the first four points."""
+    """Return its curves' runs, and the searches' first points, one seed each."""
     curves = dataclasses.replace(figure, searches={})
     runs = curves.requested(searched, searched)
     for search in figure.searches.values():
@@ -117,10 +117,10 @@ def _figure(name: str, options: Options) -> None:
         if results != RESULTS:
             raise InputError(f"results is {results}: --quick writes below --runs")
         work, results = options.runs / "quick", options.runs / "quick" / "results"
-    chosen = _some(figure, options.only or (figure.quick if options.quick else ()))
+    chosen = _selected(figure, options.only or (figure.quick if options.quick else ()))
     chosen = _quick(chosen) if options.quick else chosen
     runs_of, checked_in = Store(results / "runs"), Store(RESULTS / "runs")
-    # Figures stand on the checked-in searches, but for those that search themselves.
+    # Figures without searches of their own use the checked-in searches.
     searched = runs_of if figure.searches and not options.quick else checked_in
 
     def missing_runs() -> list[Run]:
@@ -135,12 +135,15 @@ def _figure(name: str, options: Options) -> None:
             print(f"  {program}")
         return
     setup = engine.Setup(
-        *(work, options.physics, options.devices, options.evaluate),
+        work,
+        options.physics,
+        options.devices,
+        options.evaluate,
         source=engine.source(options.commit),
     )
     while missing and not options.report:
         engine.train_missing(missing, runs_of, setup, options.processes)
-        # The end of a search's stage settles the next one's points.
+        # When a stage of a search has ended, the points of the next one are known.
         missing = missing_runs()
     Page(name, runs_of, searched, chosen if options.quick else None).write(results)
     print(f"in {results / name}.md")
@@ -153,8 +156,8 @@ class MergeOptions:
     """Add the runs of another machine to the store.
 
     Attributes:
-      folder: of its results.
-      results: that get them.
+      folder: folder of the other machine's results.
+      results: folder of the results to add them to.
     """
 
     folder: Annotated[pathlib.Path, tyro.conf.Positional]
@@ -180,7 +183,7 @@ def _report() -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 

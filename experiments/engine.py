@@ -1,8 +1,8 @@
-"""Trains the runs that a store lacks, and adds them to it.
+"""Train the runs that are missing in a store, and add them to it.
 
-Runs of the same environment and static settings are members of one compiled program.
-It works in a folder named by a hash of all it trains, so that what is there is its own,
-and work that was stopped goes on from its checkpoints by itself.
+Runs of the same environment and static settings are members of one compiled program. A
+program's work folder is named by a hash of everything that it trains. The folder
+therefore never holds other work, and stopped work continues from its checkpoints.
 """
 
 import dataclasses
@@ -41,22 +41,22 @@ from gasil_jax.sweeps import shards
 
 #: Equal parts of training in a record.
 ROWS = 50
-#: What metrics.csv calls the members of a program.
+#: The columns of metrics.csv that identify the members of a program.
 _LABELS = ("member", "seed")
 _SECONDS_BETWEEN_LOOKS = 1.0
-# A new interpreter: what a fork shares with its parent JAX does not survive.
+# New interpreters, because JAX does not survive a fork.
 _CONTEXT = multiprocessing.get_context("spawn")
 
 
 @dataclasses.dataclass(frozen=True)
 class Setup:
-    """With what runs are trained, which does not decide what they are.
+    """The settings of training that do not decide a run's numbers.
 
     Attributes:
       runs: folder of the work folders.
-      physics: of locomotion: mjx or mujoco.
-      devices: host devices that members are sharded over; None for the cores.
-      evaluate: episodes of the policy's mean after training; 0 for no evaluation.
+      physics: physics engine of locomotion: mjx or mujoco.
+      devices: number of host devices to shard members over; None for one per core.
+      evaluate: episodes of the evaluation after training; 0 for no evaluation.
       source: commit of the checkout, and whether it was clean, before training.
     """
 
@@ -68,12 +68,12 @@ class Setup:
 
 
 def source(commit: str | None = None) -> dict[str, Any]:
-    """The commit of the checkout, and whether its files are as they are there.
+    """Return the checkout's commit, and whether its files are unchanged.
 
-    Results are left out: they change while experiments run.
+    Results are left out, because they change while experiments run.
 
     Args:
-      commit: what is said where there is no repository to ask.
+      commit: the commit to return if there is no repository.
     """
 
     def ask(*arguments: str) -> str | None:
@@ -92,10 +92,10 @@ def source(commit: str | None = None) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What one compiled program trains.
+    """The runs that one compiled program trains.
 
     Attributes:
-      runs: its members, alike but for hyperparameters and seeds.
+      runs: the members, which differ only in hyperparameters and seeds.
       physics: mjx or mujoco, whose states differ.
     """
 
@@ -103,7 +103,7 @@ class Program:
     physics: str
 
     def folder(self, runs: pathlib.Path) -> pathlib.Path:
-        """Where it works."""
+        """Return the program's work folder."""
         text = " ".join([self.physics, *(run.key for run in self.runs)])
         return runs / hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -119,10 +119,10 @@ class Program:
 
 
 def programs(runs: Iterable[Run], physics: str) -> list[Program]:
-    """Runs in as few programs as may be."""
+    """Divide runs into as few programs as possible."""
     groups: dict[Run, list[Run]] = {}
     for run in runs:
-        # Counts decide shapes: they divide the runs, the other numbers do not.
+        # Only counts decide shapes, so only they need separate programs.
         counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
         shared_values = gasil_jax.Hyperparameters(**counts)
         config = run.config.replace(hyperparameters=shared_values)
@@ -133,14 +133,13 @@ def programs(runs: Iterable[Run], physics: str) -> list[Program]:
 
 
 def part_of(runs: Sequence[Run], part: shards.Shard) -> list[Run]:
-    """Every n-th run, by their keys: the same on each machine, whatever it has."""
-    mine = sorted(runs, key=lambda run: run.key)[part.number - 1 :: part.count]
-    chosen = set(mine)
+    """Return every n-th run in the order of their keys, the same on each machine."""
+    chosen = set(sorted(runs, key=lambda run: run.key)[part.number - 1 :: part.count])
     return [run for run in runs if run in chosen] if part.count > 1 else list(runs)
 
 
 def train(program: Program, setup: Setup) -> dict[Run, Record]:
-    """Train a program or go on with it.
+    """Train a program, or continue its training.
 
     Raises:
       InputError: it does not fit the memory, or another process works on it.
@@ -148,7 +147,8 @@ def train(program: Program, setup: Setup) -> dict[Run, Record]:
     """
     run, count = program.runs[0], len(program.runs)
     settings = Settings(
-        *(run.reward_delay, run.obs_noise),
+        run.reward_delay,
+        run.obs_noise,
         physics=program.physics,
         integrator=run.integrator,
     )
@@ -217,7 +217,7 @@ def _provenance(
 def record(
     metrics: Mapping[str, np.ndarray], final: float, provenance: Mapping[str, Any]
 ) -> Record:
-    """What is kept of a run: its metrics, (iterations,) each, as means over parts."""
+    """Return a run's record: means over parts of its metrics, (iterations,) each."""
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
 
@@ -237,7 +237,7 @@ def record(
 
 
 def _evaluate(env: Any, program: Program, states: Any, episodes: int) -> np.ndarray:
-    """Mean return of each member's policy, deterministic: (members,)."""
+    """Return the mean return of each member's deterministic policy: (members,)."""
     config = program.runs[0].config
 
     def score(state: Any, seed: jax.Array) -> jax.Array:
@@ -319,13 +319,13 @@ def _work(
     slot: tuple[int, int],
     log: pathlib.Path,
 ) -> None:
-    """What a process does; exits with a status."""
+    """Run the work of a process, and exit with a status."""
     # In a session of its own Ctrl-C reaches it once, from the parent.
     os.setsid()
     if hasattr(os, "sched_setaffinity"):
         number, processes = slot
         cores = sorted(os.sched_getaffinity(0))
-        # Where there are fewer cores than processes, some share one.
+        # If there are fewer cores than processes, processes share cores.
         own = cores[number::processes] or [cores[number % len(cores)]]
         os.sched_setaffinity(0, own)
     log.parent.mkdir(parents=True, exist_ok=True)

@@ -31,10 +31,10 @@ class Curve:
     """Seeds of one agent on one task.
 
     Attributes:
-      search: names both, and has chosen the hyperparameters.
-      seeds: how many, from 0.
-      total_steps: of a seed.
-      obs_noise: of the environment, where it is not the search's.
+      search: the search that chose the hyperparameters, for this agent and task.
+      seeds: number of seeds, from seed 0 on.
+      total_steps: environment steps per seed.
+      obs_noise: the environment's noise, if it is not the search's.
       preset: whether the tuned preset has the hyperparameters instead.
       changes: of these, and of other fields of `Config`.
     """
@@ -84,7 +84,7 @@ class Figure:
       panels: panel -> name -> curve.
       favourite: the curve that is compared with each other one of its panel; None
         compares all with all.
-      comparisons: what is compared in place of that.
+      comparisons: comparisons to make instead of those with the favourite.
       searches: that are trained before the curves, by the name in their table.
       quick: panels and searches of the small version.
       over: the field of `Config` that final returns are drawn over; None for learning
@@ -138,15 +138,15 @@ def difference(panel: str, ours: str, other: str) -> Terms:
 
 
 def name_of(env: str, reward_delay: int = 1, *more: str) -> str:
-    """The name of a panel: hopper-delayed."""
+    """Return the name of a panel, such as hopper-delayed."""
     return "-".join([env, *(["delayed"] if reward_delay > 1 else []), *more])
 
 
 def tuned(
     env: str, agent: str, delay: int = 1, normalized: bool = False, **more: Any
 ) -> Curve:
-    """A curve of what the search on its own task has chosen."""
-    # Noise of any strength has what was found in its middle.
+    """Return a curve with the hyperparameters chosen by the search on its own task."""
+    # All noise levels use what the search chose at the middle one.
     noise = NOISE if more.get("obs_noise") else 0.0
     return Curve(Search(env, agent, delay, noise, normalized), **more)
 
@@ -186,7 +186,7 @@ _NOISES = (0.0, 0.05, 0.1, 0.5)
 
 
 def _noise_comparisons() -> Comparisons:
-    """The gap at each noise, and by how much it is more than that without."""
+    """Return comparisons of the gap at each noise, and of its growth with noise."""
     compared: dict[tuple[str, ...], Terms] = {}
     for normalized in _BOTH:
         calm = _noise_panel(0.0, normalized)
@@ -265,7 +265,7 @@ AGES = {True: "drawn", False: "not-drawn"}
 
 
 def geometry_curve(agent: str, drawn: bool, num_envs: int) -> str:
-    """The name of a curve of the figure on batch geometry."""
+    """Return the name of a curve of the figure on batch geometry."""
     return f"{agent}-{num_envs}-{AGES[drawn]}"
 
 
@@ -361,7 +361,10 @@ FIGURES: Mapping[str, Figure] = {
         {
             name_of(name, delay, *(["normalized"] if normalized else [])): {
                 str(value): tuned(
-                    *("walker2d", "ppo+gasil", delay, normalized),
+                    "walker2d",
+                    "ppo+gasil",
+                    delay,
+                    normalized,
                     changes={name: value},
                 )
                 for value in values

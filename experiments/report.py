@@ -119,7 +119,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
 
 
 def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
-    """By what share one is more than the other over panels alike, and its interval."""
+    """Return by what share one curve exceeds the other over all panels, in words."""
     drawn = [np.log(draws(scores, p, ours) / draws(scores, p, other)) for p in panels]
     mean = lambda panel, curve: interquartile_mean(scores[panel, curve])
     middle = np.mean([np.log(mean(p, ours) / mean(p, other)) for p in panels])
@@ -129,12 +129,12 @@ def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> st
 
 
 def number(value: float) -> str:
-    """A return in words: whole from 100 on."""
+    """Return a score as text, without decimals from 100 on."""
     return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
 
 
 def in_words(middle: float, low: float, high: float) -> str:
-    """A number and its interval."""
+    """Return a number and its interval as text."""
     return f"{number(middle)} [{number(low)}, {number(high)}]"
 
 
@@ -147,14 +147,14 @@ def interval(scores: np.ndarray) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table in Markdown."""
+    """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """What the store has of a curve: some of its seeds, or all."""
+    """The stored runs of a curve, of all or only a part of its seeds."""
 
     curve: Curve
     point: Mapping[str, Any]
@@ -163,7 +163,7 @@ class Results:
 
     @property
     def complete(self) -> bool:
-        """Whether all its seeds are there."""
+        """Whether the runs of all seeds are stored."""
         return len(self.runs) == self.curve.seeds
 
     @property
@@ -183,7 +183,7 @@ class Results:
         return np.array([record.final for record in self.records])
 
     def provenance(self) -> str:
-        """What trained its seeds, in words."""
+        """Return physics, versions, devices and commits of the seeds, in words."""
         seeds_of: dict[str, list[int]] = {}
         for run, record in zip(self.runs, self.records, strict=True):
             by = record.provenance
@@ -215,7 +215,7 @@ class Page:
       name: of the figure.
       store: of its runs.
       searched: of the searches' runs; default the same.
-      figure: in place of the one of that name; default that, whose note has more.
+      figure: a figure to use instead; default the one of that name, which has a note.
     """
 
     def __init__(
@@ -270,18 +270,18 @@ class Page:
         return markdown_table(head, rows)
 
     def final(self, panel: str, curve: str) -> str:
-        """The final return of a curve."""
+        """Return the final return of a curve as text."""
         return interval(self.scores[panel, curve])
 
     def compared(self, *key: str) -> str:
-        """A comparison in words."""
+        """Return a comparison in words."""
         panel, ours, other, comparison = *key[:3], self.comparisons[key]
         words = {"not clear": "is not clearly different from"}
         phrase = words.get(comparison.verdict, f"is {comparison.verdict} than")
         return f"{ours} {phrase} {other} on {panel} ({comparison})"
 
     def comparisons_list(self) -> str:
-        """Every comparison of the page, a line each."""
+        """Return every comparison of the page, in a line each."""
         lines = []
         for key in self.figure.compared():
             if comparison := self.comparisons.get(key):
@@ -319,27 +319,29 @@ class Page:
             line = f"- {favourite} against {other}: {counts} of {len(complete)}"
             # A ratio has no meaning where a seed learned nothing or lost.
             both = lambda panel: (scores[panel, favourite], scores[panel, other])  # noqa: B023
-            some = [p for p in complete if all((side > 0).all() for side in both(p))]
-            if len(some) > 1:
-                which = f"the {len(some)} where every seed's return is above 0"
-                which = "all of them" if len(some) == len(complete) else which
-                line += f"; over {which} {together(scores, some, favourite, other)}"
+            positive = [
+                p for p in complete if all((side > 0).all() for side in both(p))
+            ]
+            if len(positive) > 1:
+                which = f"the {len(positive)} where every seed's return is above 0"
+                which = "all of them" if len(positive) == len(complete) else which
+                line += f"; over {which} {together(scores, positive, favourite, other)}"
             lines.append(f"{line}.")
         return "\n".join(lines)
 
     def added(self, *panels: str) -> str:
-        """The tally of the seeds after the tenth alone."""
-        some = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
-        later = {(panel, label): results.final[10:] for panel, label, results in some}
+        """Return the tally of only the seeds after the tenth."""
+        curves = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
+        later = {(panel, label): results.final[10:] for panel, label, results in curves}
         return self.tally(*panels, scores=later)
 
     def best_value(self, panel: str) -> str:
-        """The curve of a panel with the highest interquartile mean."""
+        """Return the curve of a panel with the highest interquartile mean."""
         mean = lambda label: float(interquartile_mean(self.scores[panel, label]))
         return max(self.figure.panels[panel], key=mean)
 
     def verdict(self, panel: str, ours: str, other: str) -> str:
-        """Of two curves of a panel, in either order."""
+        """Return the comparison of two curves of a panel, in either order."""
         if comparison := self.comparisons.get((panel, ours, other)):
             return comparison.verdict
         verdict = self.comparisons[panel, other, ours].verdict
@@ -381,9 +383,12 @@ class Page:
         """Starting ages drawn and not, for each agent and number of environments."""
         rows = [
             [
-                *(panel, agent, str(count)),
+                panel,
+                agent,
+                str(count),
                 *(self.final(panel, name) for name in names),
-                *(str(comparison), comparison.verdict),
+                str(comparison),
+                comparison.verdict,
             ]
             for panel in self.results
             for agent in PAIR
@@ -412,9 +417,9 @@ class Page:
             words = [x for x in ("better", "not clear", "worse") if x in cells]
             counts = ", ".join(f"{word} on {cells.count(word)}" for word in words)
             over_all = [
-                f"{agent} {together(self.scores, some, *pair)}"
+                f"{agent} {together(self.scores, panels, *pair)}"
                 for agent, pair in pairs.items()
-                for some in [
+                for panels in [
                     [
                         panel
                         for panel in self.results
@@ -469,7 +474,7 @@ class Page:
         )
 
     def text(self) -> str:
-        """The page, Markdown."""
+        """Return the page as Markdown."""
         parts = [f"# {self.figure.title}"]
         if self.in_step and self.figure.over is None:
             parts.append(IN_STEP)
@@ -499,12 +504,12 @@ class Page:
 
 
 def fill(note: str, value: Callable[..., str]) -> str:
-    """A note with its slots, {{NAME ARGUMENTS}}, filled in by `value`."""
+    """Fill the slots of a note, {{NAME ARGUMENTS}}, with what `value` returns."""
     return re.sub(r"{{(.+?)}}", lambda x: value(*shlex.split(x[1])), note)
 
 
 def _colors(curves: Sequence[str]) -> dict[str, Any]:
-    """An agent's is the same in every figure; values in order go from dark to light."""
+    """Return a color for each label: fixed for agents, dark to light for values."""
     import matplotlib
 
     if set(curves) & set(AGENTS):
@@ -516,7 +521,7 @@ def _colors(curves: Sequence[str]) -> dict[str, Any]:
 
 
 def _draw(page: Page) -> Any:
-    """A matplotlib figure with axes for each panel."""
+    """Return a matplotlib figure with axes for each panel."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -551,9 +556,10 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
         returns = np.array(
             [np.interp(steps, x.env_steps, x.episode_return) for x in results.records]
         )
-        some = np.isfinite(returns).all(axis=0)
-        if some.any():
-            steps, returns, color = steps[some] / 1e6, returns[:, some], color_of[label]
+        finite = np.isfinite(returns).all(axis=0)
+        if finite.any():
+            color = color_of[label]
+            steps, returns = steps[finite] / 1e6, returns[:, finite]
             low, high = bootstrap_interval(returns, resamples=500)
             axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
             axes.plot(steps, interquartile_mean(returns, 0), color=color, label=label)
@@ -571,10 +577,12 @@ def _draw_over(page: Page, panel: str, axes: Any) -> None:
         scores = [page.scores[panel, names[n]] for n in complete]
         middle = np.array([interquartile_mean(x) for x in scores])
         low, high = np.array([bootstrap_interval(x) for x in scores]).T
-        # Side by side, or one interval would hide another.
+        # Shifted sideways, so that no interval hides another.
         steps = np.array(complete) * 1.06 ** (i - 1.5)
         axes.errorbar(
-            *(steps, middle, [middle - low, high - middle]),
+            steps,
+            middle,
+            [middle - low, high - middle],
             color=plotting.COLORS[PAIR.index(agent)],
             linestyle="-" if drawn else "--",
             **{"marker": "o", "markersize": 3, "capsize": 2},

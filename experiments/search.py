@@ -74,17 +74,17 @@ _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
 
 
 def every_point(space: Space) -> tuple[Point, ...]:
-    """All points of a space."""
+    """Return all points of a space."""
     every = itertools.product(*space.values())
     return tuple(dict(zip(space, values, strict=True)) for values in every)
 
 
 def draw(space: Space) -> tuple[Point, ...]:
-    """At most sixteen points of a space of up to five hyperparameters.
+    """Return at most sixteen points of a space of up to five hyperparameters.
 
-    All there are, if they are no more. Else an orthogonal array: any two
-    hyperparameters have every pair of their values equally often, so that none is
-    judged by what it happened to be drawn with.
+    If the space has no more points, these are all of them. Otherwise they are an
+    orthogonal array: any two hyperparameters have every pair of their values equally
+    often, so that no value's score depends on the values it was drawn with.
     """
     if len(every := every_point(space)) <= 16:
         return every
@@ -93,7 +93,7 @@ def draw(space: Space) -> tuple[Point, ...]:
             f"{dict(space)}: at most five hyperparameters of two or four values"
         )
     rng = np.random.default_rng(0)
-    # Which value is which level is left to chance; two levels are one of two values.
+    # Values are assigned to levels at random; each of two values has two levels.
     of_level = {
         name: [values[i % len(values)] for i in rng.permutation(4)]
         for name, values in space.items()
@@ -118,14 +118,14 @@ class Search:
     """A search for an agent's hyperparameters on a task.
 
     Attributes:
-      env: environment's name.
-      agent: agent's name.
-      reward_delay: of the environment.
-      obs_noise: of the environment.
-      normalize_rewards: whether PPO's rewards are.
-      after: a search to go on from: hyperparameters that are not `free` are fixed at
-        the value whose points did best in it, on average.
-      free: what is searched then: all points of these, on two seeds each.
+      env: name of the environment.
+      agent: name of the agent.
+      reward_delay: the environment's reward delay.
+      obs_noise: the environment's observation noise.
+      normalize_rewards: whether PPO's rewards are normalized.
+      after: an earlier search to continue. Hyperparameters that are not `free` are
+        fixed at the value whose points had the best average score in it.
+      free: the hyperparameters to search then: all their points, on two seeds each.
     """
 
     env: str
@@ -138,11 +138,11 @@ class Search:
 
     @property
     def space(self) -> Space:
-        """What its points are drawn from, if it goes on from no other search."""
+        """The space that points are drawn from, if no earlier search is continued."""
         return _OTHER_SPACES.get((self.env, self.agent), SPACES[self.agent])
 
     def config(self, point: Point) -> Config:
-        """The appendix's values with a point's, and our number of environments."""
+        """Return a point's config: its values, our batch and the appendix's values."""
         return Config(
             agent=self.agent,
             total_steps=STEPS.get(self.env, 1_000_000),
@@ -152,14 +152,14 @@ class Search:
         ).replace(**point)
 
     def runs(self, stage: Stage) -> list[list[Run]]:
-        """The runs of a stage: a list for each point."""
+        """Return the runs of a stage, a list for each point."""
         return [
             [self.run(self.config(point), seed) for seed in stage.seeds]
             for point in stage.points
         ]
 
     def run(self, config: Config, seed: int, **changes: Any) -> Run:
-        """A run on its task."""
+        """Return a run on the search's task."""
         fields = {
             "reward_delay": self.reward_delay,
             "obs_noise": self.obs_noise,
@@ -168,9 +168,9 @@ class Search:
         return Run(self.env, config, seed, **{**fields, **changes})
 
     def scores(self, stage: Stage, store: Store) -> np.ndarray | None:
-        """Mean return over the last fifth of training, (points, seeds).
+        """Return the mean return over the last fifth of training, (points, seeds).
 
-        None before all runs of the stage are in the store.
+        The result is None if the store lacks a run of the stage.
         """
         runs = self.runs(stage)
         if store.missing(run for of_point in runs for run in of_point):
@@ -178,7 +178,7 @@ class Search:
         return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
 
     def first(self, store: Store) -> Stage | None:
-        """The first stage; None before that of the search it goes on from has ended."""
+        """Return the first stage, or None if an earlier search must end first."""
         if self.after is None:
             points = draw(self.space)
             seeds = _RUNS_OF.get(self.env, _RUNS) // len(points)
@@ -196,7 +196,7 @@ class Search:
         return Stage(points, range(_FIRST_SEED, _FIRST_SEED + seeds))
 
     def stages(self, store: Store) -> list[Stage]:
-        """Those whose points are settled by what is in the store."""
+        """Return the stages whose points are known from the runs in the store."""
         first = self.first(store)
         if first is None:
             return []
@@ -208,7 +208,7 @@ class Search:
         return [first, Stage(tuple(first.points[i] for i in order), seeds)]
 
     def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """The best point and its scores in all stages; None before all are there."""
+        """Return the best point and its scores in all stages, or None if incomplete."""
         stages = self.stages(store)
         scores = [self.scores(stage, store) for stage in stages]
         if not stages or (all_scores := scores[0]) is None or scores[-1] is None:
@@ -221,13 +221,13 @@ class Search:
         return points[chosen], all_scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
-        """The point that it has chosen; None before it is complete."""
+        """Return the chosen point, or None if the search is incomplete."""
         best = self.best(store)
         return None if best is None else best[0]
 
 
 def _means(scores: np.ndarray) -> np.ndarray:
-    """(points, seeds) -> (points,); -inf where a seed ended no episode."""
+    """Return the mean over seeds, (points,); -inf if a seed ended no episode."""
     means = scores.mean(axis=1)
     return np.where(np.isfinite(means), means, -np.inf)
 
@@ -235,7 +235,7 @@ def _means(scores: np.ndarray) -> np.ndarray:
 def _by_value(
     name: str, points: Sequence[Point], means: np.ndarray
 ) -> dict[Any, float]:
-    """The mean over the points that have each value of a hyperparameter."""
+    """Return the mean over the points with each value of a hyperparameter."""
     values = np.array([point[name] for point in points])
     return {
         value: float(means[values == value].mean())
@@ -249,13 +249,13 @@ def _best_value(name: str, points: Sequence[Point], means: np.ndarray) -> Any:
 
 
 def point_in_words(point: Point) -> str:
-    """A point as "name value, name value"."""
+    """Return a point as "name value, name value"."""
     words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
     return ", ".join(f"{name} {words(value)}" for name, value in point.items())
 
 
 def table(searches: Mapping[str, Search], store: Store) -> str:
-    """What searches have found: Markdown."""
+    """Return the results of searches as Markdown."""
     head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
     lines = [f"| {' | '.join(head.split('|'))} |", "|---" * 8 + "|"]
     for name, search in searches.items():

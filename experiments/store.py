@@ -1,7 +1,7 @@
-"""The store of runs: each stands in it once, under all that decides its numbers.
+"""The store of runs. It holds each run once, by the settings that decide its numbers.
 
-A task has one file, TASK.npz, of plain arrays and one JSON text. Figures, tables and
-searches ask the store for runs; no run knows which of them it is for.
+Each task has one file, TASK.npz, with plain arrays and one JSON text. Figures, tables
+and searches query the store for runs. A run does not record what it was trained for.
 """
 
 import dataclasses
@@ -19,9 +19,9 @@ from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
 
-#: To be raised by hand when a change makes the same settings give other numbers than
-#: before by more than rounding: all runs of before are then missing. Runs of version 1
-#: had their environments in step, and were moved here from another form of results.
+#: Raise this by hand when a change makes the same settings give different numbers, by
+#: more than rounding. All earlier runs then count as missing. Runs of version 1 had
+#: their environments in step, and were converted from an earlier format of results.
 ALGORITHM_VERSION = 2
 
 _DEFAULTS = Hyperparameters()
@@ -30,10 +30,10 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 
 @dataclasses.dataclass(frozen=True)
 class Run:
-    """All that decides the numbers of one training run.
+    """The settings that decide the numbers of one training run.
 
-    The simulator (mjx or mujoco) and the device are no part of it: they are ways to
-    compute the same thing, and a record says which were used.
+    The simulator (mjx or mujoco) and the device do not belong to them, because they
+    compute the same thing in different ways. A record says which were used.
     """
 
     env: str
@@ -46,7 +46,7 @@ class Run:
 
     @functools.cached_property
     def experiment(self) -> str:
-        """Everything but the seed, as JSON: what runs of one curve share."""
+        """All settings but the seed as JSON, which the runs of a curve share."""
         values = dict(vars(self.config))
         for name, value in values.items():
             if callable(value):
@@ -64,18 +64,18 @@ class Run:
 
     @functools.cached_property
     def key(self) -> str:
-        """A hash of everything, which names the run."""
+        """A hash of all settings, which identifies the run."""
         text = f"{self.experiment} {self.seed}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _tuples(value: Any) -> Any:
-    # JSON has no tuples, and a configuration is hashable.
+    # JSON has no tuples, but a config must be hashable.
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `Run` but the seed; one of `Config` that is newer is default."""
+    """Return a `Run`'s fields without its seed; newer `Config` fields have defaults."""
     values = {name: _tuples(value) for name, value in fields["config"].items()}
     values["hyperparameters"] = Hyperparameters(**values["hyperparameters"])
     return {**fields, "config": Config(**values)}
@@ -83,16 +83,16 @@ def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Record:
-    """What is kept of a run: means over equal parts of training, (rows,) each.
+    """The stored results of a run: means over equal parts of training, (rows,) each.
 
     Attributes:
-      env_steps: at the end of each part.
-      episode_return: of the episodes that ended in it; NaN where none did.
-      episode_length: the same; NaN where it was not recorded.
-      evaluation_return: of the policy's mean; NaN where it was not evaluated.
-      final_evaluation: of the policy's mean after training; NaN if not evaluated.
-      provenance: physics, device, versions, the commit that it was trained with, and
-        whether the checkout was clean.
+      env_steps: environment steps at the end of each part.
+      episode_return: mean return of the episodes that ended in the part; NaN if none.
+      episode_length: mean length of these episodes; NaN if it was not recorded.
+      evaluation_return: mean return of evaluations; NaN if there were none.
+      final_evaluation: mean return of an evaluation after training; NaN if none.
+      provenance: physics, device, versions, the commit of the code, and whether the
+        checkout was clean.
     """
 
     env_steps: np.ndarray
@@ -103,10 +103,10 @@ class Record:
     provenance: Mapping[str, Any]
 
     def part(self, begin: float, end: float) -> float:
-        """Mean return over a part of training, from share to share.
+        """Return the mean return between two fractions of training.
 
-        Of the rows whose middle is in it (a row may end just past a round share), or of
-        the row that the part's own middle is in.
+        The mean is over the rows whose middle lies between them, because a row may end
+        just beyond a round fraction. If there is none, it is the row in the middle.
         """
         ends = self.env_steps / self.env_steps[-1]
         middle = (np.concatenate([[0.0], ends[:-1]]) + ends) / 2
@@ -119,10 +119,10 @@ class Record:
 
     @property
     def final(self) -> float:
-        """Mean return over the last tenth of training.
+        """The mean return over the last tenth of training.
 
-        Where no episode ended in it, for many environments in step end theirs seldom,
-        of the last part of training in which one did; NaN where none ever did.
+        If no episode ended in it (many environments in step rarely end theirs), it is
+        the return of the last part in which one ended; NaN if none ever did.
         """
         ended = self.episode_return[np.isfinite(self.episode_return)]
         last = self.part(0.9, 1.0)
@@ -133,12 +133,12 @@ _ROWS = ("env_steps", "episode_return", "episode_length", "evaluation_return")
 
 
 def _rounded(values: Iterable[float]) -> np.ndarray:
-    """Six significant digits, which float32 keeps: seeds differ by far more."""
+    """Round to six significant digits, which float32 keeps; seeds differ far more."""
     return np.array([float(f"{value:.6g}") for value in values], np.float32)
 
 
 def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
-    """Write a file of runs; the same runs give the same bytes in whatever order."""
+    """Write a file of runs; its bytes do not depend on the order of the runs."""
     runs = sorted(records, key=lambda run: (run.experiment, run.seed))
     texts = {run: json.dumps(records[run].provenance, sort_keys=True) for run in runs}
     experiments = sorted({run.experiment for run in runs})
@@ -169,7 +169,7 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
 
 
 def read(path: pathlib.Path) -> dict[Run, Record]:
-    """The runs of a file.
+    """Return the runs of a file.
 
     Raises:
       InputError: it is damaged, or has settings that the package does not.
@@ -194,7 +194,7 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
 
 
 class Store:
-    """The runs of a folder: `run in store`, `store[run]` and `store.add`."""
+    """The runs of a folder, with `run in store`, `store[run]` and `store.add`."""
 
     def __init__(self, folder: pathlib.Path):
         self.folder = folder
@@ -217,11 +217,11 @@ class Store:
         return self._of(run.env)[run]
 
     def refresh(self) -> None:
-        """Read anew what other processes may have added."""
+        """Read the files again, to which other processes may have added runs."""
         self._records.clear()
 
     def missing(self, runs: Iterable[Run]) -> list[Run]:
-        """Those that are not here, each once."""
+        """Return the runs that are not stored, each once."""
         return [run for run in dict.fromkeys(runs) if run not in self]
 
     def add(self, records: Mapping[Run, Record]) -> int:

@@ -22,7 +22,7 @@ _COMPARISONS = {DELAY: "delayed_mujoco", 1: "mujoco"}
 
 
 class Summary:
-    """What all figures say, from one store."""
+    """The page of all claims and the README's blocks, from one store."""
 
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
@@ -81,7 +81,7 @@ class Summary:
         return f"{word}: the best value is better {words} of {len(panels)} panels"
 
     def claims(self) -> str:
-        """Each claim of the paper and what was measured."""
+        """Return a table with each claim of the paper and our measurements."""
         dense, delayed = (
             [name_of(x, delay) for x in NORMALIZED] for delay in (1, DELAY)
         )
@@ -166,7 +166,7 @@ class Summary:
         )
 
     def text(self) -> str:
-        """The page of all claims."""
+        """Return the page of all claims as Markdown."""
         note = report.fill((report.NOTES / "README.md").read_text(), self.value)
         title, body = note.split("\n", 1)
         in_step = any(page.in_step for page in self.pages.values())
@@ -174,7 +174,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def fill_blocks(self, text: str) -> str:
-        """A document with its generated blocks made anew."""
+        """Return a document with its generated blocks replaced by new ones."""
         block = re.compile(r"(<!-- begin (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
         made = lambda match: self.value(*shlex.split(match[2]))
         return block.sub(lambda x: f"{x[1]}\n{made(x)}\n\n{x[3]}", text)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from gasil_jax.train import iterate as iterate
     from gasil_jax.train import make_train as make_train
 
-#: Each public name and the module that it is in.
-_HOMES = {
+#: The module that defines each public name.
+_MODULES = {
     "Config": "config",
     "Hyperparameters": "config",
     "TrainState": "train",
@@ -33,14 +33,14 @@ _HOMES = {
     "preset": "presets",
 }
 
-__all__ = [*_HOMES]
+__all__ = [*_MODULES]
 
 
 def __getattr__(name: str) -> Any:
-    # Not before it is asked for: `gasil_jax.numpy_policy` runs where JAX is not.
-    if name not in _HOMES:
+    # Modules are imported on first use, so that `gasil_jax.numpy_policy` needs no JAX.
+    if name not in _MODULES:
         raise AttributeError(f"module 'gasil_jax' has no attribute {name!r}")
-    return getattr(importlib.import_module(f"gasil_jax.{_HOMES[name]}"), name)
+    return getattr(importlib.import_module(f"gasil_jax.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:

@@ -1,14 +1,14 @@
-"""Refuses, when it is imported, a release of JAX that can't be used."""
+"""Check, on import, that the installed release of JAX computes correctly."""
 
 import contextlib
 import importlib.metadata
 
-#: Wrong numbers from batched reductions on a CPU (jax issue 39103).
+#: Releases that compute batched reductions wrongly on a CPU (jax issue 39103).
 _MISCOMPILES = ("0.10.2",)
 
 
 def check(jaxlib_version: str) -> None:
-    """Raise `ImportError` for a release that is known to compute wrong numbers."""
+    """Raise `ImportError` for a release that computes wrong numbers."""
     if jaxlib_version in _MISCOMPILES:
         raise ImportError(
             f"jaxlib {jaxlib_version} gives wrong numbers on a CPU (jax issue 39103): "

@@ -1,7 +1,7 @@
-"""What a run is: `Config` (static, decides shapes) and `Hyperparameters` (traced).
+"""The settings of the algorithm: `Config` (static) and `Hyperparameters` (traced).
 
-Defaults are the paper's appendix where it gives a value, else OpenAI baselines', on
-which the paper's code was built. Each field stands beside the values that it may have.
+Defaults come from the paper's appendix, and where it gives none from OpenAI baselines,
+on which the paper's code was built. Each field is declared with its allowed range.
 """
 
 import dataclasses
@@ -14,20 +14,20 @@ from flax import struct
 
 from gasil_jax.errors import unknown
 
-#: The factor that a hyperparameter is multiplied by, over environment steps: an
-#: Optax schedule (any pure function of the steps), or (steps, factor) points, linear
-#: between them and constant beyond; no points are 1 throughout.
+#: A factor that multiplies a hyperparameter, as a function of environment steps. Either
+#: an Optax schedule (any pure function of the steps) or (steps, factor) points, linear
+#: between them and constant beyond. Without points the factor is always 1.
 Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
 class Range(NamedTuple):
-    """The finite numbers that a field may have.
+    """The range of finite numbers that a field may have.
 
     Attributes:
-      low: the lowest.
-      high: the highest.
-      excludes_low: whether the lowest itself is not allowed.
-      whole: whether only whole numbers are.
+      low: the lowest number.
+      high: the highest number.
+      excludes_low: whether `low` itself is not allowed.
+      whole: whether only whole numbers are allowed.
     """
 
     low: float
@@ -36,8 +36,8 @@ class Range(NamedTuple):
     whole: bool = False
 
     def __contains__(self, value: object) -> bool:
-        """Whether a number, no bool, is in the range."""
-        # NumPy's whole numbers are no int, and a bool is one.
+        """Return whether a value is a number in the range; a bool is not."""
+        # NumPy's integers are not `int`, but `bool` is.
         kind = numbers.Integral if self.whole else numbers.Real
         if not isinstance(value, kind) or isinstance(value, bool):
             return False
@@ -69,17 +69,18 @@ def _field(default: Any, allowed: Range) -> Any:
 
 
 class Hyperparameters(struct.PyTreeNode):
-    """Every number that can be swept: a pytree, so a sweep is a `vmap` over leaves.
+    """Every number that can be swept; a pytree, so a sweep is a `vmap` over its leaves.
 
-    Two counts are among them. The configuration's own value of these decides shapes and
-    is the most that a run can have; a member of a sweep may have less.
+    Two of them are counts, `discriminator_updates` and `buffer_steps`. The values in
+    the configuration decide shapes and are upper limits: a member of a sweep may have
+    smaller ones.
     """
 
     learning_rate: float = _number(3e-4, 0.0, excludes_low=True)
     """Adam's step size for policy and value."""
     learning_rate_decay: float = _number(1.0, 0.0, 1.0)
-    """Share of the learning rate that is gone, linearly, at the end of training: 1
-    anneals to 0, 0 keeps it constant."""
+    """Fraction of the learning rate that is lost, linearly, by the end of training: 1
+    anneals it to 0, and 0 keeps it constant."""
     gamma: float = _number(0.99, 0.0, 1.0)
     """Discount factor."""
     gae_lambda: float = _number(0.95, 0.0, 1.0)
@@ -87,91 +88,93 @@ class Hyperparameters(struct.PyTreeNode):
     clip_epsilon: float = _number(0.2, 0.0, excludes_low=True)
     """PPO's clip range of the probability ratio."""
     entropy_coefficient: float = _number(0.0, 0.0)
-    """The paper's lambda, weight of the policy's entropy."""
+    """Weight of the policy's entropy (the paper's lambda)."""
     value_coefficient: float = _number(1.0, 0.0)
-    """Weight of the squared error of the value. The value has a network, gradient clip
-    and Adam of its own, so it hardly matters."""
+    """Weight of the value's squared error. It hardly matters, because the value has its
+    own network, gradient clip and Adam."""
     max_grad_norm: float = _number(0.5, 0.0, excludes_low=True)
-    """Gradients are scaled down to this global norm, the policy's and the value's each
-    for itself."""
+    """Largest global norm of a gradient; the policy's and the value's gradients are
+    clipped separately."""
     alpha: float = _number(0.1, 0.0)
     """Scale of the discriminator's reward (paper, section 4.3)."""
     discriminator_learning_rate: float = _number(1e-4, 0.0, excludes_low=True)
     """Adam's step size for the discriminator."""
     discriminator_updates: int = _count(5)
-    """Gradient steps of the discriminator an iteration."""
+    """Gradient steps of the discriminator in an iteration."""
     discriminator_entropy_coefficient: float = _number(1e-3, 0.0)
-    """Weight of the entropy of D's output."""
+    """Weight of the entropy of the discriminator's output."""
     buffer_steps: int = _count(1000)
-    """Steps that the good-trajectory buffer keeps."""
+    """Capacity of the good-trajectory buffer, in steps."""
     behavior_cloning_coefficient: float = _number(0.1, 0.0)
     """Weight of the cloning loss of PPO+BC."""
     sil_coefficient: float = _number(0.1, 0.0)
     """Weight of the loss of PPO+SIL."""
     sil_value_coefficient: float = _number(0.01, 0.0)
-    """Weight of the value's part in it."""
+    """Weight of the value's loss within PPO+SIL's loss."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Everything that changes shapes, loop counts or the program; hashable."""
+    """The settings that change array shapes, loop counts or the program; hashable."""
 
     agent: str = "ppo+gasil"
-    """Name of the agent, see `gasil_jax.agents()`."""
+    """Name of the agent; `gasil_jax.agents()` lists them."""
     total_steps: int = _count(1_000_000)
-    """Environment steps of a seed; rounded up to whole batches."""
+    """Environment steps per seed, rounded up to whole batches."""
     num_envs: int = _count(16)
-    """Environments that a seed steps at once."""
+    """Number of environments that each seed steps in parallel."""
     batch_steps: int = _count(2048)
-    """Environment steps in an iteration, over all environments (the paper's
+    """Environment steps in an iteration, summed over all environments (the paper's
     horizon)."""
     num_epochs: int = _count(10)
     """Passes of PPO over a batch."""
     minibatch_size: int = _count(64)
     """Steps in one gradient step of PPO."""
     hidden_sizes: tuple[int, ...] = _count((64, 64))
-    """Widths of the tanh layers of the policy and of the value."""
+    """Widths of the tanh layers, in the policy and in the value."""
     discriminator_minibatch_size: int = _count(128)
-    """Policy steps, and as many good steps, in a gradient step of the
+    """Steps of the policy, and equally many good steps, in one gradient step of the
     discriminator."""
     discriminator_hidden_sizes: tuple[int, ...] = _count((100, 100))
     """Widths of the discriminator's tanh layers."""
     behavior_cloning_updates: int = _count(10)
-    """Gradient steps of PPO+BC's own an iteration."""
+    """Gradient steps on PPO+BC's cloning loss in an iteration."""
     behavior_cloning_minibatch_size: int = _count(64)
-    """Good steps in each."""
+    """Good steps in one gradient step on PPO+BC's cloning loss."""
     sil_updates: int = _count(10)
-    """Gradient steps of PPO+SIL's own an iteration."""
+    """Gradient steps on PPO+SIL's loss in an iteration."""
     sil_minibatch_size: int = _count(512)
-    """Replayed steps in each."""
+    """Replayed steps in one gradient step on PPO+SIL's loss."""
     sil_buffer_steps: int = _count(50_000)
-    """Capacity of PPO+SIL's replay, in steps."""
+    """Capacity of PPO+SIL's replay buffer, in steps."""
     learning_rate_schedule: Schedule = ()
-    """Factor over environment steps that the learning rate is multiplied by: STEPS
-    FACTOR pairs, linear between them (from Python also any Optax schedule)."""
+    """Factor that multiplies the learning rate, over environment steps: STEPS FACTOR
+    pairs, linear between them (from Python also any Optax schedule)."""
     clip_epsilon_schedule: Schedule = ()
-    """The same for PPO's clip range."""
+    """Factor that multiplies PPO's clip range, given in the same way."""
     alpha_schedule: Schedule = ()
-    """The same for alpha. The paper's rule for Humanoid, 0 for 2M steps and then up to
-    alpha until 3M, is ((2e6, 0), (3e6, 1))."""
+    """Factor that multiplies alpha, given in the same way. The paper's rule for
+    Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is ((2e6, 0), (3e6,
+    1))."""
     normalize_rewards: bool = False
-    """Whether PPO's rewards are divided by the standard deviation of their running
-    discounted sum (OpenAI baselines' ppo2). Alpha is in that unit then, not in the
-    environment's. Agents gasil and gail have no such reward."""
+    """Whether to divide PPO's rewards by the standard deviation of their running
+    discounted sum (as in OpenAI baselines' ppo2). Alpha is then in that unit, not in
+    the environment's. It has no effect on the agents gasil and gail, which do not use
+    the environment's reward."""
     stagger_episodes: bool = True
-    """Whether each environment's first episode begins at an age drawn from the whole
-    episode, so that a batch holds steps of all its parts. Without it environments that
+    """Whether each environment's first episode begins at a random age, so that a batch
+    holds steps from all parts of an episode. Otherwise environments whose episodes
     never end early stay in lock-step for the whole run."""
     expert: str | None = None
-    """What GAIL imitates: an .npz file with arrays "observation" and "action", or
-    "minari:" and the name of a data set."""
+    """Expert that GAIL imitates: an .npz file with arrays "observation" and "action",
+    or minari:NAME for a Minari data set."""
     max_episode_steps: int | None = _count(None)
-    """An episode is truncated after so many steps; None takes the environment's own
-    limit, or 1000 if it has none."""
+    """Number of steps after which an episode is truncated; None takes the environment's
+    own limit, or 1000 if it has none."""
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
     )
-    """The numbers that can be swept; `make_train` can replace them under a trace."""
+    """The numbers that can be swept; `make_train` accepts traced replacements."""
 
     @property
     def num_steps(self) -> int:
@@ -189,7 +192,7 @@ class Config:
         return math.ceil(self.total_steps / self.batch_steps)
 
     def replace(self, **changes: Any) -> "Config":
-        """A copy with some fields changed, of its own or of its hyperparameters."""
+        """Return a copy with changed fields, including those of `hyperparameters`."""
         own = {field.name for field in dataclasses.fields(self)}
         swept = {name: changes.pop(name) for name in set(changes) - own}
         if swept:
@@ -199,7 +202,7 @@ class Config:
 
 
 def ranges(kind: type) -> Mapping[str, Range]:
-    """Which numbers each field of `Config` or `Hyperparameters` may have, by name."""
+    """Return the allowed range of each numeric field of a settings class, by name."""
     return {
         field.name: field.metadata["range"]
         for field in dataclasses.fields(kind)
@@ -208,12 +211,15 @@ def ranges(kind: type) -> Mapping[str, Range]:
 
 
 def validate(config: Config, agents: Sequence[str]) -> None:
-    """Raise `ValueError`, naming the value and what is allowed, for a bad config.
+    """Check that every value of a config is allowed.
 
     Args:
-      config: what to check. Hyperparameters that are JAX arrays are not looked at:
-        they may be traced.
-      agents: the registered agents' names.
+      config: the config to check. Hyperparameters that are JAX arrays are skipped,
+        because they may be traced.
+      agents: names of the registered agents.
+
+    Raises:
+      ValueError: if a value is not allowed; the message names the value and the range.
     """
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))

@@ -1,4 +1,4 @@
-"""Score the policies of a run: ``python -m gasil_jax.evaluate RUN``."""
+"""Evaluate the policies of a run: ``python -m gasil_jax.evaluate RUN``."""
 
 import csv
 import dataclasses
@@ -29,13 +29,13 @@ def evaluate_in_gymnasium(
     num_episodes: int,
     seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Run whole episodes of a policy in Gymnasium, on C MuJoCo.
+    """Run complete episodes of a policy in Gymnasium, with C MuJoCo.
 
     Args:
-      gymnasium_id: of the task, "Walker2d-v5".
-      act: observation -> action, as of `numpy_policy.load`.
-      num_episodes: one after the other.
-      seed: of the first episode's start; the next ones' follow.
+      gymnasium_id: name of the task, such as "Walker2d-v5".
+      act: observation -> action, as from `numpy_policy.load`.
+      num_episodes: number of episodes, which run one after the other.
+      seed: seed of the first episode; each next episode has the next seed.
 
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
@@ -62,19 +62,20 @@ def evaluate_in_gymnasium(
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Score the policies of a run, or of a point of a sweep.
+    """Evaluate the policies of a run, or of a point of a sweep.
 
     Attributes:
-      run: the run's folder.
-      point: of a sweep, its number in results.csv; default the best by mean.
-      checkpoint: which policies: last, or, of a run, best by mean return in training.
-      seed: score this one alone; default all.
-      episodes: how many for each seed.
+      run: folder of the run or sweep.
+      point: number of a sweep's point in results.csv; default the best by mean.
+      checkpoint: checkpoint of the policies: last, or best, which has the best
+        evaluation or, without evaluations, the best mean return in training.
+      seed: evaluate only this seed; default all seeds.
+      episodes: number of episodes for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
-      gymnasium: score in Gymnasium, on C MuJoCo, instead; for locomotion, with the
-        policy's mean and without delay and noise.
-      key: of the episodes' starts and actions.
-      out: also write every episode's return and length to this new file, CSV.
+      gymnasium: evaluate in Gymnasium, with C MuJoCo, instead; only for locomotion,
+        with the policy's mean, without delay and noise.
+      key: random key of the episodes' starts and actions.
+      out: new CSV file to which every episode's return and length are written too.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
@@ -103,7 +104,7 @@ def _score(
             )
         )
     )
-    # A seed scored alone has the starts and draws that it has among others.
+    # A seed has the same starts and draws whether evaluated alone or with others.
     fold = lambda seed: jax.random.fold_in(jax.random.key(options.key), seed)
     keys = jax.vmap(fold)(jnp.array(seeds, jnp.uint32))
     return jax.tree.map(np.asarray, score(states, keys))
@@ -125,7 +126,7 @@ def _score_in_gymnasium(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 
@@ -172,7 +173,7 @@ def _main(arguments: Sequence[str] | None) -> None:
 def _write(
     path: pathlib.Path, seeds: Sequence[int], scores: Mapping[str, np.ndarray]
 ) -> None:
-    """A row for each episode."""
+    """Write a row for each episode."""
     with output_file.whole(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["seed", "episode", *scores])

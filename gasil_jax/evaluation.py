@@ -1,4 +1,4 @@
-"""Score the policy of a training state in whole episodes."""
+"""Evaluate the policy of a training state in complete episodes."""
 
 from typing import Any
 
@@ -22,18 +22,18 @@ def evaluate(
     num_episodes: int,
     deterministic: bool = True,
 ) -> dict[str, jax.Array]:
-    """Run whole episodes with the policy of one training state.
+    """Run complete episodes with the policy of one training state.
 
-    Pure: jit it, and vmap it over states. The return is of the environment's true
-    reward (undelayed, unshaped, undiscounted).
+    The function is pure: it works under jit, and under vmap over states. Returns are
+    sums of the environment's true reward (undelayed, unshaped, undiscounted).
 
     Args:
       env: one environment.
-      config: of the run.
-      state: of one run, not of a batch of them.
-      key: consumed.
-      num_episodes: run side by side.
-      deterministic: act with the policy's mean; else draw from the policy.
+      config: the config of the run.
+      state: the training state of one run, not of a batch.
+      key: random key; consumed.
+      num_episodes: number of episodes, which run in parallel.
+      deterministic: whether to act with the policy's mean; else actions are drawn.
 
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
@@ -55,7 +55,7 @@ def evaluate(
         reward = states.info.get("true_reward", states.reward)
         sound = normalization.is_sound(states.obs).all(axis=-1)
         sound &= normalization.is_sound(reward)
-        # As in training a step of failed physics ends the episode with reward 0.
+        # As in training, a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running
         ended = (states.done > 0) | wrappers.truncated(states)

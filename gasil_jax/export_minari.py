@@ -1,14 +1,14 @@
-"""A run's good trajectories as a Minari data set.
+"""Export a run's good trajectories as a Minari data set.
 
     python -m gasil_jax.export_minari RUN --name hopper/good-v0
 
-Exact are the observations and actions (as the policy drew them; the environment
-limits them to its range) of whole episodes, best first. The buffer keeps neither an
-episode's rewards nor what followed its last action, so that is filled in: the last
-step's reward is the episode's discounted return and the others are 0, the observation
-after the last one is that one again, and every episode is called truncated. The last
-episode of a full buffer may be cut short: it is left out unless it is as long as the
-environment's limit. All this stands in the data set's description too.
+The data set holds complete episodes, best first. Observations and actions are exact;
+actions are as the policy drew them, before the environment limits them to its range.
+The buffer keeps neither an episode's rewards nor what followed its last action, so the
+following is filled in: the last step's reward is the episode's discounted return and
+the others are 0; the final observation repeats the one before it; and every episode is
+marked as truncated. The last episode of a full buffer may be cut. It is left out unless
+it has the environment's full length. The data set's description says the same.
 """
 
 import dataclasses
@@ -43,14 +43,15 @@ _DESCRIPTION = (
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Write a run's good trajectories as a data set of Minari.
+    """Write a run's good trajectories as a Minari data set.
 
     Attributes:
-      run: the run's folder, of a finished run or not.
-      name: of the data set, NAMESPACE/DATASET-vVERSION; there must be none yet.
-      seed: whose; default every seed's, in their order.
-      point: of a sweep, its number in results.csv; default the best by mean.
-      checkpoint: as it was then: last, or best by mean return in training.
+      run: folder of the run or sweep, which need not be finished.
+      name: name of the new data set, NAMESPACE/DATASET-vVERSION.
+      seed: export only this seed's episodes; default all seeds', in their order.
+      point: number of a sweep's point in results.csv; default the best by mean.
+      checkpoint: checkpoint of the buffer: last, or best, which has the best
+        evaluation or, without evaluations, the best mean return in training.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
@@ -61,12 +62,12 @@ class Options:
 
 
 class Episode(NamedTuple):
-    """One that is whole.
+    """A complete episode.
 
     Attributes:
       observation: float32 (steps, obs).
       action: float32 (steps, action).
-      return_: discounted.
+      return_: discounted return.
     """
 
     observation: np.ndarray
@@ -77,31 +78,31 @@ class Episode(NamedTuple):
 def episodes(
     buffer: GoodTrajectories, max_episode_steps: int, max_steps: float | None = None
 ) -> list[Episode]:
-    """The buffer's whole episodes, best first.
+    """Return the buffer's complete episodes, best first.
 
     Args:
-      buffer: of one run.
-      max_episode_steps: one of so many steps is whole, wherever it is.
-      max_steps: what `good_trajectories.insert` was limited to.
+      buffer: the buffer of one run.
+      max_episode_steps: length of a full episode, which is complete in any case.
+      max_steps: the `max_steps` of `good_trajectories.insert`.
     """
     size = int(buffer.size)
     bounds = [*np.flatnonzero(np.asarray(buffer.time[:size]) == 0), size]
     observation, action = np.asarray(buffer.observation), np.asarray(buffer.action)
-    found = [
+    complete = [
         Episode(observation[start:end], action[start:end], float(buffer.return_[start]))
         for start, end in itertools.pairwise(bounds)
     ]
     most = buffer.capacity if max_steps is None else min(buffer.capacity, max_steps)
-    if size >= int(most) and len(found[-1].action) < max_episode_steps:
-        found.pop()
-    return found
+    if size >= int(most) and len(complete[-1].action) < max_episode_steps:
+        complete.pop()
+    return complete
 
 
 def check_name(name: str) -> None:
-    """Refuse a name that is malformed or taken.
+    """Check that a data set can be created under a name.
 
     Raises:
-      InputError: that, or Minari is not installed.
+      InputError: if the name is malformed or taken, or if Minari is not installed.
     """
     try:
         from minari.dataset.minari_dataset import parse_dataset_id
@@ -120,16 +121,16 @@ def check_name(name: str) -> None:
         raise InputError(f"name is {name!r}, which exists: name a new data set")
 
 
-def write(name: str, found: Sequence[Episode], **metadata: str) -> None:
-    """Make a data set of Minari; see the module for what is filled in.
+def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
+    """Create a Minari data set; the module's docstring says what is filled in.
 
     Args:
-      name: that `check_name` takes.
-      found: one or more.
-      **metadata: of `minari.create_dataset_from_buffers`.
+      name: a name that `check_name` accepts.
+      complete: one or more complete episodes.
+      **metadata: further arguments of `minari.create_dataset_from_buffers`.
 
     Raises:
-      OSError: it can't be written; nothing is left of it.
+      OSError: if it can't be written; nothing is left of it.
     """
     import gymnasium
     import minari
@@ -148,17 +149,17 @@ def write(name: str, found: Sequence[Episode], **metadata: str) -> None:
             terminations=[False] * len(episode.action),
             truncations=[False] * (len(episode.action) - 1) + [True],
         )
-        for index, episode in enumerate(found)
+        for index, episode in enumerate(complete)
     ]
     try:
         with warnings.catch_warnings():
-            # On an author and an environment, which it does without.
+            # Minari warns that the author and the environment are missing.
             warnings.simplefilter("ignore", UserWarning)
             minari.create_dataset_from_buffers(
                 name,
                 buffers,
-                observation_space=space(found[0].observation),
-                action_space=space(found[0].action),
+                observation_space=space(complete[0].observation),
+                action_space=space(complete[0].action),
                 **metadata,
             )
     except BaseException:
@@ -167,7 +168,7 @@ def write(name: str, found: Sequence[Episode], **metadata: str) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 
@@ -180,13 +181,13 @@ def _main(arguments: Sequence[str] | None) -> None:
     limit = train.max_episode_steps(env, config)
     most = states.hyperparameters.buffer_steps
     buffers = jax.device_get((states.good_trajectories, most))
-    members = [member(buffers, place) for place in range(len(seeds))]
-    found = [
+    members = [member(buffers, index) for index in range(len(seeds))]
+    complete = [
         episode
         for buffer, max_steps in members
         for episode in episodes(buffer, limit, max_steps)
     ]
-    if not found:
+    if not complete:
         raise InputError(f"run is {options.run}: no whole episode is in its buffer")
     described = run_folder.read(options.run)
     settings = dataclasses.asdict(described["settings"])
@@ -194,12 +195,12 @@ def _main(arguments: Sequence[str] | None) -> None:
         run=options.run.resolve().name,
         agent=config.agent,
         env=f"{described['env']} {settings}",
-        # A sweep's points may differ in it.
+        # The points of a sweep may have different gammas.
         gamma=float(states.hyperparameters.gamma[0]),
     )
-    write(options.name, found, algorithm_name=config.agent, description=description)
-    steps = sum(len(episode.action) for episode in found)
-    print(f"{len(found)} episodes, {steps} steps in {options.name}")
+    write(options.name, complete, algorithm_name=config.agent, description=description)
+    steps = sum(len(episode.action) for episode in complete)
+    print(f"{len(complete)} episodes, {steps} steps in {options.name}")
 
 
 if __name__ == "__main__":

@@ -2,10 +2,10 @@
 
 Paper, section 4.1. The capacity is in steps. All steps ever offered are ordered by
 (return descending, episode, time) and the first `capacity` are kept, so the last
-admitted episode may be cut; on a tie the older episode stays. An episode enters
-whole, once it has ended, with the discounted return R = sum_t gamma^t r_t of the
-environment's own reward. Pure functions on arrays: they work under jit, vmap and
-shard_map, and an empty buffer is a normal state.
+admitted episode may be cut. On a tie the older episode stays. An episode is offered as
+a whole once it has ended. It is ranked by the discounted return R = sum_t gamma^t r_t
+of the environment's own reward. All functions are pure and work under jit, vmap and
+shard_map; an empty buffer is a normal state.
 """
 
 import chex
@@ -13,19 +13,19 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Shape letters: C capacity in steps, E episodes on offer, H steps of history of an
+# Shape letters: C capacity in steps, E offered episodes, H steps of history per
 # environment, N environments.
 
 
 class GoodTrajectories(struct.PyTreeNode):
-    """The best steps so far, best episode first, each in the order of time.
+    """The best steps so far: best episode first, and in time order within each.
 
     Attributes:
       observation: float32 (C, obs), not normalized.
       action: float32 (C, action).
       return_: float32 (C,), the return of the step's episode; -inf where empty.
-      time: int32 (C,), the step's place in its episode.
-      size: int32 (), how many steps are filled, always the first ones.
+      time: int32 (C,), the step's index in its episode.
+      size: int32 (), number of filled steps; they are the first ones.
     """
 
     observation: jax.Array
@@ -36,19 +36,19 @@ class GoodTrajectories(struct.PyTreeNode):
 
     @property
     def capacity(self) -> int:
-        """Most steps that fit."""
+        """The largest number of steps that fit."""
         return self.return_.shape[-1]
 
 
 class History(struct.PyTreeNode):
-    """The last H steps of each environment, a ring over time.
+    """The last H steps of each environment, as a ring buffer over time.
 
     Attributes:
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
-      reward: float32 (N, H), the environment's own.
-      ended: bool (N, H), the step was its episode's last.
-      cursor: int32 (), where the next step is written.
+      reward: float32 (N, H), the environment's own reward.
+      ended: bool (N, H), whether the step was the last of its episode.
+      cursor: int32 (), index at which the next step is written.
     """
 
     observation: jax.Array
@@ -59,13 +59,13 @@ class History(struct.PyTreeNode):
 
 
 class Episodes(struct.PyTreeNode):
-    """Ended episodes on offer; entries with ``length == 0`` are none.
+    """Ended episodes offered to the buffer; entries with ``length == 0`` are empty.
 
     Attributes:
-      return_: float32 (E,).
-      length: int32 (E,), steps.
-      env: int32 (E,), the environment it ran in.
-      last: int32 (E,), the place of its last step in the ring of its environment.
+      return_: float32 (E,), discounted return.
+      length: int32 (E,), number of steps.
+      env: int32 (E,), index of the environment that the episode ran in.
+      last: int32 (E,), index of its last step in that environment's ring.
     """
 
     return_: jax.Array
@@ -75,7 +75,7 @@ class Episodes(struct.PyTreeNode):
 
 
 def init(capacity: int, observation_size: int, action_size: int) -> GoodTrajectories:
-    """An empty buffer."""
+    """Return an empty buffer."""
     if capacity < 1:
         raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
     return GoodTrajectories(
@@ -94,9 +94,9 @@ def init_history(
     observation_size: int,
     action_size: int,
 ) -> History:
-    """A ring that holds any episode that ends within the last `num_steps` steps.
+    """Return an empty history, long enough for every episode that ends in a batch.
 
-    Its length is a multiple of `num_steps`, so that a batch is written in one piece.
+    Its length H is a multiple of `num_steps`, so that a batch is written in one piece.
     """
     batches = -(-(max_episode_steps + num_steps) // num_steps)
     length = batches * num_steps
@@ -104,7 +104,7 @@ def init_history(
         observation=jnp.zeros((num_envs, length, observation_size), jnp.float32),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
         reward=jnp.zeros((num_envs, length), jnp.float32),
-        # No episode reaches back to before the first step.
+        # No episode reaches back beyond the first step.
         ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
     )
@@ -117,10 +117,10 @@ def record(
     reward: jax.Array,
     ended: jax.Array,
 ) -> History:
-    """Write a batch over the oldest steps.
+    """Return the history with a batch written over the oldest steps.
 
     Args:
-      history: where to.
+      history: the history before the batch.
       observation: float32 (time, N, obs).
       action: float32 (time, N, action).
       reward: float32 (time, N).
@@ -143,25 +143,25 @@ def record(
 def ended_episodes(
     history: History, ended: jax.Array, return_: jax.Array, length: jax.Array
 ) -> Episodes:
-    """The episodes that ended in the batch that was recorded last, oldest first.
+    """Return the episodes that ended in the last recorded batch, oldest first.
 
     Args:
-      history: after `record` of that batch.
-      ended: bool (time, N), the episode ended with this step.
-      return_: float32 (time, N), the discounted return of the episode up to here.
-      length: int32 (time, N), its steps up to here.
+      history: the history after `record` of that batch.
+      ended: bool (time, N), whether the episode ended with this step.
+      return_: float32 (time, N), the episode's discounted return up to this step.
+      length: int32 (time, N), the episode's number of steps up to this one.
     """
     chex.assert_equal_shape([ended, return_, length])
     num_steps, num_envs = ended.shape
     ring = history.observation.shape[1]
-    first = history.cursor - num_steps  # the batch's place in the ring
-    place = (first + jnp.arange(num_steps, dtype=jnp.int32)) % ring
+    first = history.cursor - num_steps  # the batch's first index in the ring
+    index = (first + jnp.arange(num_steps, dtype=jnp.int32)) % ring
     env = jnp.arange(num_envs, dtype=jnp.int32)
     return Episodes(
         return_=return_.ravel(),
         length=jnp.where(ended, length, 0).ravel(),
         env=jnp.broadcast_to(env, ended.shape).ravel(),
-        last=jnp.broadcast_to(place[:, None], ended.shape).ravel(),
+        last=jnp.broadcast_to(index[:, None], ended.shape).ravel(),
     )
 
 
@@ -171,25 +171,29 @@ def insert(
     episodes: Episodes,
     max_steps: jax.Array | float | None = None,
 ) -> GoodTrajectories:
-    """Keep the best `capacity` steps of the buffer and the ended episodes.
+    """Return the buffer with the best `capacity` of its own and the offered steps.
 
-    At most `max_steps` of them, (), always the same of a buffer: it is then as if
-    that were its capacity, but may be traced.
+    Args:
+      good_trajectories: the buffer before.
+      history: the steps of the offered episodes.
+      episodes: the offered episodes. Those whose return is not finite are rejected;
+        every episode with a step that is not finite must have such a return.
+      max_steps: a smaller capacity, (), which may be traced. A buffer must always be
+        given the same one.
 
-    Sorts whole episodes, not steps, then gathers each kept step from where it is.
-    Episodes with a return that is not finite are refused; `record`ed steps that are
-    not finite must come with such a return.
+    The function sorts whole episodes, not steps, and then gathers every kept step.
     """
     capacity = good_trajectories.capacity
     slot = jnp.arange(capacity, dtype=jnp.int32)
     filled = slot < good_trajectories.size
-    # What is kept already, as episodes: one at each first step, else of length 0.
+    # The buffer's own content as episodes: one at each first step, and elsewhere
+    # entries of length 0.
     starts = filled & (good_trajectories.time == 0)
     next_start = jnp.minimum(
         jnp.flip(jax.lax.cummin(jnp.flip(jnp.where(starts, slot, capacity)))),
         good_trajectories.size,
     )
-    # next_start[i] is the first start at or after i: the end of the one before.
+    # next_start[i] is the first start at or after i, where the episode before it ends.
     following = jnp.append(next_start[1:], good_trajectories.size)
     kept_length = jnp.where(
         starts, jnp.minimum(following, good_trajectories.size) - slot, 0
@@ -197,7 +201,8 @@ def insert(
     offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
     length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
     return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
-    # Stable, and the kept ones come first: on a tie the older episode stays.
+    # The sort is stable and the buffer's own episodes come first, so that on a tie the
+    # older episode stays.
     order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
@@ -212,12 +217,12 @@ def insert(
     offer = jnp.where(is_kept, 0, source - capacity)
     env = episodes.env[offer]
     ring = history.observation.shape[1]
-    place = (episodes.last[offer] - episodes.length[offer] + 1 + time) % ring
+    recorded_index = (episodes.last[offer] - episodes.length[offer] + 1 + time) % ring
 
     filled = slot < size
     gather = lambda kept, recorded: jnp.where(
         filled[:, None],
-        jnp.where(is_kept[:, None], kept[kept_index], recorded[env, place]),
+        jnp.where(is_kept[:, None], kept[kept_index], recorded[env, recorded_index]),
         0.0,
     )
     return GoodTrajectories(
@@ -232,10 +237,9 @@ def insert(
 def sample(
     key: jax.Array, good_trajectories: GoodTrajectories, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Steps drawn uniformly with replacement: (samples, obs), (samples, action).
+    """Draw steps uniformly with replacement: (samples, obs), (samples, action).
 
-    From an empty buffer the result is zeros; look at ``size`` before using it. The
-    key is consumed.
+    An empty buffer gives zeros, so check ``size`` first. The key is consumed.
     """
     uniform = jax.random.uniform(key, (num_samples,))
     index = (uniform * good_trajectories.size).astype(jnp.int32)
@@ -244,7 +248,7 @@ def sample(
 
 
 def mean_return(good_trajectories: GoodTrajectories) -> jax.Array:
-    """Mean over the kept steps of their episodes' return, (); NaN while empty."""
+    """Return the mean of `return_` over all kept steps, (); NaN if there are none."""
     filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
     total = jnp.sum(jnp.where(filled, good_trajectories.return_, 0.0))
     return jnp.where(good_trajectories.size > 0, total, jnp.nan) / jnp.maximum(

@@ -15,7 +15,7 @@ class Learner(struct.PyTreeNode):
 
 
 def init(params: Any, transform: optax.GradientTransformation) -> Learner:
-    """A learner that has taken no step."""
+    """Return a learner with a fresh optimizer state."""
     return Learner(params, transform.init(params))
 
 
@@ -25,13 +25,13 @@ def descend(
     transform: optax.GradientTransformation,
     step_size: jax.Array | float,
 ) -> Learner:
-    """One gradient step.
+    """Take one gradient step.
 
     Args:
-      learner: before it.
-      gradient: of what is minimized, the parameters' structure.
-      transform: without a step size, so that the step size may be traced.
-      step_size: what the transformed gradient is multiplied by, ().
+      learner: the learner before the step.
+      gradient: gradient of the loss, with the parameters' structure.
+      transform: the optimizer without a step size, so that the latter may be traced.
+      step_size: (), factor of the transformed gradient.
     """
     updates, optimizer_state = transform.update(gradient, learner.optimizer_state)
     params = jax.tree.map(lambda p, u: p - step_size * u, learner.params, updates)

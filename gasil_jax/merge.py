@@ -1,7 +1,7 @@
-"""One sweep out of its shards: ``python -m gasil_jax.merge OUT``.
+"""Merge the shards of a sweep: ``python -m gasil_jax.merge OUT``.
 
-Writes what the same sweep writes that is not in shards: config.json, results.csv,
-curves.npz, summary.json and sweep.png. The shards are only read.
+Writes the same files as a sweep without shards: config.json, results.csv, curves.npz,
+summary.json and sweep.png. The shards are only read.
 """
 
 import dataclasses
@@ -22,9 +22,9 @@ class Options:
     """Merge the shards of a sweep.
 
     Attributes:
-      folders: the sweep's, with shards/ in it; or those of single shards, wherever they
-        have been copied to.
-      out: folder of the tables; default the sweep's.
+      folders: the folder of the sweep, which holds shards/; or the folders of all its
+        shards, wherever they have been copied to.
+      out: folder to write the tables to; default the folder of the sweep.
     """
 
     folders: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
@@ -32,7 +32,7 @@ class Options:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 

@@ -11,10 +11,10 @@ _LOG_2PI = 1.8378770664093453
 
 
 def orthogonal(scale: float) -> nn.initializers.Initializer:
-    """Flax's orthogonal initializer, one matrix at a time also under `jax.vmap`.
+    """Return Flax's orthogonal initializer, made sequential under `jax.vmap`.
 
-    Several batched QR factorizations in one program can deadlock jaxlib 0.10.1 on
-    CPU; single ones in a loop can't.
+    Several batched QR factorizations in one program can deadlock jaxlib 0.10.1 on a
+    CPU. A loop over single ones can't.
     """
     initializer = nn.initializers.orthogonal(scale)
 
@@ -51,10 +51,10 @@ class MLP(nn.Module):
 
 
 class Policy(nn.Module):
-    """Gaussian policy with a log standard deviation that no state changes.
+    """A Gaussian policy whose log standard deviation does not depend on the state.
 
-    The last layer starts at scale 0.01, so that the first policy is nearly the same
-    everywhere (OpenAI baselines, ppo1).
+    The last layer starts at scale 0.01, so that the initial policy is nearly the same
+    in every state (OpenAI baselines, ppo1).
     """
 
     hidden_sizes: Sequence[int]
@@ -69,7 +69,7 @@ class Policy(nn.Module):
 
 
 class Value(nn.Module):
-    """State value."""
+    """The value of a state."""
 
     hidden_sizes: Sequence[int]
 
@@ -94,11 +94,11 @@ class Discriminator(nn.Module):
 def gaussian_log_prob(
     mean: jax.Array, log_std: jax.Array, action: jax.Array
 ) -> jax.Array:
-    """Log density of a diagonal Gaussian: (..., action) -> (...)."""
+    """Return the log density of a diagonal Gaussian: (..., action) -> (...)."""
     z = (action - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
 
 
 def gaussian_entropy(log_std: jax.Array) -> jax.Array:
-    """Entropy of a diagonal Gaussian in nats: (..., action) -> (...)."""
+    """Return the entropy of a diagonal Gaussian in nats: (..., action) -> (...)."""
     return jnp.sum(log_std + 0.5 * (_LOG_2PI + 1.0), axis=-1)

@@ -5,20 +5,20 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Of C MuJoCo (mjMAXVAL): what is larger it takes for a simulation that has failed.
+# From C MuJoCo (mjMAXVAL), for which a larger number means a failed simulation.
 _LARGEST = 1e10
 
 
 def is_sound(x: jax.Array) -> jax.Array:
-    """Whether numbers are finite and of a size that physics gives, bool, x's shape."""
-    return jnp.abs(x) < _LARGEST  # NaN is not.
+    """Return where numbers are finite and no larger than physics gives: x's shape."""
+    return jnp.abs(x) < _LARGEST  # False for NaN.
 
 
 class Normalizer(struct.PyTreeNode):
-    """Mean and variance of all observations so far.
+    """The mean and variance of all observations so far.
 
     Attributes:
-      count: observations seen, float32 ().
+      count: number of observations, float32 ().
       mean: float32 (obs,).
       m2: sum of squared differences from the mean, float32 (obs,).
     """
@@ -29,16 +29,17 @@ class Normalizer(struct.PyTreeNode):
 
 
 def init(observation_size: int) -> Normalizer:
-    """A normalizer that has seen nothing and changes nothing but the clip."""
-    # An array for each: one in two places could not be donated.
+    """Return a normalizer without observations; until it has some it only clips."""
+    # Each field needs its own array: a shared one could not be donated.
     zeros = lambda: jnp.zeros(observation_size, jnp.float32)
     return Normalizer(jnp.float32(0), zeros(), zeros())
 
 
 def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
-    """Take in a batch (..., obs); rows with a number that is not sound are left out.
+    """Return the normalizer updated by a batch (..., obs).
 
-    Chan, Golub, LeVeque 1979: parallel update of mean and sum of squares.
+    Rows with a number for which `is_sound` is false are left out. Mean and sum of
+    squares are updated as in Chan, Golub, LeVeque 1979.
     """
     chex.assert_equal(observation.shape[-1:], normalizer.mean.shape)
     rows = observation.reshape(-1, observation.shape[-1])
@@ -58,7 +59,7 @@ def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
 
 
 def moments(normalizer: Normalizer) -> tuple[jax.Array, jax.Array]:
-    """What `normalize` subtracts and divides by, (..., obs) each."""
+    """Return the mean and scale that `normalize` uses, (..., obs) each."""
     count = normalizer.count[..., None]
     variance = jnp.where(count > 0, normalizer.m2 / jnp.maximum(count, 1.0), 1.0)
     return normalizer.mean, jnp.sqrt(variance + 1e-8)
@@ -67,6 +68,6 @@ def moments(normalizer: Normalizer) -> tuple[jax.Array, jax.Array]:
 def normalize(
     normalizer: Normalizer, observation: jax.Array, clip: float = 10.0
 ) -> jax.Array:
-    """Observations (..., obs) at mean 0 and variance 1, clipped to +-`clip`."""
+    """Scale observations (..., obs) to mean 0 and variance 1, clipped to +-`clip`."""
     mean, scale = moments(normalizer)
     return jnp.clip((observation - mean) / scale, -clip, clip)

@@ -1,4 +1,4 @@
-"""Arrays from an ``.npz`` that may be anything; NumPy alone."""
+"""Read arrays from an untrusted ``.npz`` file, with NumPy alone."""
 
 import pathlib
 import zipfile
@@ -8,18 +8,24 @@ import numpy as np
 
 
 def read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Every array of the file by its name; nothing is unpickled.
+    """Return every array of the file by its name; nothing is unpickled.
 
     Raises:
-      ValueError: what is wrong with it, in one line.
+      ValueError: if the file can't be read; the message is one line.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
             return {name: file[name] for name in file.files}
-    # A single array, a file cut off and one with wrong bits raise an error each.
+    # A single array, a truncated file and a corrupt one raise different errors.
     except (
-        *(OSError, ValueError, KeyError, TypeError, AttributeError, EOFError),
-        *(zipfile.BadZipFile, zlib.error),
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        EOFError,
+        zipfile.BadZipFile,
+        zlib.error,
     ) as error:
         reason = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(reason) from None

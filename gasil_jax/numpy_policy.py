@@ -1,4 +1,4 @@
-"""A saved policy in NumPy alone: this module and what it imports need no JAX.
+"""Run a saved policy with NumPy alone; this module does not import JAX.
 
     act = gasil_jax.numpy_policy.load("runs/hopper")
     action = act(observation)
@@ -20,31 +20,38 @@ import numpy as np
 
 from gasil_jax import npz
 
-#: Normalized observations are clipped to plus and minus this.
+#: Normalized observations are clipped to plus and minus this number.
 CLIP = 10.0
 
-_NEEDED = (
-    *("seeds", "final_return", "mean", "scale", "log_std", "low", "high"),
-    *("kernel_0", "bias_0"),
+_REQUIRED = (
+    "seeds",
+    "final_return",
+    "mean",
+    "scale",
+    "log_std",
+    "low",
+    "high",
+    "kernel_0",
+    "bias_0",
 )
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
-    """The arrays of one seed's policy.
+    """Return the arrays of one seed's policy.
 
     Args:
-      path: the file, or the folder of a finished run.
-      seed: its number; default the one with the highest final return.
+      path: the file ``policy.npz``, or the folder of a finished run.
+      seed: number of the seed; default the one with the highest final return.
 
     Raises:
-      ValueError: it is not a policy's file, or has no such seed.
+      ValueError: if it is not a saved policy, or has no such seed.
     """
     path = pathlib.Path(path)
     if path.is_dir():
         path = path / "policy.npz"
     try:
         arrays = npz.read(path)
-        if missing := [name for name in _NEEDED if name not in arrays]:
+        if missing := [name for name in _REQUIRED if name not in arrays]:
             raise ValueError(f"{missing[0]} is missing")
     except ValueError as error:
         raise ValueError(f"{path} is not a saved policy ({error})") from None
@@ -62,12 +69,12 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
 def mean_and_log_std(
     weights: Mapping[str, Any], observation: Any, xp: Any = np
 ) -> tuple[Any, Any]:
-    """The policy's Gaussian at observations (..., obs): (..., action), (action,).
+    """Return the policy's mean (..., action) and log standard deviation (action,).
 
     Args:
-      weights: of `read`.
-      observation: not normalized.
-      xp: numpy or jax.numpy.
+      weights: the arrays from `read`.
+      observation: (..., obs), not normalized.
+      xp: the array module, numpy or jax.numpy.
     """
     x = (observation - weights["mean"]) / weights["scale"]
     x = xp.clip(x, -CLIP, CLIP)
@@ -81,19 +88,20 @@ def mean_and_log_std(
 def load(
     path: str | pathlib.Path, seed: int | None = None
 ) -> Callable[..., np.ndarray]:
-    """``act(observation, generator=None)``: (..., obs) -> (..., action), clipped.
+    """Return a saved policy as a function of observations.
 
-    With a `numpy.random.Generator` the action is drawn from the policy, without one it
-    is the policy's mean.
+    The function is ``act(observation, generator=None)``, (..., obs) -> (..., action).
+    It clips actions to their range. With a `numpy.random.Generator` the action is drawn
+    from the policy; without one it is the policy's mean.
 
     Raises:
-      ValueError: see `read`.
+      ValueError: as in `read`.
     """
     return make(read(path, seed))
 
 
 def make(weights: Mapping[str, np.ndarray]) -> Callable[..., np.ndarray]:
-    """As `load`, of arrays that are at hand."""
+    """Return the policy with these arrays, as `load` does for a file."""
 
     def act(
         observation: np.ndarray, generator: np.random.Generator | None = None

@@ -1,4 +1,4 @@
-"""Figures of one or several runs: ``python -m gasil_jax.plot RUN [RUN ...]``."""
+"""Plot one or several runs: ``python -m gasil_jax.plot RUN [RUN ...]``."""
 
 import dataclasses
 import pathlib
@@ -23,10 +23,10 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders; those of one environment and agent that differ in their seeds
-        alone are not joined.
-      out: the image, PNG, PDF or SVG.
-      labels: of the runs; default environment and agent.
+      runs: folders of the runs; each is a curve of its own, even if they differ only
+        in their seeds.
+      out: image file to write: PNG, PDF or SVG.
+      labels: labels of the runs; default environment and agent.
     """
 
     runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
@@ -35,15 +35,15 @@ class Options:
 
 
 class Curves(NamedTuple):
-    """One run.
+    """The curves of one run.
 
     Attributes:
-      label: in the legend.
+      label: label in the legend.
       env_steps: (points,).
-      returns: (seeds, points), each the mean of the episodes since the point before.
-      final: (seeds,), mean over the last tenth of training.
-      evaluations: "env_steps" and "mean" of those on the way, (seeds, evaluations)
-        each; None without any.
+      returns: (seeds, points), mean return of the episodes since the previous point.
+      final: (seeds,), mean return over the last tenth of training.
+      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
+        evaluations) each; None if there are none.
     """
 
     label: str
@@ -57,10 +57,10 @@ _POINTS = 50
 
 
 def read(folder: pathlib.Path, label: str | None = None) -> Curves:
-    """The returns of a run, finished or not.
+    """Return the curves of a run, which need not be finished.
 
     Raises:
-      InputError: it is not a run's folder, or no episode has ended in it.
+      InputError: if it is not the folder of a run, or if no episode has ended in it.
     """
     described = run_folder.read(folder)
     if "points" in described:
@@ -69,7 +69,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
             "curves.npz"
         )
     path, evaluations = folder / "evaluations.csv", None
-    # It may be too early for the first one.
+    # The file may still be empty.
     if path.is_file() and path.stat().st_size:
         evaluations = metrics_files.read_metrics(path, ("seed",), described["seeds"])
     path = folder / "metrics.csv"
@@ -79,28 +79,28 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     except (OSError, ValueError, KeyError, IndexError) as error:
         raise InputError(f"{path} has no curves to draw ({error})") from None
     count = min(_POINTS, len(steps))
-    # The first of so many equal parts of training, and so on.
+    # Training is divided into this many equal parts.
     parts = np.array_split(np.arange(len(steps)), count)
     mean = lambda x: np.array([row[np.isfinite(row)].mean() for row in x])
-    some = [p for p in parts if np.isfinite(returns[:, p]).any(axis=1).all()]
-    if not some:
+    complete = [p for p in parts if np.isfinite(returns[:, p]).any(axis=1).all()]
+    if not complete:
         raise InputError(f"{path}: not every seed has ended an episode")
     default = f"{described['env']}, {described['config'].agent}"
     return Curves(
         label=label or default,
-        env_steps=np.array([steps[p[-1]] for p in some]),
-        returns=np.stack([mean(returns[:, p]) for p in some], axis=1),
+        env_steps=np.array([steps[p[-1]] for p in complete]),
+        returns=np.stack([mean(returns[:, p]) for p in complete], axis=1),
         final=final_returns(returns),
         evaluations=evaluations,
     )
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
-    """Write the figure: the interquartile mean over seeds, with 95% intervals.
+    """Write the figure: interquartile means over seeds, with 95% intervals.
 
-    Left, over environment steps, dashed of the evaluations on the way; in the middle,
-    of the final returns, with every seed; right, the share of seeds above each final
-    return.
+    The left panel shows returns over environment steps, with evaluations dashed. The
+    middle panel shows final returns, with a dot for each seed. The right panel shows
+    the share of seeds above each final return.
     """
     import matplotlib
 
@@ -144,7 +144,7 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 

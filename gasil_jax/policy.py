@@ -1,4 +1,4 @@
-"""Policies out of training states, and back into JAX."""
+"""Turn training states and saved policies into JAX functions."""
 
 import pathlib
 from collections.abc import Callable
@@ -13,7 +13,10 @@ from gasil_jax import normalization, numpy_policy
 
 
 def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
-    """The arrays of `numpy_policy` of a `TrainState`, or (seeds, ...) of a batch."""
+    """Return a `TrainState`'s policy as the arrays that `numpy_policy` describes.
+
+    From a batch of states every array but "low" and "high" is (seeds, ...).
+    """
     params = jax.tree.map(np.asarray, state.actor_critic.policy.params["params"])
     layers = params["MLP_0"]
     low, high = getattr(env, "action_range", (-1.0, 1.0))
@@ -35,23 +38,24 @@ def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
 def load_policy(
     path: str | pathlib.Path, seed: int | None = None
 ) -> Callable[..., jax.Array]:
-    """``policy(observation, key=None)``: (..., obs) -> (..., action), clipped.
+    """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
 
-    A pure function for `jax.jit` and `jax.vmap`. Without a key the action is the
-    policy's mean, with one it is drawn; the key is consumed.
+    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action). It
+    clips actions to their range. Without a key the action is the policy's mean; with a
+    key it is drawn from the policy. The key is consumed.
 
     Args:
-      path: of the folder of a finished run, or of its ``policy.npz``.
-      seed: its number; default the one with the highest final return.
+      path: the folder of a finished run, or its file ``policy.npz``.
+      seed: number of the seed; default the one with the highest final return.
 
     Raises:
-      ValueError: it is not a policy's file, or has no such seed.
+      ValueError: if it is not a saved policy, or has no such seed.
     """
     return _make(numpy_policy.read(path, seed))
 
 
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """As `load_policy`, of one run's `TrainState`."""
+    """Return the policy of a single `TrainState`, as `load_policy` does for a file."""
     return _make(weights(state, env))
 
 

@@ -16,11 +16,11 @@ from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
 
 
 class ActorCritic(struct.PyTreeNode):
-    """The policy, and a value for each reward stream, each with its optimizer.
+    """The policy and one value per reward stream, each with its own optimizer.
 
     Attributes:
-      policy: of `networks.Policy`.
-      values: of `networks.Value`, (stream) of them.
+      policy: a learner of `networks.Policy`.
+      values: a learner of `networks.Value` for each stream.
     """
 
     policy: Learner
@@ -28,7 +28,7 @@ class ActorCritic(struct.PyTreeNode):
 
     @property
     def params(self) -> dict[str, Any]:
-        """Parameters of every network: {"policy": ..., "values": (stream)}."""
+        """The parameters of every network: {"policy": ..., "values": (stream)}."""
         return {
             "policy": self.policy.params,
             "values": tuple(value.params for value in self.values),
@@ -36,12 +36,12 @@ class ActorCritic(struct.PyTreeNode):
 
 
 class Batch(struct.PyTreeNode):
-    """What PPO learns from; the leading axis is (steps,) or (minibatch,).
+    """The steps that PPO learns from; the leading axis is (steps,) or (minibatch,).
 
     Attributes:
       observation: float32 (steps, obs), normalized.
       action: float32 (steps, action).
-      log_prob: float32 (steps,), under the policy that acted.
+      log_prob: float32 (steps,), log density under the policy that acted.
       advantage: float32 (steps,).
       returns: float32 (steps, stream), targets of the values.
     """
@@ -63,17 +63,21 @@ def generalized_advantage_estimation(
     gamma: jax.Array | float,
     gae_lambda: jax.Array | float,
 ) -> jax.Array:
-    """GAE(lambda), Schulman et al. 2016, equation 16: (time, ...) -> (time, ...).
+    """Return the advantages of GAE(lambda) (Schulman et al. 2016, equation 16).
 
     Args:
-      reward: float32 (time, ...), of environments, or of environments and streams.
-      value: float32 (time, ...), V of the observation.
-      next_value: float32 (time, ...), V of the observation that followed, the
-        final one of an episode that ended: a truncated episode is bootstrapped.
-      terminated: bool, of a shape that broadcasts to it: the future is worth nothing.
-      ended: bool, the same: terminated or truncated, the sum stops here.
+      reward: float32 (time, env) or (time, env, stream).
+      value: float32, the same shape, V of the observation.
+      next_value: float32, the same shape, V of the next observation. At the end of an
+        episode it is V of the final observation, which bootstraps truncated episodes.
+      terminated: bool, broadcasts to the reward; the future after this step is worth 0.
+      ended: bool, the shape of `terminated`; terminated or truncated, so that the sum
+        stops at this step.
       gamma: discount.
       gae_lambda: lambda.
+
+    Returns:
+      float32, the shape of the reward.
     """
     chex.assert_equal_shape([reward, value, next_value])
     chex.assert_equal_shape([terminated, ended])
@@ -91,9 +95,9 @@ def generalized_advantage_estimation(
 
 
 def standardize(advantage: jax.Array) -> jax.Array:
-    """Advantages (time, env, stream) at mean 0 and variance 1, each stream for itself.
+    """Scale the advantages (time, env, stream) of each stream to mean 0 and variance 1.
 
-    Over the whole batch, as OpenAI baselines' ppo1 has it.
+    Mean and variance are over the whole batch, as in OpenAI baselines' ppo1.
     """
     mean = jnp.mean(advantage, axis=(0, 1))
     return (advantage - mean) / (jnp.std(advantage, axis=(0, 1)) + 1e-8)
@@ -110,27 +114,27 @@ def evaluate_streams(
     value: Callable[[Any, jax.Array], jax.Array],
     hyperparameters: Hyperparameters,
 ) -> tuple[jax.Array, jax.Array]:
-    """Values and advantages of every reward stream, (time, env, stream) each.
+    """Return values and advantages of every reward stream, (time, env, stream) each.
 
     Args:
-      actor_critic: with a value for each stream.
+      actor_critic: the networks, with a value for each stream.
       rewards: float32 (time, env, stream).
       observation: float32 (time, env, obs), normalized.
-      next_observation: the same of those that followed.
+      next_observation: float32 (time, env, obs), normalized.
       terminated: bool (time, env).
       ended: bool (time, env).
       value: (params, observation) -> value.
       hyperparameters: discount and lambda.
     """
     chex.assert_equal(rewards.shape, (*terminated.shape, len(actor_critic.values)))
-    of_all = lambda observation: jnp.stack(
+    evaluate = lambda observation: jnp.stack(
         [value(critic.params, observation) for critic in actor_critic.values], axis=-1
     )
-    values = of_all(observation)
+    values = evaluate(observation)
     advantage = generalized_advantage_estimation(
         rewards,
         values,
-        of_all(next_observation),
+        evaluate(next_observation),
         terminated[..., None],
         ended[..., None],
         gamma=hyperparameters.gamma,
@@ -147,7 +151,9 @@ def loss(
     value: Callable[[Any, jax.Array], jax.Array],
     hyperparameters: Hyperparameters,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate (Schulman et al. 2017, equation 7), value error and entropy.
+    """Return PPO's loss: clipped surrogate, value error and entropy.
+
+    See Schulman et al. 2017, equations 7 and 9.
 
     Args:
       params: {"policy": ..., "values": (stream)}.
@@ -157,7 +163,7 @@ def loss(
       hyperparameters: clip range and weights.
 
     Returns:
-      The loss, (), and its parts.
+      The loss, (), and its parts as metrics.
     """
     chex.assert_equal_shape([batch.log_prob, batch.advantage])
     chex.assert_equal(
@@ -194,10 +200,11 @@ def loss(
 
 
 def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
-    """Adam behind a clip of the gradient's norm, for one network, without step size.
+    """Return one network's optimizer: a clip of the gradient's norm, then Adam.
 
-    On the parameters as one vector: of networks this small an operation costs its
-    start, so one for each layer cost a CPU a tenth of the training time.
+    It leaves the step size to the caller. It treats the parameters as one vector,
+    because networks this small spend their time on starting operations: one operation
+    per layer took a tenth of the training time on a CPU.
     """
     transform = optax.chain(
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
@@ -209,18 +216,20 @@ def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
 def descend(
     actor_critic: ActorCritic, gradient: Any, hyperparameters: Hyperparameters
 ) -> ActorCritic:
-    """One step of every network, each clipped for itself.
+    """Take one gradient step of every network; each gradient is clipped by itself.
 
     Args:
-      actor_critic: before it.
+      actor_critic: the networks before the step.
       gradient: {"policy": ..., "values": (stream)}.
-      hyperparameters: the step size and the largest norm of a gradient.
+      hyperparameters: give the step size and the largest norm of a gradient.
     """
     return ActorCritic(
         policy=descend_one(actor_critic.policy, gradient["policy"], hyperparameters),
         values=tuple(
-            descend_one(value, own, hyperparameters)
-            for value, own in zip(actor_critic.values, gradient["values"], strict=True)
+            descend_one(value, its_gradient, hyperparameters)
+            for value, its_gradient in zip(
+                actor_critic.values, gradient["values"], strict=True
+            )
         ),
     )
 
@@ -228,7 +237,7 @@ def descend(
 def descend_one(
     network: Learner, gradient: Any, hyperparameters: Hyperparameters
 ) -> Learner:
-    """One step of one network, by its gradient."""
+    """Take one gradient step of one network."""
     transform = optimizer(hyperparameters)
     return learner.descend(network, gradient, transform, hyperparameters.learning_rate)
 
@@ -243,19 +252,19 @@ def update(
     config: Config,
     hyperparameters: Hyperparameters,
 ) -> tuple[ActorCritic, dict[str, jax.Array]]:
-    """`num_epochs` passes over the batch in shuffled minibatches.
+    """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
     Args:
-      actor_critic: before it.
-      batch: (steps, ...), advantages already standardized.
-      key: consumed.
+      actor_critic: the networks before.
+      batch: (steps, ...), with standardized advantages.
+      key: random key; consumed.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
-      config: counts and sizes.
-      hyperparameters: the floats of this iteration.
+      config: gives the numbers and sizes of minibatches.
+      hyperparameters: their values in this iteration.
 
     Returns:
-      the networks, and the metrics' means over all minibatches.
+      The networks after, and the mean of each metric over all minibatches.
     """
 
     def minibatch_step(actor_critic: ActorCritic, rows: jax.Array) -> Any:

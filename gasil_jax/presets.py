@@ -1,13 +1,16 @@
-"""Where a run's hyperparameters start from: a table, by environment, agent and delay.
+"""Tables of hyperparameters that runs start from, by environment, agent and delay.
 
-A row overrides `Config`'s and `Hyperparameters`' defaults; a flag overrides a row.
-"tuned" has only what was measured: of the locomotion tasks what the search chose, with
-the environments that it ran with. Four have normalized rewards
-(experiments/results/normalized_rewards.md), ant and humanoid rewards as they are
-(random_search.md): an alpha is of the unit that it was tuned in, so that another is
-wanted where a flag changes that. "paper" has the paper's batch, one environment x 2,048
-steps, what the appendix names for a task, and the defaults, which are the appendix's,
-for the rest. One environment is slow: the cost of a step is shared by the seeds alone.
+A row overrides the defaults of `Config` and `Hyperparameters`; a flag overrides a row.
+
+"tuned" holds only what was measured. For the locomotion tasks this is what the search
+chose, with the number of environments that it ran with. Four tasks have normalized
+rewards (experiments/results/normalized_rewards.md); ant and humanoid have plain ones
+(random_search.md). Alpha was tuned in the unit of these rewards, so a flag that changes
+the unit needs another alpha.
+
+"paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
+gives for a task. The rest are the defaults, which are the appendix's too. A single
+environment is slow, because only the seeds share the cost of a step.
 """
 
 import types
@@ -23,8 +26,8 @@ Overrides = Mapping[str, Any]
 Rows = Mapping[tuple[str, str], Overrides]
 
 
-class _Found(NamedTuple):
-    """What the search chose for the agents of a task."""
+class _Chosen(NamedTuple):
+    """The hyperparameters that the search chose for the agents of a task."""
 
     behavior_cloning_coefficient: float
     sil_coefficient: float
@@ -32,26 +35,28 @@ class _Found(NamedTuple):
     discriminator_updates: int
     discriminator_learning_rate: float
     buffer_steps: int
-    #: Agents whose learning rate is 1e-4; the others' is 3e-4.
+    #: Agents with the learning rate 1e-4; the others have 3e-4.
     slower: tuple[str, ...] = ()
 
 
-# What each agent has of it.
+# The chosen hyperparameters that each agent uses.
 _NAMES: Mapping[str, tuple[str, ...]] = {
     "ppo": (),
     "ppo+bc": ("behavior_cloning_coefficient",),
     "ppo+sil": ("sil_coefficient",),
     "ppo+gasil": (
-        *("alpha", "discriminator_updates"),
-        *("discriminator_learning_rate", "buffer_steps"),
+        "alpha",
+        "discriminator_updates",
+        "discriminator_learning_rate",
+        "buffer_steps",
     ),
 }
 
 
-def _rows(found: Mapping[str, _Found], shared: Overrides) -> Rows:
-    """Rows of every agent on every task, with what all of them share."""
+def _rows(tasks: Mapping[str, _Chosen], shared: Overrides) -> Rows:
+    """Return the rows of every agent on every task, with the shared overrides."""
     rows: dict[tuple[str, str], Overrides] = {}
-    for env, chosen in found.items():
+    for env, chosen in tasks.items():
         for agent, names in _NAMES.items():
             row = {name: getattr(chosen, name) for name in names} | dict(shared)
             if agent in chosen.slower:
@@ -62,25 +67,25 @@ def _rows(found: Mapping[str, _Found], shared: Overrides) -> Rows:
 
 _NORMALIZED = {"normalize_rewards": True, "num_envs": 32}
 _DENSE = {
-    "hopper": _Found(0.1, 0.01, 0.1, 10, 1e-4, 10_000),
-    "walker2d": _Found(0.1, 1.0, 0.02, 5, 2e-5, 10_000),
-    "halfcheetah": _Found(0.01, 0.1, 0.02, 5, 2e-5, 10_000),
-    "swimmer": _Found(1.0, 1.0, 0.02, 5, 2e-5, 10_000),
+    "hopper": _Chosen(0.1, 0.01, 0.1, 10, 1e-4, 10_000),
+    "walker2d": _Chosen(0.1, 1.0, 0.02, 5, 2e-5, 10_000),
+    "halfcheetah": _Chosen(0.01, 0.1, 0.02, 5, 2e-5, 10_000),
+    "swimmer": _Chosen(1.0, 1.0, 0.02, 5, 2e-5, 10_000),
 }
 _DELAYED = {
-    "hopper": _Found(1.0, 1.0, 0.2, 20, 1e-5, 1_000),
-    "walker2d": _Found(1.0, 0.1, 1.0, 1, 3e-4, 1_000, slower=("ppo",)),
-    "halfcheetah": _Found(0.3, 0.3, 0.02, 5, 2e-5, 10_000),
-    "swimmer": _Found(1.0, 0.3, 0.02, 1, 1e-5, 10_000, slower=("ppo+gasil",)),
+    "hopper": _Chosen(1.0, 1.0, 0.2, 20, 1e-5, 1_000),
+    "walker2d": _Chosen(1.0, 0.1, 1.0, 1, 3e-4, 1_000, slower=("ppo",)),
+    "halfcheetah": _Chosen(0.3, 0.3, 0.02, 5, 2e-5, 10_000),
+    "swimmer": _Chosen(1.0, 0.3, 0.02, 1, 1e-5, 10_000, slower=("ppo+gasil",)),
 }
-_AS_THEY_ARE = {"num_envs": 64}
-_DENSE_AS_THEY_ARE = {
-    "ant": _Found(0.01, 0.01, 1.0, 10, 1e-5, 10_000),
-    "humanoid": _Found(0.01, 0.01, 0.1, 1, 2e-5, 1_000),
+_PLAIN = {"num_envs": 64}
+_DENSE_PLAIN = {
+    "ant": _Chosen(0.01, 0.01, 1.0, 10, 1e-5, 10_000),
+    "humanoid": _Chosen(0.01, 0.01, 0.1, 1, 2e-5, 1_000),
 }
-_DELAYED_AS_THEY_ARE = {
-    "ant": _Found(0.01, 1.0, 0.1, 10, 1e-4, 10_000),
-    "humanoid": _Found(0.1, 0.01, 0.1, 1, 2e-5, 1_000),
+_DELAYED_PLAIN = {
+    "ant": _Chosen(0.01, 1.0, 0.1, 10, 1e-4, 10_000),
+    "humanoid": _Chosen(0.1, 0.01, 0.1, 1, 2e-5, 1_000),
 }
 
 _STRONG_DISCRIMINATOR = {
@@ -88,7 +93,8 @@ _STRONG_DISCRIMINATOR = {
     "discriminator_updates": 20,
     "discriminator_learning_rate": 3e-4,
 }
-# On the locomotion tasks of delayed rewards, 4 to 8 seeds each, which are not kept.
+# Measured on the locomotion tasks with delayed rewards, 4 to 8 seeds each; those runs
+# are not kept.
 _STRONG = {
     ("point_mass", "gasil"): _STRONG_DISCRIMINATOR,
     ("point_mass", "ppo+gasil"): _STRONG_DISCRIMINATOR,
@@ -101,12 +107,12 @@ _STRONG = {
 
 
 class Preset(NamedTuple):
-    """Overrides by environment and agent, and those of every one.
+    """The overrides of a preset, by environment and agent.
 
     Attributes:
       dense: rows for rewards that are given at every step.
       delayed: rows for delayed rewards.
-      every: what all tasks and agents have; a row overrides it.
+      every: overrides for all tasks and agents; a row takes precedence.
     """
 
     dense: Rows
@@ -119,12 +125,12 @@ PRESETS: Mapping[str, Preset] = {
         {
             **_STRONG,
             **_rows(_DENSE, _NORMALIZED),
-            **_rows(_DENSE_AS_THEY_ARE, _AS_THEY_ARE),
+            **_rows(_DENSE_PLAIN, _PLAIN),
         },
         {
             **_STRONG,
             **_rows(_DELAYED, _NORMALIZED),
-            **_rows(_DELAYED_AS_THEY_ARE, _AS_THEY_ARE),
+            **_rows(_DELAYED_PLAIN, _PLAIN),
         },
     ),
     "paper": Preset(
@@ -143,22 +149,22 @@ PRESETS: Mapping[str, Preset] = {
 
 
 def names() -> tuple[str, ...]:
-    """The presets' names."""
+    """Return the names of the presets."""
     return tuple(PRESETS)
 
 
 def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> Config:
-    """The configuration that runs of `agent` in `env` start from.
+    """Return the config that runs of `agent` in `env` start from.
 
     Args:
-      env: environment's name; of one that has no row it is the defaults and what the
-        preset gives to every task.
-      agent: agent's name.
-      name: one of `names()`.
-      reward_delay: of the environment.
+      env: name of the environment. One without a row gets the defaults and the
+        preset's overrides for all tasks.
+      agent: name of the agent.
+      name: name of the preset, one of `names()`.
+      reward_delay: the environment's reward delay, in steps.
 
     Raises:
-      ValueError: an agent or preset that is unknown.
+      ValueError: if the agent or the preset is unknown.
     """
     if name not in PRESETS:
         raise ValueError(unknown("preset", name, names()))

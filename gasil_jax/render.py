@@ -1,7 +1,7 @@
-"""A film of a run's policy: ``python -m gasil_jax.render RUN --out walk.mp4``.
+"""Make a film of a run's policy: ``python -m gasil_jax.render RUN --out walk.mp4``.
 
-Locomotion is drawn by MuJoCo off screen, or played in a web page by Brax's viewer; the
-point mass is drawn as the path of an episode.
+MuJoCo draws locomotion off screen, or Brax's viewer plays it in a web page. The point
+mass is drawn as the path of an episode.
 """
 
 import copy
@@ -15,7 +15,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
-# MuJoCo looks at it when it is imported; without a display EGL draws on a CPU too.
+# MuJoCo reads this variable on import. Without a display, EGL can draw on a CPU too.
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
     os.environ.setdefault("MUJOCO_GL", "egl")
 
@@ -36,7 +36,7 @@ _PAGE = ".html"
 
 
 class NoOpenGL(RuntimeError):
-    """MuJoCo has nothing to draw with."""
+    """There is no OpenGL for MuJoCo to draw with."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,17 +44,18 @@ class Options:
     """Draw an episode of a run's policy.
 
     Attributes:
-      run: the run's folder, of a finished run or not.
-      out: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a strip of
-        moments; or, of locomotion, .html, to turn and zoom in a browser.
-      seed: whose policy; default the run's first.
-      point: of a sweep, its number in results.csv; default the best by mean.
-      checkpoint: which policies: last, or, of a run, best by mean return in training.
-      steps: at most.
-      width: of a frame, pixels; a page fills its window.
-      height: of a frame, pixels.
+      run: folder of the run or sweep, which need not be finished.
+      out: file to write: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a
+        strip of moments; or, for locomotion, .html, to turn and zoom in a browser.
+      seed: seed of the policy; default the run's first seed.
+      point: number of a sweep's point in results.csv; default the best by mean.
+      checkpoint: checkpoint of the policy: last, or best, which has the best
+        evaluation or, without evaluations, the best mean return in training.
+      steps: largest number of steps.
+      width: width of a frame in pixels; a page fills its window.
+      height: height of a frame in pixels.
       stochastic: draw actions from the policy instead of taking its mean.
-      key: of the episode's start and actions.
+      key: random key of the episode's start and actions.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]
@@ -72,13 +73,13 @@ class Options:
 def episode(
     env: Any, act: Any, key: jax.Array, num_steps: int
 ) -> tuple[list[Any], float]:
-    """The physics states of an episode, from its start on, and its true return.
+    """Return the physics states of an episode, from its start on, and its true return.
 
     Args:
       env: one environment.
       act: (observation, key) -> action.
-      key: consumed.
-      num_steps: at most.
+      key: random key; consumed.
+      num_steps: largest number of steps.
     """
     reset_key, key = jax.random.split(key)
     state = jax.jit(env.reset)(reset_key)
@@ -96,10 +97,10 @@ def episode(
 def locomotion_frames(
     env: Any, states: Sequence[Any], size: tuple[int, int], fps: int = 25
 ) -> tuple[list[np.ndarray], float]:
-    """Pictures (height, width, 3) uint8 of physics states, and frames a second.
+    """Return pictures (height, width, 3) uint8 of physics states, and frames/s.
 
     Raises:
-      NoOpenGL: none can be had.
+      NoOpenGL: if MuJoCo finds no OpenGL.
     """
     import mujoco
 
@@ -130,7 +131,7 @@ def locomotion_frames(
 def point_mass_frames(
     env: Any, states: Sequence[Any], size: tuple[int, int]
 ) -> tuple[list[np.ndarray], float]:
-    """The path so far at each step, as pictures (height, width, 3) uint8."""
+    """Return pictures (height, width, 3) uint8 of the path so far, and frames/s."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -139,17 +140,17 @@ def point_mass_frames(
 
     from gasil_jax.figures import plotting
 
-    places = np.stack([state.position for state in states])
+    positions = np.stack([state.position for state in states])
     figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
     canvas = FigureCanvasAgg(figure)
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     frames = []
-    for count in range(1, len(places) + 1):
+    for count in range(1, len(positions) + 1):
         axes.clear()
         taken = states[count - 1].collected
         plotting.point_mass_layout(axes, env.unwrapped.layout, taken)
-        axes.plot(*places[:count].T, color="0.3", linewidth=1)
-        axes.plot(*places[count - 1], "o", color="black", markersize=6)
+        axes.plot(*positions[:count].T, color="0.3", linewidth=1)
+        axes.plot(*positions[count - 1], "o", color="black", markersize=6)
         axes.set(xticks=[], yticks=[])
         canvas.draw()
         frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
@@ -158,20 +159,20 @@ def point_mass_frames(
 
 
 def locomotion_page(env: Any, states: Sequence[Any]) -> str:
-    """HTML that plays physics states in Brax's viewer, every one of them a frame.
+    """Return an HTML page that plays physics states in Brax's viewer, one per frame.
 
-    The page holds model and states; the viewer's scripts come from the net.
+    The page contains the model and the states; it loads the viewer from the internet.
     """
     import mujoco
     from brax.base import Transform
     from brax.io import html, mjcf
 
-    # Brax writes into the model that it is given, and loads it with MJX, which lacks
-    # humanoid's solver; none is needed to place bodies.
+    # Brax changes the model that it is given, so it gets a copy. It loads it with MJX,
+    # which lacks humanoid's solver; placing bodies needs no solver at all.
     model = copy.copy(env.unwrapped.model)
     model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
     with warnings.catch_warnings():
-        # That Brax's physics is not maintained: it is not used here.
+        # Brax warns that its physics is not maintained; that is not used here.
         warnings.simplefilter("ignore", UserWarning)
         system = mjcf.load_model(model)
     data = mujoco.MjData(env.unwrapped.model)
@@ -179,10 +180,10 @@ def locomotion_page(env: Any, states: Sequence[Any]) -> str:
     for state in states:
         data.qpos[:] = state.physics.qpos
         mujoco.mj_kinematics(env.unwrapped.model, data)
-        # Brax numbers the bodies without the world.
+        # Brax does not count the world as a body.
         placed = Transform(pos=data.xpos[1:].copy(), rot=data.xquat[1:].copy())
         frames.append(types.SimpleNamespace(x=placed))
-    # Of a frame, where the model has that of a physics step.
+    # The viewer needs the time between frames, not between physics steps.
     system = system.tree_replace({"opt.timestep": env.unwrapped.dt})
     return html.render(system, frames, height="100vh", colab=False)
 
@@ -190,11 +191,11 @@ def locomotion_page(env: Any, states: Sequence[Any]) -> str:
 def save(
     env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
 ) -> int:
-    """Write physics states as what the suffix of `path` says; returns the frames.
+    """Draw physics states in the format of the path's suffix; return the frame count.
 
     Raises:
-      NoOpenGL: of locomotion's pictures, where none can be had.
-      OSError: it can't be written.
+      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
+      OSError: if the file can't be written.
     """
     if path.suffix == _PAGE:
         path.write_text(locomotion_page(env, states))
@@ -206,10 +207,10 @@ def save(
 
 
 def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
-    """Write frames as a film, or as a strip of eight of them.
+    """Write frames as a film, or eight of them as a strip.
 
     Raises:
-      OSError: it can't be written.
+      OSError: if the file can't be written.
     """
     from PIL import Image
 
@@ -217,7 +218,7 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
         import imageio_ffmpeg
 
         height, width = frames[0].shape[:2]
-        # By default it stretches a picture to multiples of sixteen.
+        # By default pictures are stretched to multiples of sixteen pixels.
         writer = imageio_ffmpeg.write_frames(
             str(path), (width, height), fps=fps, macro_block_size=2
         )
@@ -225,7 +226,7 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
         for frame in frames:
             writer.send(np.ascontiguousarray(frame))
         writer.close()
-        # It does not look at how ffmpeg ended.
+        # The writer ignores the exit status of ffmpeg.
         if not (path.exists() and path.stat().st_size):
             raise OSError("ffmpeg wrote nothing")
     elif path.suffix == ".gif":
@@ -240,7 +241,7 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 
@@ -254,7 +255,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         )
     command_line.check_least(options, steps=1, width=1, height=1)
     command_line.check_key(options.key)
-    # A film's encoder takes no odd number of pixels.
+    # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
     env, config, seeds, states = saved_states.load(
         options.run, options.checkpoint, options.point, options.seed

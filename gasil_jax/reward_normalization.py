@@ -1,9 +1,9 @@
-"""Rewards in units of their discounted return's standard deviation.
+"""Normalize rewards by the standard deviation of their running discounted sums.
 
-OpenAI baselines' ``VecNormalize``, with which its ``ppo2`` trains on MuJoCo tasks: each
-environment keeps a running sum, discounted into the past and begun anew with each
-episode, and rewards are divided by the standard deviation of all these sums so far.
-Their mean is not taken away, so that no reward changes its sign.
+This is OpenAI baselines' ``VecNormalize``, with which its ``ppo2`` trains on MuJoCo
+tasks. Each environment keeps a running sum of rewards, discounted into the past, which
+starts again at 0 with each episode. Rewards are divided by the standard deviation of
+all these sums so far. Their mean is not subtracted, so no reward changes its sign.
 """
 
 from typing import Any
@@ -17,11 +17,11 @@ from gasil_jax import normalization
 
 
 class RewardNormalizer(struct.PyTreeNode):
-    """What the scale is computed from.
+    """The running sums and their moments, from which the scale is computed.
 
     Attributes:
       running: float32 (env,), sum of gamma^age reward over the running episode.
-      sums: moments of all such sums so far, of size 1.
+      sums: moments of all such sums so far; a normalizer with obs = 1.
     """
 
     running: jax.Array
@@ -29,7 +29,7 @@ class RewardNormalizer(struct.PyTreeNode):
 
 
 def init(num_envs: int) -> RewardNormalizer:
-    """A normalizer that has seen nothing."""
+    """Return a normalizer that has seen no rewards."""
     return RewardNormalizer(jnp.zeros(num_envs, jnp.float32), normalization.init(1))
 
 
@@ -39,12 +39,12 @@ def update(
     ended: jax.Array,
     gamma: jax.Array | float,
 ) -> RewardNormalizer:
-    """Take in a batch.
+    """Return the normalizer updated by a batch of rewards.
 
     Args:
-      normalizer: before it.
+      normalizer: the normalizer before the batch.
       reward: float32 (time, env), finite.
-      ended: bool (time, env), the episode ended with this step.
+      ended: bool (time, env), whether the episode ended with this step.
       gamma: discount.
     """
     chex.assert_equal_shape([reward, ended])
@@ -62,7 +62,7 @@ def update(
 
 
 def scale(normalizer: RewardNormalizer) -> jax.Array:
-    """What rewards are divided by, (), more than 0."""
+    """Return the number that rewards are divided by, (), more than 0."""
     _, deviation = normalization.moments(normalizer.sums)
     return deviation[0]
 
@@ -70,5 +70,5 @@ def scale(normalizer: RewardNormalizer) -> jax.Array:
 def normalize(
     normalizer: RewardNormalizer, reward: jax.Array, clip: float = 10.0
 ) -> jax.Array:
-    """Rewards of any shape in units of `scale`, clipped to +-`clip`."""
+    """Return rewards of any shape divided by `scale` and clipped to +-`clip`."""
     return jnp.clip(reward / scale(normalizer), -clip, clip)

@@ -1,4 +1,4 @@
-"""Act in the environments for one batch, with the bookkeeping of episodes."""
+"""Collect one batch of experience and keep count of the running episodes."""
 
 from typing import Any
 
@@ -16,20 +16,21 @@ class Rollout(struct.PyTreeNode):
 
     Attributes:
       observation: float32 (time, env, obs), before the action, not normalized.
-      next_observation: float32 (time, env, obs), after it, the final observation
-        of an episode that ended and not the start of the next.
-      action: float32 (time, env, action), as drawn from the policy.
-      log_prob: float32 (time, env), of the action when it was drawn.
-      reward: float32 (time, env), the environment's, delayed where it delays.
-      terminated: bool (time, env), the episode ended and had no future.
-      truncated: bool (time, env), it was cut off and its value is bootstrapped.
-      episode_return: float32 (time, env), sum of the true rewards up to here.
-      discounted_return: float32 (time, env), sum of gamma^t reward up to here;
+      next_observation: float32 (time, env, obs), after the action. Where an episode
+        ended, it is its final observation and not the start of the next episode.
+      action: float32 (time, env, action), as drawn from the policy, not clipped.
+      log_prob: float32 (time, env), log density of the action when it was drawn.
+      reward: float32 (time, env), the environment's reward, delayed if it delays it.
+      terminated: bool (time, env), whether the episode ended and has no future value.
+      truncated: bool (time, env), whether the episode was cut off; its value is then
+        bootstrapped.
+      episode_return: float32 (time, env), sum of the true rewards up to this step.
+      discounted_return: float32 (time, env), sum of gamma^t reward up to this step;
         NaN from the first faulty step on, and where the episode was cut short.
-      episode_length: int32 (time, env), steps up to here.
-      faulty: bool (time, env), the step gave a number that physics does not give.
-      cut_short: bool (time, env), the episode was truncated before it was as long as
-        an episode can be, because it began at a later age than 0.
+      episode_length: int32 (time, env), number of steps up to this one.
+      faulty: bool (time, env), whether the physics failed in this step.
+      cut_short: bool (time, env), whether the episode was truncated before it reached
+        its full length, because it began at an age above 0.
     """
 
     observation: jax.Array
@@ -47,29 +48,30 @@ class Rollout(struct.PyTreeNode):
 
     @property
     def ended(self) -> jax.Array:
-        """The episode ended with this step, bool (time, env)."""
+        """Whether the episode ended with this step, bool (time, env)."""
         return self.terminated | self.truncated
 
     @property
     def completed(self) -> jax.Array:
-        """A whole episode ended with this step, bool (time, env).
+        """Whether an episode of full length ended with this step, bool (time, env).
 
-        Its return is an episode's; that of one that was cut short is not.
+        Only returns of such episodes are reported; one that was cut short is left out.
         """
         return self.ended & ~self.cut_short
 
 
 class EnvironmentStates(struct.PyTreeNode):
-    """Running episodes; every field is (env, ...).
+    """The running episodes; every field is (env, ...).
 
     Attributes:
-      state: the environment's state, a Brax ``State``.
+      state: the environments' states, a Brax ``State``.
       episode_return: float32 (env,), sum of the true rewards so far.
       discounted_return: float32 (env,), sum of gamma^t reward so far.
       discount: float32 (env,), gamma^t.
-      episode_length: int32 (env,), steps so far.
-      starting_age: int32 (env,), the age at which the running episode began: it is
-        truncated when this and its length make the limit. 0 but for first episodes.
+      episode_length: int32 (env,), number of steps so far.
+      starting_age: int32 (env,), the age at which the running episode began. The
+        episode is truncated when this plus its length reaches the limit. Only first
+        episodes have an age above 0.
     """
 
     state: Any
@@ -82,12 +84,12 @@ class EnvironmentStates(struct.PyTreeNode):
 
 def _cast(x: Any, dtype: Any) -> jax.Array:
     x = jnp.asarray(x)
-    # Outside of jit an array of keys has no `astype`.
+    # Outside jit, an array of keys has no `astype`.
     return x if jnp.issubdtype(dtype, jax.dtypes.prng_key) else x.astype(dtype)
 
 
 def _strip_weak_types(tree: Any) -> Any:
-    # A weak type in the first state only would compile everything twice.
+    # A weak type in the first state alone would make JAX compile everything twice.
     return jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), tree)
 
 
@@ -98,20 +100,21 @@ def init(
 
     Args:
       env: a single environment with Brax's interface, not wrapped to reset itself.
-      key: draws the starts and the ages.
-      num_envs: how many environments.
+      key: key for the initial states and the ages.
+      num_envs: number of environments.
       age_limit: each first episode begins at an age drawn uniformly from
-        [0, age_limit); None begins all at age 0. Environments that begin together
-        stay together in a task that never ends early: each batch is then one thin
-        slice of the episode (Staggered Environment Resets, arXiv 2511.21011).
+        [0, age_limit); None starts all of them at age 0. In a task whose episodes
+        never end early, environments that start together stay together, and each
+        batch then holds one thin slice of the episode (Staggered Environment Resets,
+        arXiv 2511.21011).
     """
     state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
     starting_age = jnp.zeros(num_envs, jnp.int32)
     if age_limit is not None:
-        # The last of so many keys is the one that no environment is reset with.
+        # No environment is reset with the last of these keys.
         age_key = jax.random.split(key, num_envs + 1)[-1]
         starting_age = jax.random.randint(age_key, (num_envs,), 0, age_limit)
-    # An array for each: one in two places could not be donated.
+    # Each field needs its own array: a shared one could not be donated.
     return EnvironmentStates(
         state=_strip_weak_types(state),
         episode_return=jnp.zeros(num_envs, jnp.float32),
@@ -123,7 +126,7 @@ def init(
 
 
 def is_finite(tree: Any) -> jax.Array:
-    """Whether every number of every leaf is finite, bool ()."""
+    """Return whether every number of every leaf is finite, bool ()."""
     leaves = jax.tree.leaves(tree)
     return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
 
@@ -138,25 +141,25 @@ def collect(
     max_episode_steps: int,
     gamma: jax.Array | float,
 ) -> tuple[EnvironmentStates, Rollout]:
-    """Take `num_steps` in each environment; a fresh episode follows an ended one.
+    """Take `num_steps` steps in each environment; ended episodes start again.
 
     Args:
       env: a single environment with Brax's interface, not wrapped to reset itself.
       policy: observation (env, obs) -> mean (env, action), log std (action,).
       environments: the running episodes.
-      key: consumed.
-      num_steps: steps of each environment.
-      max_episode_steps: longer episodes are truncated.
+      key: random key; consumed.
+      num_steps: number of steps in each environment.
+      max_episode_steps: length at which an episode is truncated.
       gamma: discount of the episodes' return.
 
-    Physics that diverges (an observation, or a reward, given or held back, that
-    `normalization.is_sound` refuses) terminates the episode with reward 0 and is
-    reported in ``faulty``. An episode that is truncated here gets the reward that the
-    environment still holds back, ``info["held_reward"]``.
+    If the physics diverges, the episode terminates with reward 0 and the step is marked
+    in ``faulty``. It has diverged if `normalization.is_sound` is false for a number in
+    the observation or for a reward, given or held back. An episode that is truncated
+    here is given the reward that the environment still holds back,
+    ``info["held_reward"]``.
 
-    A first episode that began at a later age than 0 is truncated like any other when
-    it reaches the limit, and marked in ``cut_short``: PPO learns from its steps, but
-    its return is not an episode's.
+    A first episode that began at an age above 0 is truncated at the same limit and
+    marked in ``cut_short``. PPO learns from its steps, but its return is not reported.
     """
     num_envs = environments.episode_length.shape[0]
     low, high = getattr(env, "action_range", (-1.0, 1.0))

@@ -30,12 +30,12 @@ from gasil_jax.sweeps.shards import Program
 def train(
     options: Options, env: Any, program: Program, folder: pathlib.Path
 ) -> dict[str, Any]:
-    """Train, log and save; returns the summary.
+    """Train, log and save a run; return the summary.
 
     Raises:
-      Interrupted: by a signal.
-      OSError: the folder can't be written any more.
-      ValueError: what is there to go on with does not fit.
+      Interrupted: if a signal was received.
+      OSError: if the folder can no longer be written.
+      ValueError: if the run to continue does not fit the options.
     """
     summaries = []
     write_config(options, folder)
@@ -57,7 +57,7 @@ def _write_results(
     runs: Batch,
     outcome: driver.Outcome,
 ) -> dict[str, Any]:
-    """What a run leaves beside metrics and checkpoints; returns the summary."""
+    """Write the learning curve, the policies and the summary; return the summary."""
     config = options.config
     seeds = seeds_of(options)
     metrics = metrics_files.read_metrics(
@@ -98,7 +98,7 @@ def _write_results(
         finals["final_evaluation"] = evaluations["mean"][:, -1]
         trained["evaluation_seconds"] = outcome.evaluation_seconds
     if not outcome.new_steps:
-        trained = _on_record(folder / "summary.json", trained)
+        trained = _recorded(folder / "summary.json", trained)
     summary = {
         "env": options.env,
         "agent": config.agent,
@@ -118,7 +118,7 @@ def _write_results(
 def _by_seed_and_mean(
     seeds: Sequence[int], quantities: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Each quantity, (seeds,), by seed and, as NAME_mean, its mean; NaN is None."""
+    """Return each quantity, (seeds,), by seed, and its mean; NaN becomes None."""
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
         finite = np.isfinite(values)
@@ -131,8 +131,8 @@ def _by_seed_and_mean(
     return fields
 
 
-def _on_record(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
-    """The same fields from the summary that is there, if it has them."""
+def _recorded(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
+    """Return the same fields from the existing summary, or else as they are given."""
     try:
         before = json.loads(path.read_text())
         return {name: before[name] for name in trained}
@@ -141,7 +141,7 @@ def _on_record(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 

@@ -1,4 +1,4 @@
-"""Hyperparameters that change with the environment steps of training."""
+"""Change hyperparameters over the environment steps of training."""
 
 import jax
 import jax.numpy as jnp
@@ -7,11 +7,12 @@ from gasil_jax.config import Config, Hyperparameters, Schedule
 
 
 def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
-    """The factor at `env_steps`, (): linear between points, constant beyond.
+    """Return a schedule's factor at `env_steps`, ().
 
     Args:
-      schedule: (steps, factor) points, steps increasing, or an Optax schedule.
-      env_steps: float32 (), environment steps that a run has taken.
+      schedule: an Optax schedule, or (steps, factor) points with increasing steps. The
+        factor is linear between points and constant beyond them.
+      env_steps: float32 (), number of environment steps that the run has taken.
     """
     if callable(schedule):
         return jnp.asarray(schedule(env_steps), jnp.float32)
@@ -24,10 +25,10 @@ def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
 def at(
     config: Config, hyperparameters: Hyperparameters, iteration: jax.Array
 ) -> Hyperparameters:
-    """What an iteration trains with: the learning rate annealed, schedules applied."""
-    # In float32: as int32 it ends at 2^31 steps.
+    """Return an iteration's hyperparameters, annealed and scheduled."""
+    # In float32, because int32 would overflow at 2^31 steps.
     env_steps = iteration.astype(jnp.float32) * config.batch_steps
-    # A loop of one's own may go on for longer than it was annealed for.
+    # A user's own loop may run for more iterations than the config has.
     left = jnp.maximum(
         1.0 - hyperparameters.learning_rate_decay * (iteration / config.num_iterations),
         0.0,

@@ -1,17 +1,18 @@
 """Sweeps: ``python -m gasil_jax.sweep --env hopper --seeds 5 --grid alpha=0.02,0.1``.
 
-Points that differ only in `Hyperparameters` run in one compiled program, seeds x
-points vmapped and sharded; those that differ in a field of `Config` (buffer size,
+Points that differ only in `Hyperparameters` run in one compiled program, with seeds x
+points vmapped and sharded. Points that differ in a count (such as buffer size or
 discriminator updates) are grouped, and each group compiles once. With --share-counts
-these two don't divide the points: all run in the program of the largest.
+points with different buffer sizes or discriminator updates share a program.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
-curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png, and
-for each program a folder under programs/ with its metrics.csv and checkpoints. With
---evaluate-every there is an evaluations.csv beside each metrics.csv, and curves.npz has
-its columns, (points, seeds, evaluations), as evaluation_mean and so on. With
---shard 3/8 an eighth of all points and seeds is trained in a folder of its own,
-shards/3-of-8, without the tables, which gasil_jax.merge makes of all shards.
+curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png. Each
+program has a folder under programs/ with its metrics.csv and checkpoints. With
+--evaluate-every there is an evaluations.csv beside each metrics.csv, and curves.npz
+also holds its columns, (points, seeds, evaluations), as evaluation_mean and so on.
+
+With --shard 3/8 an eighth of all points and seeds is trained in the folder
+shards/3-of-8, without tables. `gasil_jax.merge` makes the tables from all shards.
 """
 
 import argparse
@@ -39,19 +40,19 @@ class Options(run_options.Options):
 
     Attributes:
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
-      random: draw so many points, from the grid's values or, without one, from the
-        ranges of the paper's appendix; first_seed is the draw's seed, too.
-      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each, in
-        place of grid and random.
-      share_counts: points that differ in buffer_steps or discriminator_updates share
-        a program too, which compiles once and has for each point the cost of the
-        largest: best on a GPU.
-      shard: train this part of all points and seeds alone, NUMBER/COUNT from 1/COUNT
-        on, in a folder below out; the same command again goes on with it. See
+      random: number of points to draw from the grid or, without a grid, from the
+        ranges of the paper's appendix. The draw's seed is first_seed.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
+        instead of grid and random.
+      share_counts: let points that differ in buffer_steps or discriminator_updates
+        share a program. It compiles once, but every point costs as much as the
+        largest; best on a GPU.
+      shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
+        from 1 on, in a folder below `out`. The same command continues it. See
         gasil_jax.merge.
-      launcher: train all shards and merge them: local, one process after another, or
-        ray, on its cluster.
-      shards: how many the launcher makes.
+      launcher: train all shards and merge them: local, in one process after another,
+        or ray, on a Ray cluster.
+      shards: number of shards that the launcher makes.
     """
 
     grid: tuple[str, ...] = ()
@@ -70,12 +71,12 @@ def train(
     programs: Sequence[Program],
     folder: pathlib.Path,
 ) -> None:
-    """Train the programs one by one, log and save; those that are trained are left.
+    """Train, log and save the unfinished programs, one after the other.
 
     Raises:
-      Interrupted: by a signal.
-      OSError: the folder can't be written any more.
-      ValueError: what is there to go on with does not fit.
+      Interrupted: if a signal was received.
+      OSError: if the folder can no longer be written.
+      ValueError: if the sweep to continue does not fit the options.
     """
     run_options.write_config(options, folder, points=points)
 
@@ -105,7 +106,7 @@ def train(
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status."""
+    """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 
@@ -124,19 +125,19 @@ def _main(arguments: Sequence[str] | None) -> None:
 def _placement(
     arguments: Sequence[str] | None,
 ) -> tuple[argparse.Namespace, list[str]]:
-    """The options that say where training happens, and all other arguments."""
+    """Return the options that say where training runs, and all other arguments."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     for name in ("--shard", "--launcher", "--shards", "--out"):
-        # Without its value it is refused where everything is parsed.
+        # The full parser reports a missing value.
         parser.add_argument(name, nargs="?")
     return parser.parse_known_args(arguments)
 
 
 def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
-    """All points and programs, checked.
+    """Return all points and programs of a sweep, checked.
 
     Raises:
-      InputError: the value and what is allowed.
+      InputError: if a value is not allowed; the message names the value and the range.
     """
     run_options.check(options)
     points = make_points(
@@ -156,7 +157,7 @@ def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
 
 
 def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
-    """The programs that are not trained to their end in the folder that is named."""
+    """Return the programs that are not yet trained to their end in the folder `out`."""
     if options.out is None:
         return list(programs)
     left = tables.Trained(options.out, programs).unfinished()
@@ -164,7 +165,7 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
 
 
 def check_points(points: Sequence[Point], began: pathlib.Path | None) -> None:
-    """Raise `InputError` if a sweep that has begun in a folder has other points."""
+    """Raise `InputError` if the sweep that has begun in a folder has other points."""
     if began is not None and list(run_folder.read(began)["points"]) != list(points):
         raise InputError(
             f"out is {began}, where a sweep of other points has begun: go on with the "
@@ -198,21 +199,21 @@ def _train_whole(options: Options, began: pathlib.Path | None) -> None:
 def _train_shard(
     arguments: Sequence[str] | None, shard: shards.Shard, out: str | None
 ) -> None:
-    """Train a shard of the sweep in `out`, or go on with it."""
+    """Train a shard of the sweep in `out`, or continue it."""
     if out is None:
         raise InputError("shard needs --out and the folder of the whole sweep")
     whole = pathlib.Path(out)
     shards.refuse_whole(whole)
     shards.refuse_recut(whole, shard)
-    place = shard.folder(whole)
-    began = place if run_folder.is_described(place) else None
+    shard_folder = shard.folder(whole)
+    began = shard_folder if run_folder.is_described(shard_folder) else None
     options = run_options.parse(Options, arguments, _PROGRAM, began)
-    options = dataclasses.replace(options, out=place, resume=True)
+    options = dataclasses.replace(options, out=shard_folder, resume=True)
     points, programs = _plan_here(options, began)
     programs = shards.share(programs, shard)
-    trained = tables.Trained(place, programs)
+    trained = tables.Trained(shard_folder, programs)
     if not trained.unfinished():
-        print(f"shard {shard} is done, in {place}")
+        print(f"shard {shard} is done, in {shard_folder}")
         return
     run_options.check_out(options)
     env = assembly.prepare(options, programs, _untrained(options, programs))
@@ -226,7 +227,7 @@ def _train_shard(
 
 
 def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
-    """Have the launcher run a command for each shard, and merge."""
+    """Let the launcher run a command for each shard, then merge the shards."""
     launch.check(launcher)
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")

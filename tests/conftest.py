@@ -55,8 +55,8 @@ def pytest_runtest_setup(item):
 def pytest_collection_modifyitems(items):
     """One worker for the tests that share a module's fixture: it is made once."""
     for item in items:
-        found = item._fixtureinfo.name2fixturedefs.values()
-        if any(definitions[-1].scope == "module" for definitions in found):
+        fixtures = item._fixtureinfo.name2fixturedefs.values()
+        if any(definitions[-1].scope == "module" for definitions in fixtures):
             item.add_marker(pytest.mark.xdist_group(item.module.__name__))
 
 

@@ -1,4 +1,4 @@
-"""The direction of imports: a folder says what a module may touch."""
+"""The direction of imports: a module's folder decides what it may import."""
 
 import ast
 import pathlib

@@ -1,6 +1,6 @@
-"""Our environments under Gymnasium's interface, one alone or a batch of them.
+"""Our environments with Gymnasium's interface, single or as a batch.
 
-    import gasil_envs.gymnasium_adapter  # makes the names known
+    import gasil_envs.gymnasium_adapter  # registers the names
 
     gymnasium.make("gasil_envs/walker2d", reward_delay=20)
     gymnasium.make_vec("gasil_envs/walker2d", num_envs=64)
@@ -23,7 +23,7 @@ _NAMESPACE = "gasil_envs"
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
-    """Of observations and of actions."""
+    """Return the spaces of observations and actions."""
     low, high = getattr(env, "action_range", (-1.0, 1.0))
     shape = (env.action_size,)
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), shape).copy()
@@ -38,13 +38,13 @@ def _key(generator: np.random.Generator) -> jax.Array:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """One environment.
+    """A single environment with Gymnasium's interface.
 
     Args:
       name: one of `gasil_envs.names()`.
       **settings: fields of `gasil_envs.registry.Settings`.
 
-    The step limit is the environment's own: an episode that it ends is truncated.
+    The environment has its own step limit; an episode that reaches it is truncated.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
@@ -59,7 +59,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The first observation, (obs,) float32, of an episode drawn anew."""
+        """Start an episode and return its first observation, (obs,) float32."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
         return np.asarray(self._state.obs), {}
@@ -67,7 +67,10 @@ class GymnasiumEnv(gymnasium.Env):
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Observation, reward, terminated, truncated, and the true reward as info."""
+        """Return observation, reward, terminated, truncated and info.
+
+        ``info["true_reward"]`` is the reward without delay.
+        """
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
@@ -76,11 +79,11 @@ class GymnasiumEnv(gymnasium.Env):
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
-    """Many at once; an episode that ended begins anew with the next step.
+    """A batch of environments; the step after an episode's end starts the next one.
 
     Args:
       name: one of `gasil_envs.names()`.
-      num_envs: how many.
+      num_envs: number of environments.
       **settings: fields of `gasil_envs.registry.Settings`.
     """
 
@@ -117,7 +120,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """The first observations, (num_envs, obs) float32."""
+        """Start an episode in each and return the observations, (num_envs, obs)."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
         return np.array(self._state.obs), {}
@@ -125,7 +128,10 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     def step(
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
-        """Observation (num_envs, obs), reward, terminated and truncated (num_envs,)."""
+        """Return observation (num_envs, obs), reward, terminated, truncated and info.
+
+        Reward, terminated, truncated and the true reward in info are (num_envs,) each.
+        """
         given = jnp.asarray(actions, jnp.float32)
         self._state = state = self._step(self._state, given, _key(self.np_random))
         truncated = np.array(wrappers.truncated(state))
@@ -140,7 +146,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
 
 def register() -> None:
-    """Make the names known to Gymnasium."""
+    """Register our environments with Gymnasium."""
     for name in registry.names():
         gymnasium.register(
             id=f"{_NAMESPACE}/{name}",
@@ -150,6 +156,6 @@ def register() -> None:
         )
 
 
-# Not an entry point of the installed package: every program that imports Gymnasium
-# would load JAX.
+# As an entry point of the installed package this would make every program that imports
+# Gymnasium load JAX.
 register()

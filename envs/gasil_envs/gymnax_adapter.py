@@ -1,10 +1,10 @@
-"""Our environments under the interface of gymnax 1.0, pure functions throughout.
+"""Our environments with the interface of gymnax 1.0; all functions are pure.
 
     env = GymnaxEnv("walker2d", reward_delay=20)
     observation, state = env.reset(key, env.default_params)
 
-An episode that ended begins anew within the same step. The spaces need the package
-gymnax; what trains without looking at them does not.
+When an episode ends, the next one begins within the same step. Only the spaces need the
+package gymnax.
 """
 
 from typing import Any
@@ -20,11 +20,11 @@ Transition = tuple[jax.Array, State, jax.Array, jax.Array, jax.Array, dict[str, 
 
 
 class Params(struct.PyTreeNode):
-    """Nothing: what can vary is given when the environment is made."""
+    """Empty parameters: all settings are given when the environment is made."""
 
 
 class GymnaxEnv:
-    """One environment; `jax.vmap` its functions for many.
+    """One environment; use `jax.vmap` on its functions for many.
 
     Args:
       name: one of `gasil_envs.names()`.
@@ -40,7 +40,9 @@ class GymnaxEnv:
     def reset(
         self, key: jax.Array, params: Params | None = None
     ) -> tuple[jax.Array, State]:
-        """The first observation, float32 (obs,), and the state. Consumes the key."""
+        """Return the first observation, float32 (obs,), and the state. The key is
+        consumed.
+        """
         state = self._env.reset(key)
         return state.obs, state
 
@@ -51,19 +53,20 @@ class GymnaxEnv:
         action: jax.Array,
         params: Params | None = None,
     ) -> Transition:
-        """Observation, state, reward, terminated, truncated and info.
+        """Take a step; if the episode ends, start the next one.
 
         Args:
-          key: of the start of the next episode, where this one ends; consumed.
-          state: of the step before.
+          key: key for the start of the next episode; consumed.
+          state: the state before the step.
           action: float32 (action,).
-          params: of gymnax' interface; not looked at.
+          params: ignored; part of gymnax' interface.
 
         Returns:
-          Observation float32 (obs,), of the next episode where this one ended, whose
-          own last one is ``info["final_observation"]``; reward float32 ();
-          terminated and truncated bool (), not both. ``info["true_reward"]`` is
-          without delay.
+          Observation, state, reward, terminated, truncated and info. The observation,
+          float32 (obs,), is that of the next episode if this one ended; the last
+          observation of this episode is ``info["final_observation"]``. The reward is
+          float32 (). Terminated and truncated are bool () and never both true.
+          ``info["true_reward"]`` is the reward without delay.
         """
         stepped, fresh = self._env.step(state, action), self._env.reset(key)
         ended = stepped.done > 0
@@ -77,11 +80,11 @@ class GymnaxEnv:
         return state.obs, state, stepped.reward, terminated, truncated, info
 
     def observation_space(self, params: Params | None = None) -> Any:
-        """A ``gymnax.environments.spaces.Box``; of (obs,), without bounds."""
+        """Return an unbounded ``gymnax.environments.spaces.Box`` of shape (obs,)."""
         return _box(-jnp.inf, jnp.inf, self._env.observation_size)
 
     def action_space(self, params: Params | None = None) -> Any:
-        """A ``gymnax.environments.spaces.Box``; of (action,)."""
+        """Return a ``gymnax.environments.spaces.Box`` of shape (action,)."""
         low, high = getattr(self._env, "action_range", (-1.0, 1.0))
         return _box(low, high, self._env.action_size)
 

@@ -28,29 +28,29 @@ _EVERYTHING: Range = (-float("inf"), float("inf"))
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """What tells one locomotion task from another.
+    """The definition of one locomotion task.
 
     Attributes:
-      gymnasium_id: the task that it is in Gymnasium.
-      xml: file name among Gymnasium's MuJoCo assets.
-      frame_skip: physics steps for each environment step.
+      gymnasium_id: name of the task in Gymnasium.
+      xml: name of the model's file in Gymnasium's MuJoCo assets.
+      frame_skip: number of physics steps in an environment step.
       forward_reward: weight of the forward velocity, 1 / (m/s).
       control_cost: weight of the squared norm of the action.
-      healthy_reward: given for each step that ends in a healthy state.
+      healthy_reward: reward of each step that ends in a healthy state.
       healthy_z: open interval of the torso's height in metres, qpos[z_index].
       healthy_angle: open interval of the torso's angle in radians, qpos[2].
       healthy_state: open interval for all of qpos[2:] and qvel.
       z_index: index in qpos of the height.
-      reset_noise: half width of the uniform noise on the start, and the
-        standard deviation of the velocity noise where that is normal.
-      normal_velocity_noise: whether the start's velocity noise is normal.
-      hidden_positions: how many leading entries of qpos are not observed.
-      max_velocity: observed velocities are clipped to +-this.
-      fields: arrays of ``mjData`` that the next three take.
-      position: from fields to the planar position (2,) whose change is the forward
-        velocity, or None for qpos[0:2].
-      observe_more: from fields to the rest of the observation.
-      contact_cost: from contact forces, ``cfrc_ext`` (nbody, 6), to a cost.
+      reset_noise: half width of the uniform noise on the initial state; also the
+        standard deviation of normal velocity noise.
+      normal_velocity_noise: whether the initial velocity's noise is normal.
+      hidden_positions: number of leading entries of qpos that are not observed.
+      max_velocity: largest absolute value of an observed velocity.
+      fields: names of the arrays of ``mjData`` that the next three functions use.
+      position: (model, fields) -> planar position (2,), whose change is the forward
+        velocity; None for qpos[0:2].
+      observe_more: fields -> the rest of the observation.
+      contact_cost: contact forces, ``cfrc_ext`` (nbody, 6) -> cost.
     """
 
     gymnasium_id: str
@@ -171,13 +171,13 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
 
 
 class LocomotionState(struct.PyTreeNode):
-    """Physics state and the planar position (2,) that velocity is measured from."""
+    """The physics state, and the planar position (2,) for computing the velocity."""
 
     physics: PhysicsState
     position: jax.Array
 
 
-#: Engines by name: from (model, fields, solver) to a `Physics`.
+#: Physics engines by name: (model, fields, solver) -> `Physics`.
 PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], str], Physics]] = (
     types.MappingProxyType(
         {
@@ -187,25 +187,24 @@ PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], str], Physics]]
     )
 )
 
-#: Integrators by name; "model" is the one that the model asks for.
+#: Integrators by name; "model" is the integrator that the model specifies.
 INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
     {"model": None, "euler": mujoco.mjtIntegrator.mjINT_EULER}
 )
 
 
 class Locomotion(Env):
-    """A task of `TASKS`.
+    """One of the locomotion tasks in `TASKS`.
 
-    Actions are in the units of the model's actuators, as in Gymnasium: physics
-    limits them to `action_range`, the control cost sees them as given (humanoid's,
-    as Gymnasium's does, sees the action too).
+    Actions are in the units of the model's actuators, as in Gymnasium. Physics limits
+    them to `action_range`; the control cost is of the actions before this limit.
 
     Args:
-      name: of the task.
-      physics: "mjx", pure JAX, or "mujoco", C on the host's cores.
-      solver: of MJX's constraints, see `MjxPhysics`.
-      integrator: "model", which is Gymnasium's, or "euler", which is not: four times
-        fewer evaluations where the model asks for Runge and Kutta's.
+      name: name of the task.
+      physics: "mjx", in pure JAX, or "mujoco", in C on the host's cores.
+      solver: solver of MJX's constraints, see `MjxPhysics`.
+      integrator: "model", the same as Gymnasium's, or "euler", which is not the same
+        and needs a quarter of the evaluations if the model specifies Runge-Kutta.
     """
 
     episode_length = 1000
@@ -226,7 +225,7 @@ class Locomotion(Env):
         self._physics_name = physics
         self.physics = PHYSICS[physics](self.model, task.fields, solver)
         self.dt = self.model.opt.timestep * task.frame_skip
-        # Constants of the traced functions stay NumPy arrays: they are embedded.
+        # A NumPy array becomes a constant of the traced functions.
         self._start = np.asarray(self.model.qpos0, np.float32)
         self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
 
@@ -248,7 +247,7 @@ class Locomotion(Env):
 
     @property
     def backend(self) -> str:
-        """Brax's name for the physics."""
+        """The name of the physics engine."""
         return self._physics_name
 
     def reset(self, rng: jax.Array) -> State:
@@ -264,7 +263,7 @@ class Locomotion(Env):
             qvel = scale * jax.random.normal(velocity_key, shape, jnp.float32)
         else:
             qvel = jax.random.uniform(velocity_key, shape, jnp.float32, -scale, scale)
-        # MuJoCo reads a quaternion as its normalization; MJX does not everywhere.
+        # MuJoCo normalizes quaternions that it reads; MJX does not everywhere.
         for joint in np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
             first = self.model.jnt_qposadr[joint] + 3
             quaternion = qpos[first : first + 4]
@@ -273,7 +272,7 @@ class Locomotion(Env):
         return self.state_at(qpos, qvel)
 
     def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
-        """The state of an episode that starts at `qpos` (nq,) and `qvel` (nv,)."""
+        """Return the state of an episode that starts at qpos (nq,) and qvel (nv,)."""
         physics = self.physics.init(qpos, qvel)
         fields = self.physics.kinematics(physics)
         zero = jnp.float32(0)
@@ -316,7 +315,7 @@ class Locomotion(Env):
         healthy = within(qpos[task.z_index], task.healthy_z)
         healthy &= within(qpos[2], task.healthy_angle)
         healthy &= within(jnp.concatenate([qpos[2:], physics.qvel]), task.healthy_state)
-        # Without bounds a comparison with infinity still catches NaN and infinity.
+        # If there are no bounds, this still catches NaN and infinity.
         return healthy.astype(jnp.float32)
 
     def _observe(self, physics: PhysicsState, fields: Fields) -> jax.Array:

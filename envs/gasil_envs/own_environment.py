@@ -1,6 +1,6 @@
-"""An environment of the user's own, MODULE:NAME: found, built, and looked over.
+"""Import, build and check an environment of the user's own, given as MODULE:NAME.
 
-What would stop training in the middle of a trace is said in one line before it.
+Mistakes that would stop training with a long trace are reported in one line beforehand.
 """
 
 import importlib
@@ -19,44 +19,44 @@ from gasil_envs import wrappers
 
 
 def find(name: str) -> Callable[[], Env]:
-    """What MODULE:NAME names: a class, or a function that builds an environment.
+    """Return the class or function that MODULE:NAME names.
 
     Raises:
-      ValueError: it can't be imported, or needs arguments.
+      ValueError: if it can't be imported or needs arguments.
     """
     module, attribute = name.split(":", 1)
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        constructor = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f"env {name!r} can't be imported: {error}") from None
     except Exception as error:
         why = _in_a_line(error)
         raise ValueError(f"env {name!r} can't be imported: {why}") from None
     try:
-        inspect.signature(found).bind()
+        inspect.signature(constructor).bind()
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"env {name!r} must build an environment without arguments: {error}"
         ) from None
-    return found
+    return constructor
 
 
 def build(name: str) -> Env:
-    """The environment that MODULE:NAME names; nothing of it is computed.
+    """Build and check the environment that MODULE:NAME names, without running it.
 
     Raises:
-      ValueError: it can't be built, or is not of Brax's interface.
+      ValueError: if it can't be built or does not have Brax's interface.
     """
-    made = find(name)
+    constructor = find(name)
     try:
-        env = made()
+        env = constructor()
     except Exception as error:
         raise ValueError(f"env {name!r} can't be built: {_in_a_line(error)}") from None
-    for needed in ("reset", "step", "observation_size", "action_size"):
-        if not hasattr(env, needed):
-            raise ValueError(f"env {name!r} is no environment: it has no {needed}")
-    for counted in ("observation_size", "action_size"):
-        _check_count(name, counted, getattr(env, counted))
+    for attribute in ("reset", "step", "observation_size", "action_size"):
+        if not hasattr(env, attribute):
+            raise ValueError(f"env {name!r} is no environment: it has no {attribute}")
+    for attribute in ("observation_size", "action_size"):
+        _check_count(name, attribute, getattr(env, attribute))
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
     _check_states(name, env)
@@ -71,8 +71,8 @@ def _check_count(name: str, what: str, count: Any) -> None:
 
 
 def _check_states(name: str, env: Env) -> None:
-    """Refuse states that `jax.lax.scan` can't carry, or of other sizes than it says."""
-    # The wrapper that it is trained under adds to a state what need not be alike.
+    """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
+    # Training wraps the environment, which adds fields that need not match.
     limited = wrappers.EpisodeLimit(env, 1)
     action = jnp.zeros(env.action_size)
     try:
@@ -81,8 +81,8 @@ def _check_states(name: str, env: Env) -> None:
     except Exception as error:
         raise ValueError(f"env {name!r} can't be traced: {_in_a_line(error)}") from None
     for state, where in ((first, "reset"), (then, "step")):
-        wanted = {"obs": (env.observation_size,), "reward": (), "done": ()}
-        for field, shape in wanted.items():
+        expected = {"obs": (env.observation_size,), "reward": (), "done": ()}
+        for field, shape in expected.items():
             value = getattr(state, field)
             given = getattr(value, "shape", type(value).__name__)
             if given != shape:
@@ -108,14 +108,16 @@ def _described(leaf: Any) -> str:
 
 
 def _in_a_line(error: Exception) -> str:
-    """What an error of the user's own code says, and where it was raised."""
-    said = f"{type(error).__name__}: {error}".partition("\n")[0]
+    """Return the message of an error in the user's code, and where it was raised."""
+    message = f"{type(error).__name__}: {error}".partition("\n")[0]
     if isinstance(error, SyntaxError):
-        return said  # With its place.
+        return message  # It names file and line already.
     frames = reversed(traceback.extract_tb(error.__traceback__))
-    theirs = (x for x in frames if not x.filename.startswith((_JAX, __file__)))
-    place = next(theirs, None)
-    return said if place is None else f"{said} ({place.filename}, line {place.lineno})"
+    user_frames = (x for x in frames if not x.filename.startswith((_JAX, __file__)))
+    frame = next(user_frames, None)
+    if frame is None:
+        return message
+    return f"{message} ({frame.filename}, line {frame.lineno})"
 
 
 _JAX = str(pathlib.Path(jax.__file__).parent)

@@ -2,10 +2,10 @@
 
 The action is the agent's velocity. Objects are collected once: blue +5, green +10,
 orange distractors -5. An actuation cost proportional to the L2 norm of the action
-discourages speed. The paper prints no coordinates; `Layout`'s defaults are ours, found
-by a search for a layout in which its story happens (experiments/point_mass_layouts.py):
-two blue objects tempt on both sides of the start, three greens lie further up, and
-distractors on both sides of them.
+discourages speed. The paper gives no coordinates. `Layout`'s defaults are the result of
+our search for a layout in which the paper's findings appear
+(experiments/point_mass_layouts.py): two tempting blue objects on both sides of the
+start, three green ones further up, and distractors on both sides of those.
 """
 
 import dataclasses
@@ -19,17 +19,19 @@ from flax import struct
 
 @dataclasses.dataclass(frozen=True)
 class Layout:
-    """Where things are, in units of the half width of the box [-1, 1] x [-1, 1].
+    """The positions and rewards of all objects, in the box [-1, 1] x [-1, 1].
 
-    An object is collected when the agent comes within `radius` of its centre.
-    The agent starts uniformly within `start_spread` of `start` in each coordinate.
+    An object is collected when the agent comes within `radius` of its centre. The
+    agent's start is uniform within `start_spread` of `start` in each coordinate.
     """
 
     blue: tuple[tuple[float, float], ...] = ((-0.25, -0.12), (0.25, -0.12))
     green: tuple[tuple[float, float], ...] = ((-0.23, 0.28), (0.23, 0.28), (0.0, 0.58))
     orange: tuple[tuple[float, float], ...] = (
-        *((-0.64, 0.11), (0.64, 0.11)),
-        *((-0.8, 0.5), (0.8, 0.5)),
+        (-0.64, 0.11),
+        (0.64, 0.11),
+        (-0.8, 0.5),
+        (0.8, 0.5),
     )
     start: tuple[float, float] = (0.0, -0.2)
     start_spread: float = 0.1
@@ -43,7 +45,7 @@ class Layout:
 
 
 class PointMassState(struct.PyTreeNode):
-    """The agent's position (2,) and which objects are collected (objects,) bool."""
+    """The agent's position (2,), and which objects are collected, bool (objects,)."""
 
     position: jax.Array
     collected: jax.Array
@@ -61,7 +63,7 @@ class PointMass(Env):
 
     def __init__(self, layout: Layout | None = None):
         self.layout = layout = layout or Layout()
-        # Constants of the traced functions stay NumPy arrays: they are embedded.
+        # NumPy arrays become constants of the traced functions.
         self.objects = np.array(layout.blue + layout.green + layout.orange, np.float32)
         self.object_rewards = np.array(
             [layout.blue_reward] * len(layout.blue)
@@ -83,7 +85,7 @@ class PointMass(Env):
 
     @property
     def backend(self) -> str:
-        """Brax's name for the physics: there is none here."""
+        """Brax's name of the physics engine; there is none here."""
         return "none"
 
     def reset(self, rng: jax.Array) -> State:
@@ -98,14 +100,14 @@ class PointMass(Env):
         return State(pipeline_state, self._observe(pipeline_state), zero, zero)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Move and collect."""
+        """Move the agent and collect the objects within reach."""
         action = jnp.clip(action, -1.0, 1.0)
         before = state.pipeline_state
         position = jnp.clip(before.position + self.layout.max_speed * action, -1.0, 1.0)
         distance = jnp.linalg.norm(position - self.objects, axis=-1)
-        found = (distance <= self.layout.radius) & ~before.collected
-        pipeline_state = PointMassState(position, before.collected | found)
-        reward = jnp.sum(jnp.where(found, self.object_rewards, 0.0))
+        reached = (distance <= self.layout.radius) & ~before.collected
+        pipeline_state = PointMassState(position, before.collected | reached)
+        reward = jnp.sum(jnp.where(reached, self.object_rewards, 0.0))
         cost = self.layout.actuation_cost * jnp.sqrt(jnp.sum(action**2))
         return state.replace(
             pipeline_state=pipeline_state,

@@ -1,4 +1,4 @@
-"""Matrix products in float32 on devices whose default is less."""
+"""Multiply matrices in full float32 on devices that use less by default."""
 
 import functools
 from collections.abc import Callable
@@ -13,11 +13,11 @@ Result = TypeVar("Result")
 def full_precision(
     function: Callable[Arguments, Result],
 ) -> Callable[Arguments, Result]:
-    """Have what a function traces multiply matrices in full float32.
+    """Make a function's traced matrix products use full float32.
 
-    Without a word a GPU from Ampere on takes TF32, with ten bits for the fraction,
-    which has ruined PPO runs. A program that sets `jax_default_matmul_precision`
-    itself gets what it asks for.
+    GPUs from Ampere on use TF32 by default, with ten bits for the fraction, which has
+    ruined PPO runs. If a program sets `jax_default_matmul_precision` itself, that
+    setting applies instead.
     """
 
     @functools.wraps(function)

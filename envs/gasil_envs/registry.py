@@ -1,4 +1,4 @@
-"""Environment names and the one function that builds an environment."""
+"""The names of environments, and the function that builds an environment by name."""
 
 import dataclasses
 import difflib
@@ -16,17 +16,18 @@ from gasil_envs.physics.mjx import SOLVERS
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
-    """How an environment is built.
+    """The settings of an environment.
 
     Attributes:
-      reward_delay: give the accumulated reward every so many steps and when the
-        episode ends (paper, section 5.4); 1 leaves it as it is.
+      reward_delay: number of steps after which the accumulated reward is given; it is
+        also given when the episode ends (paper, section 5.4). 1 means no delay.
       obs_noise: standard deviation of Gaussian noise on the observations (paper,
-        section 5.3); 0 leaves them as they are.
-      physics: of locomotion: mjx, pure JAX, or mujoco, C on the host's cores.
-      solver: of mjx's contacts: small (ours, faster) or mjx.
-      integrator: of locomotion: model, which is Gymnasium's, or euler, which is
-        faster and another task.
+        section 5.3); 0 means no noise.
+      physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
+        host's cores.
+      solver: contact solver of mjx: small (ours, faster) or mjx.
+      integrator: integrator of locomotion: model, the same as Gymnasium's, or euler,
+        which is faster but changes the task.
     """
 
     reward_delay: int = 1
@@ -62,20 +63,24 @@ def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
     )
 
 
-#: Before the name of an environment of ``brax.envs``.
+#: Prefix of the names of environments in ``brax.envs``.
 BRAX = "brax:"
 _EPISODE_LENGTH = 1000
 
 
 def names() -> tuple[str, ...]:
-    """The names of our own that `make` takes."""
+    """Return the names of our own environments."""
     return tuple(_constructors())
 
 
 def _constructor(name: str) -> Callable[[Settings], Env]:
-    """What builds the environment of a name; a `ValueError` of an unknown one."""
+    """Return the function that builds an environment from its settings.
+
+    Raises:
+      ValueError: if the name is unknown.
+    """
     if name.startswith(BRAX):
-        _refuse_unknown("env", name, [BRAX + known for known in brax.envs._envs])
+        _refuse_unknown("env", name, [BRAX + x for x in brax.envs._envs])
         return lambda settings: brax.envs.get_environment(name.removeprefix(BRAX))
     if ":" in name:
         own_environment.find(name)
@@ -85,7 +90,7 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
 
 
 def check(name: str, settings: Settings) -> None:
-    """Raise `ValueError` for arguments that `make` would refuse; builds nothing."""
+    """Raise `ValueError` if `make` would refuse the arguments; builds nothing."""
     _constructor(name)
     if ":" in name:
         for field in ("physics", "solver", "integrator"):
@@ -108,7 +113,7 @@ def check(name: str, settings: Settings) -> None:
 
 
 def prepare(settings: Settings, num_devices: int) -> None:
-    """What must be done before JAX starts for so many CPU devices."""
+    """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
     if settings.physics == "mujoco":
         native.reserve_threads(num_devices)
 
@@ -117,13 +122,13 @@ def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
-      name: one of `names()`, "brax:" and a name of ``brax.envs``, or MODULE:NAME of
-        a class or function of yours that builds an environment of Brax's interface.
+      name: one of `names()`; "brax:" and a name in ``brax.envs``; or MODULE:NAME of
+        your own class or function that builds an environment with Brax's interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator.
 
     Raises:
-      ValueError: an unknown name or a value out of range.
+      ValueError: if the name is unknown or a value is out of range.
     """
     chosen = Settings(**settings)
     check(name, chosen)

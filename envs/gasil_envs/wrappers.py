@@ -11,9 +11,9 @@ from brax.envs import Env, State, Wrapper
 
 
 def truncated(state: State) -> jax.Array:
-    """Whether the episode was cut off with this step, bool of the shape of ``done``.
+    """Return whether the episode was cut off in this step, bool, the shape of ``done``.
 
-    False of an environment that says nothing of it.
+    It is false if the environment has no ``info["truncation"]``.
     """
     return state.info.get("truncation", jnp.zeros_like(state.done)) > 0
 
@@ -43,7 +43,7 @@ class EpisodeLimit(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and set ``done`` and ``truncation`` at the limit."""
         steps = state.info["steps"] + 1
-        # Where the environment says nothing of it, the last step's must not stay.
+        # An environment without truncation must not keep the last step's value.
         info = {**state.info, "truncation": jnp.float32(0)}
         state = self.env.step(state.replace(info=info), action)
         at_limit = (steps >= self.episode_length).astype(jnp.float32)
@@ -58,9 +58,9 @@ class EpisodeLimit(Wrapper):
 class RewardDelay(Wrapper):
     """Give the accumulated reward every `delay` steps and at the episode's end.
 
-    Paper, section 5.4. Nothing is lost: the rewards given in an episode sum to the
-    rewards earned. ``info["true_reward"]`` keeps the reward of each step, on which
-    evaluation is done.
+    Paper, section 5.4. Over an episode, the rewards given sum to the rewards earned.
+    ``info["true_reward"]`` is the reward of each step without delay, which evaluations
+    use.
     """
 
     def __init__(self, env: Env, delay: int):
@@ -125,9 +125,9 @@ class ObservationNoise(Wrapper):
 
 
 class AutoReset(Wrapper):
-    """Start the next episode where one ended, from a fresh random start.
+    """Start the next episode when one has ended, from a random state.
 
-    For use under Brax's and Playground's tools; `gasil_jax` resets in its rollout.
+    This is for the tools of Brax and Playground; `gasil_jax` resets in its rollout.
     ``info["final_observation"]`` keeps the observation that the episode ended with,
     from which a truncated episode's value is bootstrapped.
     """

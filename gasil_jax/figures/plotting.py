@@ -1,4 +1,4 @@
-"""Learning curves from metrics."""
+"""Draw learning curves and the point mass' layout."""
 
 import pathlib
 from collections.abc import Mapping
@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-#: Okabe and Ito's colours, which colour-blind readers tell apart.
+#: Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
 def smooth(curve: np.ndarray, window: int) -> np.ndarray:
-    """Mean of the last `window` entries that are not NaN: (..., n) -> (..., n).
+    """Return the running mean over the last `window` entries: (..., n) -> (..., n).
 
-    NaN where there are none.
+    NaN entries are left out; where all are NaN, so is the mean.
     """
     finite = np.isfinite(curve)
     pad = lambda x: np.concatenate([np.zeros((*x.shape[:-1], window)), x], axis=-1)
@@ -32,14 +32,14 @@ def draw_band(
     color: str,
     label: str | None = None,
 ) -> None:
-    """A curve with `spread` shaded on both sides of it; all arrays are (n,)."""
+    """Draw a curve with `spread` shaded on both sides of it; all arrays are (n,)."""
     low, high = mean - spread, mean + spread
     axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
     axes.plot(steps, mean, color=color, label=label)
 
 
 def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
-    """Write a figure as its path ends in, the folder too if missing, and close it."""
+    """Write a figure in the format of the path's suffix and close the figure."""
     import matplotlib.pyplot as plt
 
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,7 +48,7 @@ def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
 
 
 def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
-    """The point mass' box and objects; those that are `collected` (objects,) pale."""
+    """Draw the point mass' box and objects; `collected` ones, (objects,), are pale."""
     import matplotlib.pyplot as plt
 
     kinds = (
@@ -56,7 +56,7 @@ def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
         (layout.green, "#009E73", layout.green_reward),
         (layout.orange, "#E69F00", layout.orange_reward),
     )
-    objects = [(x, y, c, r) for places, c, r in kinds for x, y in places]
+    objects = [(x, y, c, r) for centres, c, r in kinds for x, y in centres]
     for (x, y, color, reward), taken in zip(objects, collected, strict=True):
         alpha = 0.12 if taken else 0.6
         axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=alpha))
@@ -79,16 +79,16 @@ def learning_curve(
 ) -> None:
     """Save mean, spread and each seed's return over environment steps as a PNG.
 
-    Each point is the mean of the last fiftieth of training. The mean of evaluations is
-    dashed.
+    Each point is a mean over the preceding fiftieth of training. The mean of the
+    evaluations is dashed.
 
     Args:
-      path: where to.
+      path: the image file.
       env_steps: (iterations,).
       episode_return: (seeds, iterations); NaN where no episode ended.
-      title: of the plot.
-      evaluations: "env_steps" and "mean" of those on the way, (seeds, evaluations)
-        each; None without any.
+      title: title of the plot.
+      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
+        evaluations) each; None if there are none.
     """
     import matplotlib
 
@@ -99,15 +99,15 @@ def learning_curve(
     figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
     for curve in episode_return:
         axes.plot(env_steps, curve, color="0.75", linewidth=0.8)
-    some = np.isfinite(episode_return).any(axis=0)
-    if some.any():
-        seen, steps = episode_return[:, some], env_steps[some]
+    has_return = np.isfinite(episode_return).any(axis=0)
+    if has_return.any():
+        seen, steps = episode_return[:, has_return], env_steps[has_return]
         mean, spread = np.nanmean(seen, axis=0), np.nanstd(seen, axis=0)
         draw_band(axes, steps, mean, spread, "#0072B2", "mean ± standard deviation")
     if evaluations is not None:
         steps, mean = evaluations["env_steps"][0], evaluations["mean"].mean(axis=0)
         axes.plot(steps, mean, "--", color="#D55E00", label="mean of the evaluations")
-    if some.any() or evaluations is not None:
+    if has_return.any() or evaluations is not None:
         axes.legend(frameon=False, loc="upper left")
     axes.set(xlabel="environment steps", ylabel="episode return", title=title)
     save(figure, path, dpi=150)

@@ -1,15 +1,15 @@
 """Save and load training states with Orbax.
 
-`save` and `restore` are of one state. `write`, `latest`, `best` and `prune` keep a
-folder of checkpoints, each a folder named by its iteration:
+`save` and `restore` handle a single state. `write`, `latest`, `best` and `prune` manage
+a folder of checkpoints. Each checkpoint is a folder named by its iteration:
 
     00000490/state/          the state, written by Orbax
-    00000490/manifest.json   SHA-256 of every file of it, and a record
+    00000490/manifest.json   SHA-256 of each of its files, and a record
 
-A checkpoint is written under another name and renamed when it is whole and on the
-disk, so a process that is killed at any moment leaves the ones before it as they were.
-One that was damaged later is told by its hashes, and set aside as 00000490.damaged when
-training goes on from the one before.
+A checkpoint is written under another name, and renamed once it is complete and on the
+disk. A process may therefore be killed at any moment without harm to older checkpoints.
+The hashes reveal later damage. A damaged checkpoint is renamed to 00000490.damaged when
+training continues from an older one.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ def _is_key(leaf: Any) -> bool:
 
 
 def _as_arrays(state: Any) -> dict[str, Any]:
-    """Leaves by their path in the state; typed keys as what they hold."""
+    """Return the state's leaves by their path, with typed keys as plain arrays."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(state)
     return {
         jax.tree_util.keystr(path): jax.random.key_data(x) if _is_key(x) else x
@@ -52,24 +52,24 @@ def save(folder: pathlib.Path, state: Any) -> None:
 
 
 def restore(folder: pathlib.Path, like: Any) -> Any:
-    """Read what `save` wrote.
+    """Read a state that `save` wrote.
 
     Args:
-      folder: where it is.
+      folder: the folder that `save` wrote to.
       like: a state of the same structure, shapes and dtypes; its leaves may be
         `jax.ShapeDtypeStruct`.
 
     Raises:
-      ValueError: it is a state of another structure, shape or dtype.
+      ValueError: if the saved state has another structure, shape or dtype.
     """
     with ocp.StandardCheckpointer() as checkpointer:
         arrays = checkpointer.restore(folder.absolute())
-    wanted = jax.eval_shape(_as_arrays, like)
-    # Orbax may restore a part of a tree that does not match, without a word.
+    expected = jax.eval_shape(_as_arrays, like)
+    # Orbax may silently restore only a part of a tree that does not match.
     shape = lambda tree: {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
-    if shape(arrays) != shape(wanted):
-        names = set(arrays) ^ set(wanted) or {
-            name for name in wanted if shape(arrays)[name] != shape(wanted)[name]
+    if shape(arrays) != shape(expected):
+        names = set(arrays) ^ set(expected) or {
+            name for name in expected if shape(arrays)[name] != shape(expected)[name]
         }
         raise ValueError(f"{folder} holds another state: {min(names)} differs")
     leaves, structure = jax.tree_util.tree_flatten_with_path(like)
@@ -83,12 +83,12 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
 
 
 class Checkpoint(NamedTuple):
-    """One that is whole.
+    """A complete, undamaged checkpoint.
 
     Attributes:
-      folder: where it is.
-      iteration: after which it was written.
-      record: what `write` was given.
+      folder: its folder.
+      iteration: number of iterations before it was written.
+      record: the record that `write` was given.
     """
 
     folder: pathlib.Path
@@ -96,27 +96,27 @@ class Checkpoint(NamedTuple):
     record: Mapping[str, Any]
 
     def restore(self, like: Any) -> Any:
-        """Its state; see `restore`."""
+        """Return the saved state; see the function `restore`."""
         return restore(self.folder / _STATE, like)
 
 
 class WriteError(OSError):
-    """A checkpoint could not be written; those before it are as they were."""
+    """A checkpoint could not be written; older ones are unharmed."""
 
 
 def write(
     root: pathlib.Path, iteration: int, state: Any, record: Mapping[str, Any]
 ) -> None:
-    """Add a checkpoint to the folder `root`, if a whole one is not there already.
+    """Write a checkpoint into the folder `root`, unless an undamaged one is there.
 
     Args:
-      root: made where it is missing.
-      iteration: its number.
+      root: folder of the checkpoints, created if it is missing.
+      iteration: number of iterations so far.
       state: a pytree of arrays.
-      record: what is to be known of it without reading the state; goes into JSON.
+      record: facts that can be read without the state; written as JSON.
 
     Raises:
-      WriteError: the disk is full, or the folder can't be written.
+      WriteError: if the disk is full or the folder can't be written.
     """
     whole = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
@@ -125,7 +125,7 @@ def write(
         return
     try:
         root.mkdir(parents=True, exist_ok=True)
-        # What a process left that was killed here.
+        # Remove what a killed process has left.
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         save(partial / _STATE, state)
@@ -144,13 +144,13 @@ def write(
 
 
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
-    found = {}
+    hashes = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != _MANIFEST:
             with path.open("rb") as file:
                 digest = hashlib.file_digest(file, "sha256").hexdigest()
-            found[path.relative_to(folder).as_posix()] = digest
-    return found
+            hashes[path.relative_to(folder).as_posix()] = digest
+    return hashes
 
 
 def _to_disk(path: pathlib.Path) -> None:
@@ -162,7 +162,7 @@ def _to_disk(path: pathlib.Path) -> None:
 
 
 def _folders(root: pathlib.Path) -> list[pathlib.Path]:
-    """Every finished checkpoint's folder, oldest first, whole or damaged."""
+    """Return the folders of all finished checkpoints, oldest first, even if damaged."""
     if not root.is_dir():
         return []
     return sorted(
@@ -171,27 +171,27 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
 
 
 def read(folder: pathlib.Path) -> Checkpoint:
-    """The checkpoint in `folder`, its hashes compared.
+    """Return the checkpoint in `folder` after checking its hashes.
 
     Raises:
-      ValueError: it is damaged.
+      ValueError: if it is damaged.
     """
     try:
         manifest = json.loads((folder / _MANIFEST).read_text())
         files, record = manifest["files"], dict(manifest["record"])
     except (OSError, ValueError, KeyError, TypeError):
         raise ValueError(f"{folder} is damaged: its manifest can't be read") from None
-    found = _hashes(folder)
-    if found != files:
+    hashes = _hashes(folder)
+    if hashes != files:
         name = min(
-            name for name in {*found, *files} if found.get(name) != files.get(name)
+            name for name in {*hashes, *files} if hashes.get(name) != files.get(name)
         )
         raise ValueError(f"{folder} is damaged: {name} is not what was written")
     return Checkpoint(folder, int(folder.name), record)
 
 
 def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
-    """The newest checkpoint that is whole, and what is wrong with newer ones."""
+    """Return the newest undamaged checkpoint, and the errors of damaged newer ones."""
     damages: list[str] = []
     for folder in reversed(_folders(root)):
         try:
@@ -202,7 +202,7 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 
 def best(root: pathlib.Path) -> Checkpoint | None:
-    """The whole checkpoint with the highest "score" in its record, if one has any."""
+    """Return the undamaged checkpoint with the highest recorded "score", or None."""
     scores = _scores(_folders(root))
     for folder in sorted(scores, key=scores.__getitem__, reverse=True):
         with contextlib.suppress(ValueError):
@@ -211,26 +211,26 @@ def best(root: pathlib.Path) -> Checkpoint | None:
 
 
 def best_score(root: pathlib.Path) -> float:
-    """The highest "score" in a record, minus infinity where none has any."""
+    """Return the highest "score" of all records, or minus infinity without scores."""
     return max(_scores(_folders(root)).values(), default=-math.inf)
 
 
 def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
-    """The scores of those that have one."""
-    found = {}
+    """Return the scores of the checkpoints that have one."""
+    scores = {}
     for folder in folders:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
             score = json.loads((folder / _MANIFEST).read_text())["record"]["score"]
             if score is not None:
-                found[folder] = score
-    return found
+                scores[folder] = score
+    return scores
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:
-    """Rename checkpoints after an iteration, so that they no longer count as one.
+    """Rename the checkpoints after an iteration, so that they no longer count.
 
-    What is newer than the newest whole one is damaged: training that goes on from that
-    writes them again, and `prune` would keep them for the newest.
+    Checkpoints newer than the newest undamaged one are damaged. Training that continues
+    from it writes them again; until then `prune` would keep them as the newest.
     """
     for folder in _folders(root):
         if int(folder.name) > newer_than:
@@ -245,10 +245,9 @@ def prune(root: pathlib.Path, keep: int) -> None:
     """Delete all but the newest `keep` and the best one."""
     folders = _folders(root)
     scores = _scores(folders)
-    kept = {
-        *folders[-keep:],
-        *([max(scores, key=scores.__getitem__)] if scores else []),
-    }
+    kept = set(folders[-keep:])
+    if scores:
+        kept.add(max(scores, key=scores.__getitem__))
     for folder in folders:
         if folder not in kept:
             shutil.rmtree(folder)

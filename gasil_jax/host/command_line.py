@@ -1,4 +1,4 @@
-"""From a command line to a dataclass, and from its errors to a line and a status."""
+"""Parse a command line into a dataclass; turn errors into a line and a status."""
 
 import contextlib
 import dataclasses
@@ -26,7 +26,7 @@ _REGISTRY = ConstructorRegistry()
 
 @contextlib.contextmanager
 def input_checked() -> Iterator[None]:
-    """Raise a `ValueError` that is raised inside as an `InputError`."""
+    """Turn every `ValueError` raised inside the `with` block into an `InputError`."""
     try:
         yield
     except ValueError as error:
@@ -35,7 +35,7 @@ def input_checked() -> Iterator[None]:
 
 @_REGISTRY.primitive_rule
 def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    # A command line names points; an Optax schedule comes from Python alone.
+    # A command line gives points; an Optax schedule can only be given in Python.
     if info.type != Schedule:
         return None
 
@@ -55,10 +55,10 @@ def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
 
 
 def whole_number(word: str) -> int:
-    """A whole number in words: step counts are written as 1e6, too.
+    """Return the whole number that a word stands for, also one written as 1e6.
 
     Raises:
-      ValueError: it is none.
+      ValueError: if the word is not a whole number.
     """
     try:
         return int(word)
@@ -93,18 +93,18 @@ def parse(
     program: str,
     default: T | None = None,
 ) -> T:
-    """Options from the command line; prints help and exits where that is asked for.
+    """Return the options of a command line; print the help and exit if it says --help.
 
     Args:
-      options: a dataclass.
-      arguments: default what the program was started with.
-      program: the module that was started.
-      default: what stands where no flag is given; default the dataclass' own.
+      options: the dataclass of the options.
+      arguments: the command line; default the one that the program was started with.
+      program: name of the module that was started.
+      default: the values of options that are not given; default the dataclass' own.
 
     Raises:
-      InputError: what tyro refuses, its message in one line.
+      InputError: if tyro rejects the command line; the message is one line.
     """
-    # Of these tyro says the value and not the name.
+    # tyro's own message about a switch with a value does not name the switch.
     switches = _switches(options)
     for argument in sys.argv[1:] if arguments is None else arguments:
         flag, equals, value = argument.partition("=")
@@ -128,20 +128,20 @@ def parse(
 
 
 def _switches(kind: Any) -> set[str]:
-    """Names of what is on or off, in a dataclass and in those inside it."""
-    found = set()
+    """Return the names of a dataclass' boolean flags, including nested dataclasses'."""
+    names = set()
     for name, hint in get_type_hints(kind).items():
         if hint is bool:
-            found |= {name, f"no_{name}"}
+            names |= {name, f"no_{name}"}
         elif dataclasses.is_dataclass(hint):
-            found |= _switches(hint)
-    return found
+            names |= _switches(hint)
+    return names
 
 
 def _in_one_line(refusal: str) -> str:
-    """What a framed message of tyro says, without frame, title and pointers."""
+    """Return the text of tyro's framed message without its frame, title and hints."""
     text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    # Drawn with lines, with ASCII or with blanks, as the terminal's encoding allows.
+    # The frame is of lines, ASCII or blanks, depending on the terminal's encoding.
     lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
     _title, *rest = [line for line in lines if line.strip("-")]
     message = " ".join(" ".join(rest).split())
@@ -159,11 +159,14 @@ def _in_one_line(refusal: str) -> str:
 
 
 def check_least(options: Any, **least: int) -> None:
-    """Raise `InputError` for numbers below what is allowed; None is no number.
+    """Check that numbers are not below their lowest allowed values; None is allowed.
 
     Args:
       options: a dataclass.
-      least: of its fields by name.
+      least: the lowest allowed value of each field to check, by name.
+
+    Raises:
+      InputError: if a number is too low.
     """
     for name, low in least.items():
         value = getattr(options, name)
@@ -172,18 +175,18 @@ def check_least(options: Any, **least: int) -> None:
 
 
 def check_key(key: int) -> None:
-    """Raise `InputError` for a key that is none of JAX's and of Gymnasium's."""
+    """Raise `InputError` unless both JAX and Gymnasium take the number as a seed."""
     if not 0 <= key < 2**32:
         raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
 
 
 def exit_status(work: Callable[[], int | None]) -> int:
-    """Do the work of a command line; its errors become lines on stderr.
+    """Do the work of a command line, print its errors and return its exit status.
 
     Returns:
-      what the work says, or 0: done; 1: a folder or file can't be read or written,
-      or a program that was started failed; 2: bad input; 128 and the signal's
-      number: interrupted, and saved.
+      The status that the work returns, or 0 if it is done; 1 if a folder or file can't
+      be read or written, or if a program that it started failed; 2 for bad input; 128
+      plus the signal's number if it was interrupted after saving.
     """
     try:
         return work() or 0

@@ -1,4 +1,4 @@
-"""Settings of JAX that must stand before it starts: devices, precision, its cache."""
+"""Settings of JAX that must be made before it starts: devices, precision, cache."""
 
 import contextlib
 import hashlib
@@ -15,29 +15,30 @@ from gasil_jax.host.environments import Settings
 
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
-    """Have JAX use the host's cores as devices; call it before JAX starts.
+    """Make JAX use the host's cores as devices; call it before JAX starts.
 
     Args:
-      settings: of the environment.
-      requested: how many devices; None for the cores.
-      num_members: no more devices are used than there are members.
+      settings: settings of the environment.
+      requested: number of devices; None for one per core.
+      num_members: number of members, which is the largest number of devices used.
     """
     count = min(requested or environments.available_cores(), num_members)
     environments.prepare(settings, count)
-    # In a program that has used JAX already, its devices stay as they are.
+    # If the program has used JAX before, the devices stay as they are.
     with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", count)
     _keep_compiled_programs()
-    # Everywhere, not only where `full_precision` says so.
+    # This applies everywhere, not only to functions with `full_precision`.
     jax.config.update("jax_default_matmul_precision", "highest")
 
 
 def _keep_compiled_programs() -> None:
-    """Have JAX keep them in the user's cache, unless its own variable says where.
+    """Make JAX keep compiled programs in the user's cache, unless it already has one.
 
-    By the version of jaxlib and the processor: a program for another one may crash.
+    There is a folder for each version of jaxlib and each processor, because a program
+    compiled for another one may crash.
     """
-    # Before 0.12 XLA calls every program that it loads one for another processor.
+    # Before 0.12 XLA warns of every loaded program that it is for another processor.
     quiet = jaxlib.version.__version_info__ >= (0, 12)
     config: Any = jax.config  # Its options are attributes that its type does not have.
     if config.jax_compilation_cache_dir is not None or not quiet:

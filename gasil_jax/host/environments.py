@@ -1,4 +1,4 @@
-"""Environments by name: the one place where the library knows ``gasil_envs``."""
+"""Make environments by name; the registry of ``gasil_envs`` is used only here."""
 
 from typing import Any
 
@@ -21,10 +21,10 @@ __all__ = [
 
 
 def is_locomotion(env: Any) -> bool:
-    """Whether it is one of the MuJoCo tasks, wrapped or not."""
+    """Return whether an environment, wrapped or not, is one of the MuJoCo tasks."""
     return isinstance(env.unwrapped, Locomotion)
 
 
 def is_point_mass(env: Any) -> bool:
-    """Whether it is the point mass, wrapped or not."""
+    """Return whether an environment, wrapped or not, is the point mass."""
     return isinstance(env.unwrapped, PointMass)

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as something to look at, between two chunks of training."""
+"""Note SIGINT and SIGTERM, so that training can stop between two chunks."""
 
 import contextlib
 import signal
@@ -7,10 +7,10 @@ from typing import Any
 
 
 class Interrupted(Exception):
-    """A signal ended a run before its time; all that was done is saved.
+    """A signal stopped a run early; everything done so far is saved.
 
     Attributes:
-      signal: which one.
+      signal: the signal.
     """
 
     def __init__(self, number: signal.Signals):
@@ -19,10 +19,10 @@ class Interrupted(Exception):
 
 
 class Interruption:
-    """While it is entered, notes the first of these signals; a second one kills.
+    """Notes the first signal inside the `with` block; a second signal kills.
 
     Attributes:
-      signal: the one that came, or None.
+      signal: the signal that was received, or None.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class Interruption:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Interruption":
-        # Outside the main thread Python takes no handlers, and gets no signals.
+        # Outside the main thread Python accepts no handlers and receives no signals.
         with contextlib.suppress(ValueError):
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._before[number] = signal.signal(number, self._note)

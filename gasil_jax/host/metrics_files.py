@@ -1,4 +1,4 @@
-"""The files of a run folder: config.json, summary.json, and its tables in CSV."""
+"""Write and read the files of a run folder: JSON files and tables in CSV."""
 
 import csv
 import dataclasses
@@ -16,7 +16,7 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 
-#: Metrics that every metrics.csv has, in this order; an agent's own follow.
+#: Metrics that every metrics.csv has, in this order; the agent's own metrics follow.
 COLUMNS = (
     "env_steps",
     "episode_return",
@@ -32,10 +32,18 @@ COLUMNS = (
 
 
 def versions() -> dict[str, str | None]:
-    """Versions of what a result depends on; None for what isn't installed."""
+    """Return the versions of Python and the packages; None if not installed."""
     packages = (
-        *("gasil_jax", "jax", "jaxlib", "flax", "optax", "brax"),
-        *("mujoco", "mujoco-mjx", "gymnasium", "numpy"),
+        "gasil_jax",
+        "jax",
+        "jaxlib",
+        "flax",
+        "optax",
+        "brax",
+        "mujoco",
+        "mujoco-mjx",
+        "gymnasium",
+        "numpy",
     )
     return {"python": platform.python_version()} | {
         name: _version(name) for name in packages
@@ -50,7 +58,7 @@ def _version(package: str) -> str | None:
 
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-    """Write a whole file, or none."""
+    """Write a JSON file; if that fails, none is left."""
     text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
     with output_file.whole(path) as partial:
         partial.write_text(text + "\n")
@@ -67,19 +75,19 @@ def _to_json(value: Any) -> Any:
 class MetricsWriter:
     """Appends a row for each member and iteration to a table such as metrics.csv.
 
-    A value that is not finite (no episode ended yet, no discriminator) is left empty;
-    the others are written so that float32 reads them back unchanged.
+    A value that is not finite (no episode ended yet, no discriminator) is left empty.
+    The others are written so that reading them as float32 gives the same numbers.
 
     Args:
-      path: of the file.
-      labels: columns that tell the members apart, (members,) each: "seed" and others.
-      size: where to go on: the file is cut there and the rest is kept beside it;
-        None for a new file.
-      columns: metrics that are written first, in this order; others follow.
+      path: the file.
+      labels: columns that identify the members, (members,) each: "seed" and others.
+      size: number of bytes to keep of an existing file; the rest is moved to a new
+        file beside it. None creates a new file.
+      columns: metrics to write first, in this order; others follow.
 
     Raises:
-      FileExistsError: a new file would replace one.
-      ValueError: the file that is to go on is missing or shorter than `size`.
+      FileExistsError: if a new file would replace an existing one.
+      ValueError: if the existing file is missing or shorter than `size`.
     """
 
     def __init__(
@@ -105,7 +113,7 @@ class MetricsWriter:
         self._writer = csv.writer(self._file)
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
-        """Write (members, iterations) arrays, one for each metric."""
+        """Write arrays (members, iterations), one for each metric."""
         if self._columns is None:
             own = tuple(sorted(set(metrics) - set(self._first)))
             self._columns = (*self._labels, *self._first, *own)
@@ -123,7 +131,7 @@ class MetricsWriter:
         self._file.flush()
 
     def size(self) -> int:
-        """Bytes of the file, all of them on the disk."""
+        """Write everything to the disk and return the size of the file in bytes."""
         self._file.flush()
         os.fsync(self._file.fileno())
         return os.fstat(self._file.fileno()).st_size
@@ -134,7 +142,7 @@ class MetricsWriter:
 
 
 def _cut(path: pathlib.Path, size: int) -> None:
-    """Shorten a file; what is cut off goes into a new file beside it."""
+    """Shorten a file, and move what is cut off to a new file beside it."""
     with path.open("rb+") as file:
         file.seek(size)
         rest = file.read()
@@ -160,15 +168,15 @@ def _cell(value: Any) -> str:
 def read_metrics(
     path: pathlib.Path, labels: Sequence[str], num_members: int
 ) -> dict[str, np.ndarray]:
-    """Every column of a `MetricsWriter`, (members, iterations); NaN where empty.
+    """Return every metric of a `MetricsWriter`'s file, (members, iterations) each.
 
     Args:
-      path: of the file.
-      labels: names of the columns that are not metrics.
-      num_members: rows of an iteration.
+      path: the file; an empty cell becomes NaN.
+      labels: names of the first columns, which are not metrics.
+      num_members: number of rows per iteration.
 
     Raises:
-      InputError: it is damaged.
+      InputError: if the file is damaged.
     """
     first = len(labels)
     try:

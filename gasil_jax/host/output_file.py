@@ -1,4 +1,4 @@
-"""Files that are refused beforehand, or written whole."""
+"""Check output files beforehand, and write each of them completely or not at all."""
 
 import contextlib
 import pathlib
@@ -10,14 +10,14 @@ from gasil_jax.errors import InputError
 
 
 def unwritable(path: pathlib.Path, error: OSError) -> str:
-    """What is said of a folder or file that can't be written."""
-    # Libraries raise it without a number, some in several lines.
+    """Return the error message for a folder or file that can't be written."""
+    # Errors that libraries raise may have no `strerror`, and several lines.
     why = error.strerror or str(error).partition("\n")[0]
     return f"out is {path}, which can't be written: {why}"
 
 
 def check(path: pathlib.Path, endings: Sequence[str]) -> None:
-    """Raise `InputError` unless it can be a new file with one of these endings."""
+    """Raise `InputError` unless the path is free and has one of these endings."""
     if path.suffix not in endings:
         raise InputError(f"out is {path}: it must end in {', '.join(endings)}")
     if path.exists():
@@ -25,10 +25,10 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 
 def make_parent(path: pathlib.Path) -> None:
-    """Make the folder that it goes in.
+    """Create the folder of a file.
 
     Raises:
-      InputError: that can't be, or it can't be written in.
+      InputError: if it can't be created or written to.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -40,14 +40,15 @@ def make_parent(path: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Gives a path beside it to write to, which becomes it in the end, or nothing.
+    """Yield a temporary path beside the file, which is renamed to it at the end.
 
-    So no reader sees half a file, and processes may write the same one side by side.
+    No reader therefore sees half a file, and several processes may write the same one.
+    If the block raises an error, nothing is left.
 
     Raises:
-      OSError: it can't be written, in one line that names it.
+      OSError: if it can't be written; the message is one line with the path.
     """
-    # No number of a process: those of several hosts may be the same.
+    # Not the process number, because processes on several hosts may have the same.
     partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
     try:
         yield partial

@@ -1,8 +1,8 @@
-"""Score the policies of a batch at set times while it trains.
+"""Evaluate the policies of a batch at regular intervals during training.
 
-The scores are in evaluations.csv, beside metrics.csv: a row for each member and
-evaluation, with the mean, least and greatest return of its episodes and their mean
-length. Training is the same, bit for bit, with and without.
+The scores go to evaluations.csv, beside metrics.csv: a row for each member and
+evaluation, with the mean, lowest and highest return of its episodes and their mean
+length. Evaluations do not change training, not by a single bit.
 """
 
 import math
@@ -19,19 +19,19 @@ from gasil_jax.host import metrics_files, trackers
 from gasil_jax.host.members import Batch
 from gasil_jax.train import TrainState
 
-#: Columns of evaluations.csv after those that tell the members apart.
+#: Columns of evaluations.csv after those that identify the members.
 COLUMNS = ("env_steps", "mean", "min", "max", "length")
-# Far from the seed numbers in use, whose keys are those of training.
+# Far from the usual seed numbers, because training takes its keys from those.
 _ROOT = 2**32 - 1
 
 
 class EvaluationSchedule(NamedTuple):
-    """When policies are scored, and in how many episodes.
+    """The times of evaluations and their number of episodes.
 
     Attributes:
-      every: environment steps of a seed between two evaluations, rounded up to whole
-        iterations; the last policy is scored in any case.
-      num_episodes: of each policy, from fresh starts.
+      every: environment steps per seed between two evaluations, rounded up to whole
+        iterations; the final policy is always evaluated.
+      num_episodes: number of episodes of each policy, in fresh environments.
     """
 
     every: int
@@ -39,10 +39,10 @@ class EvaluationSchedule(NamedTuple):
 
 
 def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Array:
-    """The key of a seed's evaluation after so many iterations.
+    """Return the key of a seed's evaluation after `iteration` iterations.
 
-    It depends on these two numbers alone: not on training's keys, and not on the
-    members beside it.
+    It depends on these two numbers alone, not on the keys of training or on the other
+    members of the batch.
     """
     return jax.random.fold_in(
         jax.random.fold_in(jax.random.key(_ROOT), seed), iteration
@@ -50,22 +50,23 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
 
 
 class PeriodicEvaluation:
-    """Scores all members with one compiled program, sharded as their training is.
+    """Evaluates all members with one compiled program, sharded as training is.
 
     Args:
-      runs: what is trained.
-      schedule: when, and in how many episodes.
-      path: of evaluations.csv.
-      labels: columns that tell the members apart, (members,) each.
-      size: where the file goes on, as of `metrics_files.MetricsWriter`.
-      following: trackers that are given the scores too.
+      runs: the batch of runs that is trained.
+      schedule: the times of evaluations and their number of episodes.
+      path: the file evaluations.csv.
+      labels: columns that identify the members, (members,) each.
+      size: number of bytes to keep of an existing file, see
+        `metrics_files.MetricsWriter`.
+      following: trackers that also get the scores.
 
     Attributes:
-      seconds: spent on evaluations in this process, compiling included.
+      seconds: time of all evaluations in this process, including compilation.
 
     Raises:
-      FileExistsError: a new file would replace one.
-      ValueError: the file that is to go on is missing or shorter than `size`.
+      FileExistsError: if a new file would replace an existing one.
+      ValueError: if the existing file is missing or shorter than `size`.
     """
 
     def __init__(
@@ -95,22 +96,22 @@ class PeriodicEvaluation:
         self._writer = metrics_files.MetricsWriter(path, labels, size, columns=COLUMNS)
 
     def iterations_left(self, done: int) -> int:
-        """Iterations from `done` to the next evaluation, one at least."""
+        """Return the iterations from `done` to the next evaluation, at least one."""
         return self._interval - done % self._interval
 
     def is_due(self, done: int) -> bool:
-        """Whether the policies after so many iterations are to be scored."""
+        """Return whether an evaluation is due after `done` iterations."""
         return done % self._interval == 0 or done == self._runs.config.num_iterations
 
     def score(self, states: Any, done: int) -> float:
-        """Score the policies, write the scores and give them to the trackers.
+        """Evaluate the policies, write the scores and log them to the trackers.
 
         Args:
-          states: of the members, padded, as training has them; they stay as they are.
-          done: iterations that they have behind them.
+          states: the members' training states, padded as in training; not donated.
+          done: number of iterations so far.
 
         Returns:
-          the mean return over episodes and members.
+          The mean return over episodes and members.
         """
         started = time.monotonic()
         episodes = jax.tree.map(np.asarray, self._score(states, self._seeds))
@@ -129,7 +130,7 @@ class PeriodicEvaluation:
         return float(scores["mean"].mean(dtype=np.float64))
 
     def size(self) -> int:
-        """Bytes of evaluations.csv, all of them on the disk."""
+        """Write everything to the disk; return the size of evaluations.csv in bytes."""
         return self._writer.size()
 
     def close(self) -> None:

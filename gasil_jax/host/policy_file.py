@@ -1,4 +1,4 @@
-"""Writes policy.npz, the trained policies of a run."""
+"""Write policy.npz, the trained policies of a run."""
 
 import pathlib
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ def save(
     seeds: Sequence[int],
     final_return: np.ndarray,
 ) -> None:
-    """Write the policies of a batch of states as one ``.npz``, whole.
+    """Write the policies of a batch of training states to one ``.npz`` file.
 
     Args:
-      path: where to.
-      states: (seeds, ...).
-      env: that they were trained in.
-      seeds: their numbers.
+      path: the file.
+      states: the training states, (seeds, ...).
+      env: the environment that they were trained in.
+      seeds: numbers of the seeds.
       final_return: (seeds,), NaN where unknown.
     """
     arrays: dict[str, Any] = {

@@ -1,4 +1,4 @@
-"""A live display of a run: a bar on a terminal, plain lines elsewhere."""
+"""Show the progress of a run: as a bar on a terminal, as plain lines elsewhere."""
 
 import contextlib
 import sys
@@ -26,11 +26,11 @@ _SECONDS_OF_SILENCE = 1.0
 
 @contextlib.contextmanager
 def announced(title: str, name: str) -> Iterator[None]:
-    """Say what is being done while this is entered, if it takes more than a second.
+    """Print a line to stderr if the `with` block takes more than a second.
 
     Args:
-      title: of the program or run, before the colon of the line on stderr.
-      name: of what is being done.
+      title: name of the program or run, the part before the colon.
+      name: name of the work, the part after the colon.
     """
     timer = threading.Timer(_SECONDS_OF_SILENCE, _line, (title, name))
     timer.daemon = True
@@ -42,13 +42,13 @@ def announced(title: str, name: str) -> Iterator[None]:
 
 
 def _line(title: str, text: str) -> None:
-    # In one write: a line of another thread's does not come between.
+    # A single write, so that no line of another thread comes in between.
     sys.stderr.write(f"{title}: {text}\n")
     sys.stderr.flush()
 
 
 class Progress:
-    """Shows steps, return (mean over seeds and spread), steps/s and time left."""
+    """Shows steps, return (mean and spread over seeds), steps/s and the time left."""
 
     def __init__(self, title: str, total_steps: int):
         self._console = Console(stderr=True)
@@ -84,7 +84,7 @@ class Progress:
         self._bar.stop()
 
     def phase(self, name: str, steps: int = 0) -> None:
-        """Say what is happening now, from so many environment steps on."""
+        """Show the name of the phase that begins after `steps` environment steps."""
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = steps
         self._bar.update(self._task, status=name)
@@ -93,9 +93,9 @@ class Progress:
 
     @contextlib.contextmanager
     def aside(self, name: str) -> Iterator[None]:
-        """Say what is done between two pieces of training, if it takes long.
+        """Show the name of work between two pieces of training, if it takes long.
 
-        Its time does not count in the speed.
+        Its time does not count towards the training speed.
         """
         started = time.monotonic()
         status = self._bar.tasks[0].fields["status"]

@@ -1,4 +1,4 @@
-"""Whether a batch of runs fits the device and the disk, before anything compiles."""
+"""Check before compiling that a batch of runs fits the devices and the disk."""
 
 import math
 import pathlib
@@ -11,20 +11,21 @@ import jax
 from gasil_jax import train
 from gasil_jax.config import Config
 
-# Measured with XLA's own account of eight programs, agents and shapes that differ: the
-# program needs 7 to 11 times a batch beside the states (tests/test_resources.py).
+# Measured with XLA's own report, over eight programs with different agents and shapes:
+# besides the states a program needs 7 to 11 times the memory of a batch
+# (tests/host/test_resources.py).
 _BATCHES = 8
-# By the same account an episode that is scored needs 7 (point mass) or 25 (hopper)
-# times its environment's state.
+# By the same report an evaluated episode needs 7 (point mass) or 25 (hopper) times the
+# memory of its environment's state.
 _STATES = 7
 
 
 class Need(NamedTuple):
-    """Bytes of one run.
+    """The bytes that one run needs.
 
     Attributes:
-      state: of its `TrainState`, which is what a checkpoint holds.
-      memory: while it trains.
+      state: size of its `TrainState`, which is the size of a checkpoint.
+      memory: memory during training.
     """
 
     state: int
@@ -41,18 +42,18 @@ def _size(tree: Any) -> int:
 
 
 def need(env: Any, config: Config) -> Need:
-    """What one run takes; memory is an estimate, within a factor of two."""
+    """Return the bytes that one run needs; memory is right within a factor of two."""
     state = jax.eval_shape(lambda: train.init(env, config, jax.random.key(0)))
-    # The fields of a `Rollout`, and as much again for what PPO adds to it.
+    # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + env.action_size + 12
     batch = 4 * config.batch_steps * numbers
-    # What imitates may be large, and is copied when it is not donated.
+    # The imitation method's state may be large, and is copied if it is not donated.
     memory = _size(state) + _size(state.imitation) + _BATCHES * batch
     return Need(_size(state), memory)
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
-    """Bytes that are free for the programs of these devices, None if unknown."""
+    """Return the free memory of these devices in bytes, or None if it is unknown."""
     if devices[0].platform != "cpu":
         stats = devices[0].memory_stats() or {}
         if "bytes_limit" not in stats:
@@ -73,23 +74,23 @@ def available(devices: Sequence[jax.Device]) -> int | None:
 def check_memory(
     env: Any, config: Config, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
-    """Refuse what does not fit the devices.
+    """Check that training fits the devices' memory.
 
     Args:
       env: one environment.
-      config: of the runs.
-      num_members: trained at once.
-      devices: that they are sharded over.
+      config: the config of the runs.
+      num_members: number of members that are trained at once.
+      devices: the devices that they are sharded over.
 
     Raises:
-      ValueError: the numbers.
+      ValueError: if it does not fit; the message gives the sizes.
     """
     one = need(env, config)
-    wanted, free = num_members * one.memory, available(devices)
-    if free is not None and wanted > free:
+    required, free = num_members * one.memory, available(devices)
+    if free is not None and required > free:
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
-            f"{_in_words(wanted)} of memory, {_in_words(one.memory)} each with "
+            f"{_in_words(required)} of memory, {_in_words(one.memory)} each with "
             f"num_envs {config.num_envs} and batch_steps {config.batch_steps}, and "
             f"{_in_words(free)} are free: at most {free // one.memory} fit"
         )
@@ -103,24 +104,24 @@ def check_episodes(
     *,
     option: str = "episodes",
 ) -> None:
-    """Refuse more episodes side by side than fit the devices.
+    """Check that an evaluation's parallel episodes fit the devices' memory.
 
     Args:
       env: one environment.
-      num_episodes: of each policy.
-      num_policies: scored at once.
-      devices: that they run on.
-      option: that gives their number.
+      num_episodes: number of episodes of each policy.
+      num_policies: number of policies that are evaluated at once.
+      devices: the devices that they run on.
+      option: name of the option that sets the number of episodes.
 
     Raises:
-      ValueError: the numbers.
+      ValueError: if they do not fit; the message gives the sizes.
     """
     state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
-    wanted, free = _STATES * state * num_episodes * num_policies, available(devices)
-    if free is not None and wanted > free:
+    required, free = _STATES * state * num_episodes * num_policies, available(devices)
+    if free is not None and required > free:
         raise ValueError(
             f"{option} is {num_episodes}: of {num_policies} policies side by side they "
-            f"need at least {_in_words(wanted)} of memory, and {_in_words(free)} are "
+            f"need at least {_in_words(required)} of memory, and {_in_words(free)} are "
             "free"
         )
 
@@ -131,35 +132,35 @@ def check_disk(
     folder: pathlib.Path,
     num_checkpoints: int,
 ) -> None:
-    """Refuse what does not fit the disk.
+    """Check that the checkpoints fit the disk.
 
     Args:
       env: one environment.
-      runs: each configuration, and how many members have it.
-      folder: that checkpoints are written to; need not exist.
-      num_checkpoints: of each that are kept.
+      runs: each config with the number of its members.
+      folder: the folder of the checkpoints; it need not exist.
+      num_checkpoints: number of checkpoints to keep of each member.
 
     Raises:
-      ValueError: the numbers.
+      ValueError: if they do not fit; the message gives the sizes.
     """
     while not folder.exists():
         folder = folder.parent
     sizes = [need(env, config).state * num_members for config, num_members in runs]
-    # One more of those that train is being written.
-    wanted = num_checkpoints * sum(sizes) + max(sizes, default=0)
+    # While a checkpoint is being written there is one more.
+    required = num_checkpoints * sum(sizes) + max(sizes, default=0)
     free = _free_disk(folder)
-    if free is not None and wanted > free:
+    if free is not None and required > free:
         members = sum(num_members for _, num_members in runs)
         raise ValueError(
             f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
             f"{num_checkpoints} checkpoints of {members} seeds (over all points), and "
-            f"one that is being written, need {_in_words(wanted)}"
+            f"one that is being written, need {_in_words(required)}"
         )
 
 
 def _free_disk(folder: pathlib.Path) -> int | None:
     usage = shutil.disk_usage(folder)
-    # A file system that is none, such as /proc, has no size.
+    # A virtual file system such as /proc has no size.
     return usage.free if usage.total else None
 
 

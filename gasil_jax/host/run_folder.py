@@ -1,4 +1,4 @@
-"""A run's folder: made, locked, described in config.json, and read again."""
+"""Create, lock, describe and read the folder of a run."""
 
 import contextlib
 import dataclasses
@@ -23,31 +23,32 @@ _CONFIG = "config.json"
 
 
 def check(out: pathlib.Path, resume: bool) -> None:
-    """Refuse a folder before a run is built for it; nothing new is left but a lock.
+    """Check that a run can use the folder; leaves nothing but a lock file.
 
     Raises:
-      InputError: it can't be written, is in use, or, unless `resume`, is used.
+      InputError: if it can't be written, if another process uses it, or if it is not
+        empty and `resume` is false.
     """
     if out.is_dir():
         with lock(create(out, "")):
             if not (resume and is_described(out)):
                 refuse_used(out)
         return
-    place = out
-    while not place.exists():
-        place = place.parent
+    existing = out
+    while not existing.exists():
+        existing = existing.parent
     try:
-        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=place):
+        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=existing):
             pass
     except OSError as error:
         raise InputError(unwritable(out, error)) from None
 
 
 def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
-    """Make the folder `out`, or else a new one of that name under runs/.
+    """Create the folder `out` or, if it is None, a new folder `name` under runs/.
 
     Raises:
-      InputError: it can't be written.
+      InputError: if it can't be written.
     """
     try:
         if out is not None:
@@ -70,12 +71,12 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
 
 @contextlib.contextmanager
 def lock(folder: pathlib.Path) -> Iterator[None]:
-    """Keep every other process from writing into the folder.
+    """Lock the folder against other processes inside the `with` block.
 
-    The operating system takes the lock away from a process that ends, however it ends.
+    The operating system frees the lock when the process ends, however it ends.
 
     Raises:
-      InputError: another process has it.
+      InputError: if another process holds the lock.
     """
     with (folder / _LOCK).open("a+") as file:
         try:
@@ -94,10 +95,10 @@ def lock(folder: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]:
-    """`lock`, after whoever has it for a moment.
+    """Lock the folder like `lock`, but wait if another process holds the lock.
 
     Raises:
-      InputError: another process had it all the time.
+      InputError: if another process still holds it after `seconds`.
     """
     deadline = time.monotonic() + seconds
     with contextlib.ExitStack() as stack:
@@ -113,9 +114,10 @@ def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]
 
 
 def refuse_used(folder: pathlib.Path) -> None:
-    """Raise `InputError` if there is anything in the folder but what `create` leaves.
+    """Raise `InputError` unless the folder is empty.
 
-    That is a lock, and for a moment what another process tries whether it can write.
+    The lock file does not count, nor does the file by which another process tests for a
+    moment whether it can write.
     """
     names = (path.name for path in folder.iterdir())
     if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
@@ -126,7 +128,7 @@ def refuse_used(folder: pathlib.Path) -> None:
 
 
 def is_described(folder: pathlib.Path) -> bool:
-    """Whether a run has begun in the folder."""
+    """Return whether a run has begun in the folder."""
     return (folder / _CONFIG).is_file()
 
 
@@ -138,10 +140,10 @@ def describe(folder: pathlib.Path, content: Mapping[str, Any]) -> None:
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
-    """What config.json holds, "config" and "settings" as the dataclasses they are.
+    """Return the content of config.json, "config" and "settings" as dataclasses.
 
     Raises:
-      InputError: there is none, or it is not of a run.
+      InputError: if there is no such file or if it does not describe a run.
     """
     path = folder / _CONFIG
     try:
@@ -151,7 +153,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         described = _tuples_in(content)
         described["config"] = Config(**fields)
         described["settings"] = Settings(**content["settings"])
-        if "points" in described:  # Of a sweep, which may be older than the option.
+        if "points" in described:  # A sweep, which may be older than the option.
             described.setdefault("share_counts", False)
         for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
             if type(described[name]) is not kind:
@@ -168,39 +170,44 @@ def _tuples_in(fields: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _as_tuples(value: Any) -> Any:
-    # JSON has no tuples, and a configuration is hashable.
+    # JSON has no tuples, but a config must be hashable.
     return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
 
 
-#: What may differ between a run and its continuation.
+#: Options that may differ between a run and its continuation.
 _FREE = (
-    *("out", "resume", "checkpoint_every", "keep_checkpoints", "devices"),
-    # What a file lists is compared itself.
-    *("log", "points_file"),
+    "out",
+    "resume",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "devices",
+    "log",
+    # The points that the file lists are compared instead.
+    "points_file",
 )
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Fields that may not change between a run and its continuation, and do.
+    """Return the fields that differ from the run, but must not in its continuation.
 
     Args:
-      before: of `read`.
-      now: the same of what is asked for. "total_steps" may have grown.
+      before: content of the run's config.json, from `read`.
+      now: the same of the continuation; its "total_steps" may be larger.
 
     Returns:
-      "NAME was A, is B" for each.
+      "NAME was A, is B" for each of these fields.
     """
-    found, asked = [], flat(now)
+    changes, requested = [], flat(now)
     for name, old in flat(before).items():
-        new = asked.get(name)
+        new = requested.get(name)
         grown = name == "total_steps" and new is not None and new >= old
         if old != new and not grown and name not in _FREE:
-            found.append(f"{name} was {old}, is {new}")
-    return found
+            changes.append(f"{name} was {old}, is {new}")
+    return changes
 
 
 def flat(described: Mapping[str, Any]) -> dict[str, Any]:
-    """Every field by its own name, those in dataclasses too."""
+    """Return every field by its own name, including those of nested dataclasses."""
     fields: dict[str, Any] = {}
     for name, value in described.items():
         if dataclasses.is_dataclass(value):

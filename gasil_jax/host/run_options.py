@@ -1,4 +1,4 @@
-"""The options of a run: parsed on a preset, checked, and written to its folder."""
+"""The options of a run: parse them on top of a preset, check them, write them down."""
 
 import argparse
 import contextlib
@@ -28,30 +28,32 @@ class Options:
     """Train an agent on an environment, many seeds at once.
 
     Attributes:
-      env: environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
-        humanoid, brax: and the name of one of Brax's, brax:inverted_pendulum, or
-        MODULE:NAME of your own.
-      seeds: how many seeds.
-      first_seed: number of the first seed; a seed's result depends on its number
-        alone.
-      out: run folder, created here; default runs/ENV-AGENT-TIME.
-      resume: go on with the run in the folder out from its last checkpoint, with its
-        settings; total_steps alone may grow. Where no run has begun, begin one.
-      checkpoint_every: environment steps of a seed between two checkpoints; default
-        ten minutes.
-      keep_checkpoints: how many of the newest checkpoints are kept, besides the one
-        with the best evaluation or, without evaluate_every, the best returns.
-      evaluate_every: environment steps of a seed between two evaluations of the
+      env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
+        humanoid; one of Brax's as brax:NAME, for example brax:inverted_pendulum; or
+        your own as MODULE:NAME.
+      seeds: number of seeds to train.
+      first_seed: number of the first seed. A seed's result depends only on its
+        number.
+      out: run folder, created if it is missing; default runs/ENV-AGENT-TIME.
+      resume: continue the run in the folder `out` from its last checkpoint, with its
+        settings; only total_steps may differ, and only grow. If the folder holds no
+        run yet, a new one begins.
+      checkpoint_every: environment steps per seed between two checkpoints; by
+        default a checkpoint is written every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
+        with the best evaluation or, without evaluate_every, with the best returns.
+      evaluate_every: environment steps per seed between two evaluations of the
         policy's mean action in fresh environments, rounded up to whole iterations;
-        default none. Scores, of the undelayed return, are in evaluations.csv.
-      evaluate_episodes: of each evaluation and seed; default 10.
-      log: also to these, besides metrics.csv: tensorboard, wandb.
-      preset: where the hyperparameters start from: tuned, by environment and agent,
-        or paper, with the paper's one environment a seed, which is several times
-        slower; flags override it.
-      devices: host devices that the seeds are sharded over; default the cores.
-      settings: of the environment.
-      config: the algorithm.
+        by default none. The scores are undelayed returns, in evaluations.csv.
+      evaluate_episodes: episodes per seed in each evaluation; default 10.
+      log: trackers to log to besides metrics.csv: tensorboard, wandb.
+      preset: the hyperparameters to start from: tuned, by environment and agent, or
+        paper, with the paper's single environment per seed, which is several times
+        slower. Flags override them.
+      devices: number of host devices to spread the seeds over; default one for each
+        core.
+      settings: settings of the environment.
+      config: settings of the algorithm.
     """
 
     env: str
@@ -83,21 +85,22 @@ def parse(
     program: str,
     began: pathlib.Path | None = None,
 ) -> T:
-    """Options from the command line, on top of the preset that they name.
+    """Return the command line's options, on top of the preset that they name.
 
     Args:
-      kind: what the options are.
-      arguments: default what the program was started with.
-      program: the module that was started.
-      began: folder of a run that is to go on; the options are on top of its own.
+      kind: the class of the options.
+      arguments: the command line; default the one that the program was started with.
+      program: name of the module that was started.
+      began: folder of the run to continue. Its own options are then the defaults,
+        and the preset is not used.
 
     Raises:
-      InputError: a flag or value that is unknown, or that the run does not have.
+      InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if began is not None:
         described = run_folder.read(began)
         fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
-        # One that is None or False by default may be newer than the run.
+        # An option with the default None or False may be newer than the run.
         newer = {
             f.name: f.default for f in fields if f.default is None or f.default is False
         }
@@ -105,8 +108,8 @@ def parse(
         missing = names - set(newer) - set(described)
         if missing or set(described) - names - {"out", "points"}:
             raise InputError(f"out is {began}, which another program has written")
-        known = newer | described
-        values: dict[str, Any] = {f.name: known[f.name] for f in fields}
+        stored = newer | described
+        values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
         before = kind(**values)
         options = command_line.parse(kind, arguments, program, before)
         changed = run_folder.differences(vars(before), vars(options))
@@ -126,10 +129,10 @@ def parse(
 
 
 def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
-    """The folder of the run that --resume goes on with, if one has begun.
+    """Return the folder of the run that --resume continues, or None if there is none.
 
     Raises:
-      InputError: --resume without --out.
+      InputError: if --resume is given without --out.
     """
     given = _folder_arguments(arguments)
     if given is None or not given.resume:
@@ -140,7 +143,7 @@ def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
 
 
 def _folder_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
-    """--resume and --out; None if they are refused where everything is parsed."""
+    """Parse --resume and --out alone; None leaves their error to the full parser."""
     parser = argparse.ArgumentParser(
         add_help=False, allow_abbrev=False, exit_on_error=False
     )
@@ -153,10 +156,10 @@ def _folder_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | N
 
 
 def check(options: Options) -> None:
-    """Refuse bad input before anything is built or compiled.
+    """Check the options before anything is built or compiled.
 
     Raises:
-      InputError: the value and what is allowed.
+      InputError: if a value is not allowed; the message names the value and the range.
     """
     with command_line.input_checked():
         environments.check(options.env, options.settings)
@@ -185,22 +188,22 @@ def check(options: Options) -> None:
 
 
 def seeds_of(options: Options) -> range:
-    """Absolute numbers of the seeds, of each point in a sweep."""
+    """Return the seeds' absolute numbers; every point of a sweep has the same ones."""
     return range(options.first_seed, options.first_seed + options.seeds)
 
 
 def evaluation_schedule(options: Options) -> EvaluationSchedule | None:
-    """When policies are evaluated on the way; None if they are not."""
+    """Return when policies are evaluated during training; None for never."""
     if options.evaluate_every is None:
         return None
     return EvaluationSchedule(options.evaluate_every, options.evaluate_episodes or 10)
 
 
 def check_out(options: Options) -> None:
-    """Refuse a folder that can't be used before anything is built for it.
+    """Check that the run folder can be used, before anything is built for it.
 
     Raises:
-      InputError: why.
+      InputError: if it can't.
     """
     if options.out is not None:
         run_folder.check(options.out, options.resume)
@@ -208,12 +211,13 @@ def check_out(options: Options) -> None:
 
 @contextlib.contextmanager
 def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
-    """The run's folder, made where it is missing, locked while this is entered.
+    """Create the run's folder if it is missing, and lock it inside the `with` block.
 
-    An `Interrupted` that passes is told how `program` goes on.
+    An `Interrupted` raised inside gets a note with the command that continues the run.
 
     Raises:
-      InputError: it is used, in use, or can't be written.
+      InputError: if another run is in the folder or uses it now, or if it can't be
+        written.
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
@@ -232,16 +236,16 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
 
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
-    """Write config.json: every option, the config's fields under "config"."""
+    """Write every option to config.json, the config's fields under "config"."""
     described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
     run_folder.describe(folder, described | {"out": str(folder)} | more)
 
 
 def make_env(options: Options) -> Any:
-    """The environment that the options ask for.
+    """Build the environment that the options name.
 
     Raises:
-      InputError: it can't be built, or the agent can't run in it.
+      InputError: if it can't be built, or if the agent can't run in it.
     """
     settings = dataclasses.asdict(options.settings)
     with command_line.input_checked():

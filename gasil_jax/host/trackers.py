@@ -1,8 +1,9 @@
-"""Metrics for TensorBoard and Weights & Biases, beside metrics.csv.
+"""Log metrics to TensorBoard and Weights & Biases, besides metrics.csv.
 
-A tracker is given what metrics.csv is given: "mean/NAME" is a metric's mean over the
-members, "episode_return/LABEL" a member's own; "evaluation/mean" and "evaluation/LABEL"
-are the same of an evaluation's mean return. Steps are environment steps of a member.
+A tracker gets the metrics that metrics.csv gets. "mean/NAME" is a metric's mean over
+the members, and "episode_return/LABEL" is the return of one member. "evaluation/mean"
+and "evaluation/LABEL" are mean returns of an evaluation, over all members and of one
+member. Steps are environment steps per member.
 """
 
 import contextlib
@@ -19,13 +20,13 @@ from gasil_jax.errors import InputError
 
 
 class Tracker(Protocol):
-    """Where scalars go."""
+    """A destination for scalars."""
 
     def log(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Take the scalars of one iteration."""
+        """Log the scalars of one iteration."""
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write everything that is still buffered, and close."""
 
 
 class _TensorBoard:
@@ -47,7 +48,7 @@ class _WeightsAndBiases:
     def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
         import wandb
 
-        # A run that goes on is the same run there, though it may get more steps;
+        # A continued run is the same run in Weights & Biases, even with more steps.
         # WANDB_MODE=offline needs no account.
         try:
             self._run = wandb.init(
@@ -73,7 +74,10 @@ class _WeightsAndBiases:
 
 
 def _identifier(path: pathlib.Path) -> str:
-    """What a file holds that is written once: folders of one name are told apart."""
+    """Return the random identifier in a file, which is created if it is missing.
+
+    It distinguishes runs whose folders have the same name.
+    """
     with contextlib.suppress(FileExistsError), path.open("x") as file:
         file.write(uuid.uuid4().hex)
     return path.read_text()
@@ -83,7 +87,7 @@ def _as_text(config: Mapping[str, Any]) -> str:
     return "\n".join(f"{name}: {value}" for name, value in config.items())
 
 
-#: name -> (the package that it needs, what makes it).
+#: name -> (the required package, the tracker's class).
 TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
     "tensorboard": ("tensorboardX", _TensorBoard),
     "wandb": ("wandb", _WeightsAndBiases),
@@ -109,15 +113,15 @@ def check(names: Sequence[str]) -> None:
 def make(
     names: Sequence[str], folder: pathlib.Path, config: Mapping[str, Any]
 ) -> list[Tracker]:
-    """The trackers of a run.
+    """Return the trackers of a run.
 
     Args:
-      names: of `TRACKERS`.
-      folder: of the run; its name is the run's.
-      config: what to show of the run.
+      names: names in `TRACKERS`.
+      folder: folder of the run, whose name becomes the run's name.
+      config: settings to show with the run.
 
     Raises:
-      InputError: one can't begin.
+      InputError: if a tracker can't start.
     """
     return [TRACKERS[name][1](folder, config) for name in names]
 
@@ -127,7 +131,7 @@ def log(
     labels: Mapping[str, Sequence[Any]],
     metrics: Mapping[str, np.ndarray],
 ) -> None:
-    """Give a chunk of metrics, (members, iterations) each, to all trackers."""
+    """Log a chunk of metrics, (members, iterations) each, to all trackers."""
     for index, step in enumerate(metrics["env_steps"][0] if trackers else ()):
         scalars = {}
         for name, values in metrics.items():
@@ -145,7 +149,7 @@ def log_evaluation(
     labels: Mapping[str, Sequence[Any]],
     scores: Mapping[str, np.ndarray],
 ) -> None:
-    """Give the scores of an evaluation, (members,) each, to all trackers."""
+    """Log the scores of an evaluation, (members,) each, to all trackers."""
     mean = {"evaluation/mean": float(scores["mean"].mean())}
     scalars = mean | _by_member("evaluation", labels, scores["mean"])
     for tracker in trackers:
@@ -155,7 +159,7 @@ def log_evaluation(
 def _by_member(
     name: str, labels: Mapping[str, Sequence[Any]], values: np.ndarray
 ) -> dict[str, float]:
-    """The finite values, (members,), by the name with each member's label."""
+    """Return the finite ones of the values (members,), as NAME/LABEL of the member."""
     members = zip(*labels.values(), strict=True)
     return {
         f"{name}/{'-'.join(map(str, member))}": float(value)

@@ -1,7 +1,7 @@
-"""Ways of imitating the good-trajectory buffer, one file each, and their registry.
+"""The imitation methods, one file each, and the registry of agents.
 
-An agent is PPO plus one `Imitation`. To add one, write a file with such a tuple and
-name it in `AGENTS`.
+An agent is PPO plus one `Imitation`. To add an agent, write a file that defines one and
+add it to `AGENTS`.
 """
 
 from gasil_jax.imitation import adversarial, behavior_cloning, none, self_imitation
@@ -18,17 +18,20 @@ AGENTS: dict[str, Imitation] = {
 
 
 def agents() -> tuple[str, ...]:
-    """The names that `Config.agent` takes."""
+    """Return the names that `Config.agent` may have."""
     return tuple(AGENTS)
 
 
 def unused(agent: str) -> frozenset[str]:
-    """Names of what other agents look at and this one does not, if it says so."""
-    mine = AGENTS[agent].fields
-    if mine is None:
+    """Return the names of the fields that other agents use and this one does not.
+
+    The set is empty if the agent does not say which fields it uses.
+    """
+    used = AGENTS[agent].fields
+    if used is None:
         return frozenset()
     every = {name for each in AGENTS.values() for name in each.fields or ()}
-    return frozenset(every.difference(mine))
+    return frozenset(every.difference(used))
 
 
 __all__ = ["AGENTS", "Imitation", "agents", "unused"]

@@ -5,13 +5,13 @@ and not from the buffer; the discriminator ascends
 
     E_pi[log D(s, a)] + E_B[log(1 - D(s, a))]
 
-and the policy is paid the bonus -alpha log D(s, a) >= 0, more for pairs that look
-like the buffer. Everything is computed from the logit l of D:
-log D = -softplus(-l), log(1 - D) = -softplus(l). The bonus is never negative, which
-favours long episodes (survival bias); the paper has it so.
+and the policy receives the bonus -alpha log D(s, a) >= 0, which is larger for pairs
+that look like the buffer's. Everything is computed from the logit l of D:
+log D = -softplus(-l), log(1 - D) = -softplus(l). The bonus is never negative, as in the
+paper, and therefore favours long episodes (survival bias).
 
-While the buffer is empty D does not train and the bonus is 0. GAIL is the same with a
-fixed set of expert pairs in the buffer's place.
+While the buffer is empty, D does not train and the bonus is 0. GAIL is the same method
+with a fixed set of expert pairs instead of the buffer.
 """
 
 from collections.abc import Callable
@@ -30,7 +30,7 @@ from gasil_jax.networks import Discriminator
 
 
 def bonus(logit: jax.Array, alpha: jax.Array | float) -> jax.Array:
-    """-alpha log D (paper, section 4.3) from the logit of D: (...) -> (...)."""
+    """Return -alpha log D (paper, section 4.3) from the logit of D: (...) -> (...)."""
     return alpha * jax.nn.softplus(-logit)
 
 
@@ -39,16 +39,16 @@ def loss(
     good_logit: jax.Array,
     entropy_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, Metrics]:
-    """What the discriminator descends: minus the paper's objective (equation 10).
+    """Return the discriminator's loss: minus the paper's objective (equation 10).
 
     Args:
       policy_logit: (minibatch,), logits of D on the policy's pairs.
       good_logit: (minibatch,), logits of D on the buffer's pairs.
-      entropy_coefficient: weight of the entropy of D's output over both, which
-        keeps D from certainty (OpenAI baselines' GAIL).
+      entropy_coefficient: weight of the entropy of D's output on all pairs, which
+        keeps D from becoming certain (OpenAI baselines' GAIL).
 
     Returns:
-      The loss, (), and its parts.
+      The loss, (), and its parts as metrics.
     """
     log_likelihood = -jnp.mean(jax.nn.softplus(-policy_logit)) - jnp.mean(
         jax.nn.softplus(good_logit)
@@ -65,12 +65,12 @@ def loss(
 
 
 def _network(config: Config) -> Any:
-    # Flax says of `apply` that it may give changed variables too: Any is narrower.
+    # Typed as Any because Flax declares that `apply` may also return variables.
     return Discriminator(config.discriminator_hidden_sizes)
 
 
 def _optimizer() -> optax.GradientTransformation:
-    # As one vector: see `ppo.optimizer`.
+    # One vector of parameters is faster, see `ppo.optimizer`.
     return optax.flatten(optax.scale_by_adam())
 
 
@@ -84,7 +84,7 @@ def _init(
 
 
 class Source(NamedTuple):
-    """Where the pairs come from that the policy is to be like.
+    """The source of the pairs that the policy imitates.
 
     Attributes:
       sample: (key, context, n) -> observation (n, obs), action (n, action).
@@ -104,7 +104,7 @@ def _sample_good(
 def _sample_expert(
     key: jax.Array, context: Context, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
-    assert context.config.expert is not None  # `check` refuses it.
+    assert context.config.expert is not None  # Ensured by `_check_expert`.
     observation, action = expert.load(context.config.expert)
     rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
     return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
@@ -119,10 +119,10 @@ _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
 def _train_discriminator(
     state: Learner, source: Source, context: Context, key: jax.Array
 ) -> tuple[Learner, Metrics]:
-    """Gradient steps on the discriminator; none count while there is no source.
+    """Take gradient steps on the discriminator, if the source is ready.
 
-    As many as the configuration's own `discriminator_updates`, of which a member's
-    first `discriminator_updates` count.
+    The loop takes as many steps as the config's own `discriminator_updates`, and keeps
+    only the first `discriminator_updates` of this member's hyperparameters.
     """
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters

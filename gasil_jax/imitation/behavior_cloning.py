@@ -22,7 +22,7 @@ from gasil_jax.ppo import ActorCritic
 
 
 def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
-    """Mean negative log likelihood of `action`, (steps, action): -> ()."""
+    """Return the mean negative log likelihood of actions (steps, action), ()."""
     return -jnp.mean(gaussian_log_prob(mean, log_std, action))
 
 

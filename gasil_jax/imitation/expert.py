@@ -1,4 +1,4 @@
-"""Expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
+"""Load expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
 
 import contextlib
 import functools
@@ -13,27 +13,28 @@ _MINARI = "minari:"
 
 
 def load(source: str) -> tuple[np.ndarray, np.ndarray]:
-    """Observations (steps, obs) and actions (steps, action), float32.
+    """Return the expert's observations (steps, obs) and actions (steps, action).
+
+    Both are float32 and read-only.
 
     Args:
       source: the path of an ``.npz`` file with arrays "observation" and "action", or
-        "minari:" and the name of a data set of Minari, which must be installed and
-        have it.
+        "minari:" and the name of a local data set; Minari must then be installed.
 
     Raises:
-      ValueError: it can't be read, or is not that.
+      ValueError: if it can't be read or holds other arrays.
     """
-    written = None
+    version = None
     if not source.startswith(_MINARI):
         with contextlib.suppress(OSError):
-            found = pathlib.Path(source).stat()
-            written = (found.st_mtime_ns, found.st_size)
-    return _load(source, written)
+            file = pathlib.Path(source).stat()
+            version = (file.st_mtime_ns, file.st_size)
+    return _load(source, version)
 
 
 @functools.lru_cache(maxsize=4)
-def _load(source: str, written: Any) -> tuple[np.ndarray, np.ndarray]:
-    """`load`, once for each content: `written` says when a file was."""
+def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Load an expert; `version` makes the cache read a changed file again."""
     if source.startswith(_MINARI):
         observation, action = _load_minari(source.removeprefix(_MINARI))
     else:
@@ -97,13 +98,17 @@ def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def check(source: str | None, observation_size: int, action_size: int) -> None:
-    """Raise `ValueError` if `source` is not for such an environment."""
+    """Check that an expert is given and fits the environment's sizes.
+
+    Raises:
+      ValueError: if it is missing, can't be read, or has other sizes.
+    """
     if source is None:
         raise ValueError("expert is missing: agent 'gail' needs a file or data set")
     observation, action = load(source)
-    found = (observation.shape[1], action.shape[1])
-    if found != (observation_size, action_size):
+    sizes = (observation.shape[1], action.shape[1])
+    if sizes != (observation_size, action_size):
         raise ValueError(
-            f"expert {source!r} has {found[0]} observations and {found[1]} actions a "
+            f"expert {source!r} has {sizes[0]} observations and {sizes[1]} actions a "
             f"step: the environment has {observation_size} and {action_size}"
         )

@@ -1,4 +1,4 @@
-"""What the training loop asks of a way of imitating."""
+"""The interface between the training loop and an imitation method."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,16 +16,18 @@ Metrics = dict[str, jax.Array]
 
 
 class Context(struct.PyTreeNode):
-    """What an imitation module sees of an iteration.
+    """The data of an iteration that an imitation method may use.
 
     Attributes:
-      rollout: the batch, (time, env, ...), its reward normalized where it is.
-      history: the last steps of each environment, the batch's in it.
-      good_trajectories: the buffer, the batch's ended episodes in it.
-      normalizer: of the observations, as the policy used it in the batch.
-      reward_scale: (), what rewards were divided by; 1 where they are not normalized.
-        The buffer's and the history's are not.
-      hyperparameters: the floats.
+      rollout: the batch, (time, env, ...); its rewards are normalized if the config
+        says so.
+      history: the last steps of each environment, including the batch's.
+      good_trajectories: the buffer, including the batch's ended episodes.
+      normalizer: the normalizer of observations that the policy used in the batch.
+      reward_scale: (), the number that the rollout's rewards were divided by; 1 if
+        they are not normalized. Rewards in the history and returns in the buffer
+        never are.
+      hyperparameters: their values in this iteration.
       config: the static configuration.
       policy: (params, normalized observation) -> mean, log standard deviation.
       value: (params, normalized observation) -> value.
@@ -45,10 +47,10 @@ class Context(struct.PyTreeNode):
 def check_without_expert(
     config: Config, observation_size: int, action_size: int
 ) -> None:
-    """Refuse an expert, which the agent would not look at: a `check`.
+    """Check that no expert is given: the `check` of agents that do not use one.
 
     Raises:
-      ValueError: the configuration names one.
+      ValueError: if the config names an expert.
     """
     if config.expert is not None:
         raise ValueError(
@@ -58,27 +60,28 @@ def check_without_expert(
 
 
 def one_stream(hyperparameters: Hyperparameters) -> tuple[float, ...]:
-    """The weights of an agent that gives one reward: a `stream_weights`."""
+    """Return the weight of a single reward stream: the default `stream_weights`."""
     return (1.0,)
 
 
 class Imitation(NamedTuple):
-    """Pure functions; their state is a pytree that the loop carries.
+    """An imitation method as pure functions; the loop carries their state, a pytree.
 
     Attributes:
       init: (key, config, observation size, action size) -> state.
       update_and_reward: (state, context, key) -> state, rewards, metrics. Learns from
-        the batch, and gives the rewards that PPO maximizes: (time, env), or
-        (time, env, stream) of several streams, each with a value of its own.
+        the batch and returns the rewards that PPO maximizes: (time, env) or, for
+        several streams, (time, env, stream). Each stream has its own value.
       update_policy: (state, actor_critic, context, key) -> state, actor_critic,
-        metrics. Gradient steps of its own on the policy and the values after PPO's.
-      check: (config, observation size, action size), raises `ValueError` for what
-        the agent can't run with, before anything compiles; default
+        metrics. Takes further gradient steps on the policy and the values after PPO's.
+      check: (config, observation size, action size). Raises `ValueError`, before
+        anything compiles, if the agent can't run with them; default
         `check_without_expert`.
-      fields: of `Config` and `Hyperparameters` those that it looks at, PPO's apart:
-        a sweep of the others would change nothing. None where it does not say.
+      fields: names of the fields of `Config` and `Hyperparameters` that the method
+        uses, besides those that PPO uses. A sweep over a field that the agent does
+        not use is refused. None if the method does not say.
       stream_weights: hyperparameters -> the weight of each reward stream's standardized
-        advantage in the policy's; default one stream of weight 1.
+        advantage in the policy's advantage; default one stream of weight 1.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -96,5 +99,5 @@ class Imitation(NamedTuple):
 def leave_policy(
     state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
 ) -> tuple[Any, ActorCritic, Metrics]:
-    """An `update_policy` that takes no steps."""
+    """Change nothing: the `update_policy` of methods that only shape rewards."""
     return state, actor_critic, {}

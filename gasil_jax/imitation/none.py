@@ -9,14 +9,14 @@ from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_pol
 def no_state(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> tuple[()]:
-    """An `init` of agents that remember nothing."""
+    """Return an empty state: the `init` of agents that have none."""
     return ()
 
 
 def plain_reward(
     state: tuple[()], context: Context, key: jax.Array
 ) -> tuple[tuple[()], jax.Array, Metrics]:
-    """An `update_and_reward` that learns nothing and leaves the reward as it is."""
+    """Return the environment's reward: the `update_and_reward` that learns nothing."""
     return state, context.rollout.reward, {}
 
 

@@ -9,9 +9,9 @@ max(R - V(s), 0)^0.6, on `sil_coefficient` times the loss (equations 1 to 4 ther
 
 with w the importance weights of the prioritized sampling. As in the authors' code the
 advantage is clipped at one standard deviation of the returns (they divide rewards by
-it), and the mean is over the steps with a positive advantage but over no fewer than 64.
-The first term's advantage is in that unit too; the second's in the return's own, which
-is that of PPO's value loss here.
+it). The mean is over the steps with a positive advantage, or over 64 if they are fewer.
+The advantage of the first term is in units of that standard deviation. That of the
+second term is in the unit of the returns, as in PPO's value loss here.
 """
 
 from typing import Any, NamedTuple
@@ -37,7 +37,7 @@ _LEAST_SAMPLES = 64
 
 
 class Steps(NamedTuple):
-    """Rows of a `Replay`, (samples, ...) each."""
+    """Steps of a `Replay`, (samples, ...) each."""
 
     observation: jax.Array
     action: jax.Array
@@ -45,14 +45,14 @@ class Steps(NamedTuple):
 
 
 class Replay(struct.PyTreeNode):
-    """The last `capacity` steps of ended episodes, a ring.
+    """The last `capacity` steps of ended episodes, as a ring buffer.
 
     Attributes:
       observation: float32 (capacity, obs), not normalized.
       action: float32 (capacity, action).
-      return_: float32 (capacity,), discounted, from the step on.
+      return_: float32 (capacity,), discounted return from the step on.
       priority: float32 (capacity,), 0 where empty.
-      cursor: int32 (), where the next step is written.
+      cursor: int32 (), index at which the next step is written.
     """
 
     observation: jax.Array
@@ -61,13 +61,13 @@ class Replay(struct.PyTreeNode):
     priority: jax.Array
     cursor: jax.Array
 
-    def at(self, place: jax.Array) -> Steps:
-        """The steps at these places, int32 (samples,)."""
-        return Steps(self.observation[place], self.action[place], self.return_[place])
+    def at(self, index: jax.Array) -> Steps:
+        """Return the steps at these indices, int32 (samples,)."""
+        return Steps(self.observation[index], self.action[index], self.return_[index])
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
-    """An empty replay."""
+    """Return an empty replay."""
     return Replay(
         observation=jnp.zeros((capacity, observation_size), jnp.float32),
         action=jnp.zeros((capacity, action_size), jnp.float32),
@@ -80,54 +80,56 @@ def init_replay(capacity: int, observation_size: int, action_size: int) -> Repla
 def returns_to_go(
     history: History, num_steps: int, gamma: jax.Array | float
 ) -> tuple[jax.Array, jax.Array]:
-    """Discounted returns of the steps whose episode ended in the last batch.
+    """Return the discounted returns of steps whose episode ended in the last batch.
 
     Args:
-      history: after `record` of the batch.
-      num_steps: steps of each environment in a batch.
+      history: the history after `record` of the batch.
+      num_steps: number of steps of each environment in a batch.
       gamma: discount.
 
     Returns:
-      return (env, steps of history) and whether the step is of such an episode and
-      its return is finite, both in the order of time, oldest first.
+      Two arrays (env, steps of history), in time order, oldest step first: the
+      discounted return from the step on, and a mask of the steps whose episode ended
+      in the last batch and whose return is finite.
     """
     in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
     reward, ended = in_time(history.reward), in_time(history.ended)
     length = reward.shape[1]
 
     def backward(carry: Any, step: Any) -> Any:
-        return_, wanted = carry
+        return_, is_complete = carry
         reward, ended, is_new = step
         return_ = reward + jnp.where(ended, 0.0, gamma * return_)
-        wanted = jnp.where(ended, is_new, wanted)
-        return (return_, wanted), (return_, wanted)
+        is_complete = jnp.where(ended, is_new, is_complete)
+        return (return_, is_complete), (return_, is_complete)
 
     num_envs = reward.shape[0]
     start = (jnp.zeros(num_envs), jnp.zeros(num_envs, bool))
     is_new = jnp.arange(length) >= length - num_steps
-    _, (return_, wanted) = jax.lax.scan(
+    _, (return_, is_complete) = jax.lax.scan(
         backward, start, (reward.T, ended.T, is_new), reverse=True
     )
-    return return_.T, wanted.T & jnp.isfinite(return_.T)
+    return return_.T, is_complete.T & jnp.isfinite(return_.T)
 
 
 def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Replay:
-    """Add the steps of the episodes that ended in the last batch.
+    """Return the replay with the steps of the episodes that ended in the last batch.
 
-    One environment's after the other's, each oldest first.
-    They get the highest priority there is, so that each is drawn soon.
+    Steps are added one environment after the other, each in time order. They get the
+    highest priority in the replay, so that each is drawn soon.
     """
-    return_, wanted = returns_to_go(history, num_steps, gamma)
+    return_, complete = returns_to_go(history, num_steps, gamma)
     in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     capacity = replay.return_.shape[0]
-    wanted = flat(wanted)
-    count = jnp.sum(wanted)
-    rank = jnp.cumsum(wanted) - 1
-    # Of more than fit, the last ones; the place `capacity` is out of bounds: dropped.
-    kept = wanted & (rank >= count - capacity)
-    place = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
-    write = lambda ring, new: ring.at[place].set(new, mode="drop")
+    complete = flat(complete)
+    count = jnp.sum(complete)
+    rank = jnp.cumsum(complete) - 1
+    # If there are too many, the last ones are kept. The index `capacity` is out of
+    # bounds, so what is written there is dropped.
+    kept = complete & (rank >= count - capacity)
+    index = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
+    write = lambda ring, new: ring.at[index].set(new, mode="drop")
     highest = jnp.maximum(jnp.max(replay.priority), _LEAST_PRIORITY)
     highest = jnp.where(jnp.any(replay.priority > 0), highest, 1.0)
     return Replay(
@@ -142,28 +144,27 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
 def sample(
     key: jax.Array, replay: Replay, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Places drawn by priority, and their importance weights, (samples,) each.
+    """Draw indices by priority, with their importance weights, (samples,) each.
 
-    Schaul et al. 2016; the weights are divided by the largest that there can be.
+    See Schaul et al. 2016. The weights are divided by their largest possible value.
     """
     mass = jnp.where(replay.priority > 0, replay.priority**_PRIORITY_EXPONENT, 0.0)
     cumulative = jnp.cumsum(mass)
     total = cumulative[-1]
-    place = jnp.searchsorted(
+    index = jnp.searchsorted(
         cumulative, jax.random.uniform(key, (num_samples,)) * total, side="right"
     )
-    # In float32 the sum over all may come out higher than that up to the last place
-    # with anything in it.
+    # In float32 the total may come out higher than the sum up to the last filled index.
     last = jnp.max(jnp.where(mass > 0, jnp.arange(mass.shape[0]), 0))
-    place = jnp.minimum(place, last)
+    index = jnp.minimum(index, last)
     size = jnp.sum(replay.priority > 0)
     weight = lambda mass: (mass / total * size) ** -_IMPORTANCE_EXPONENT
     least = jnp.min(jnp.where(mass > 0, mass, jnp.inf))
-    return place, weight(jnp.maximum(mass[place], least)) / weight(least)
+    return index, weight(jnp.maximum(mass[index], least)) / weight(least)
 
 
 def return_scale(replay: Replay) -> jax.Array:
-    """The standard deviation of the returns in the replay, ()."""
+    """Return the standard deviation of the returns in the replay, ()."""
     filled = replay.priority > 0
     size = jnp.maximum(jnp.sum(filled), 1)
     mean = jnp.sum(jnp.where(filled, replay.return_, 0.0)) / size
@@ -174,7 +175,7 @@ def return_scale(replay: Replay) -> jax.Array:
 def clipped_advantage(
     return_: jax.Array, value: jax.Array, scale: jax.Array | float
 ) -> jax.Array:
-    """(R - V)+ in units of `scale`, at most 1: (samples,)."""
+    """Return (R - V)+ in units of `scale`, clipped at 1: (samples,)."""
     return jnp.clip((return_ - value) / scale, 0.0, _HIGHEST_ADVANTAGE)
 
 
@@ -186,14 +187,14 @@ def loss(
     scale: jax.Array | float,
     value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """The loss of a minibatch, (), and the fraction of positive advantages, ()."""
+    """Return a minibatch's loss, (), and its fraction of positive advantages, ()."""
     chex.assert_equal_shape([log_prob, value, return_, weight])
     advantage = clipped_advantage(return_, value, scale)
     num_positive = jnp.sum(advantage > 0)
     num_samples = jnp.maximum(num_positive, _LEAST_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
     policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
-    # The gradient of half the clipped square, also where the clip is active.
+    # This has the gradient of half the clipped square, also where the clip is active.
     value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
     fraction = num_positive / advantage.shape[0]
     return policy_loss + value_coefficient * value_loss, fraction
@@ -218,7 +219,7 @@ def _update_policy(
 ) -> tuple[Replay, ActorCritic, Metrics]:
     config, hyperparameters = context.config, context.hyperparameters
     normalize = lambda x: normalization.normalize(context.normalizer, x)
-    # The replay's returns are the environment's; the value is of normalized rewards.
+    # The replay's returns are of the environment's rewards, the value's of normalized.
     scale = return_scale(replay) / context.reward_scale
 
     def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
@@ -240,17 +241,17 @@ def _update_policy(
 
     def step(carry: Any, key: jax.Array) -> Any:
         actor_critic, priority = carry
-        place, weight = sample(
+        index, weight = sample(
             key, replay.replace(priority=priority), config.sil_minibatch_size
         )
-        rows = replay.at(place)
+        rows = replay.at(index)
         rows = rows._replace(return_=rows.return_ / context.reward_scale)
         gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
             actor_critic.params, rows, weight
         )
         actor_critic = ppo.descend(actor_critic, gradient, hyperparameters)
         advantage = clipped_advantage(rows.return_, value, scale)
-        priority = priority.at[place].set(jnp.maximum(advantage, _LEAST_PRIORITY))
+        priority = priority.at[index].set(jnp.maximum(advantage, _LEAST_PRIORITY))
         return (actor_critic, priority), fraction
 
     before = (actor_critic, replay.priority)

@@ -1,6 +1,6 @@
-"""Trains programs into folders: what a run, a sweep and a shard have in common.
+"""Train programs in their folders, for runs, sweeps and shards alike.
 
-A run is a sweep of one point, whose only program works in the run's own folder.
+A run is a sweep of one point, whose only program has the run's own folder.
 """
 
 import dataclasses
@@ -27,13 +27,13 @@ from gasil_jax.sweeps.shards import Program
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A program and the folder that it trains in.
+    """A program and the folder that it is trained in.
 
     Attributes:
-      program: its configuration and members.
-      folder: of its metrics.csv and checkpoints; made where it is missing.
-      labels: what the tables call the members, (members,) each.
-      finished: whether it has been trained to its end already.
+      program: the program, with its config and members.
+      folder: folder of its metrics.csv and checkpoints, created if it is missing.
+      labels: columns that identify the members in the tables, (members,) each.
+      finished: whether it is already trained to its end.
     """
 
     program: Program
@@ -43,7 +43,7 @@ class Job:
 
     @property
     def env_steps(self) -> int:
-        """Environment steps over all members."""
+        """The number of environment steps over all members."""
         config = self.program.config
         return config.num_iterations * config.batch_steps * len(self.program.members)
 
@@ -51,17 +51,17 @@ class Job:
 def prepare(
     options: Options, programs: Sequence[Program], unfinished: Sequence[Program]
 ) -> Any:
-    """Start the devices, build the environment and check that all fits; returns it.
+    """Start the devices, check that everything fits, and return the environment.
 
-    Nothing compiles before this is done.
+    Nothing is compiled before this is done.
 
     Args:
-      options: of the run or sweep.
-      programs: with the members that are trained at once.
-      unfinished: those whose checkpoints are still to be written.
+      options: options of the run or sweep.
+      programs: the programs; the members of each are trained at once.
+      unfinished: the programs whose checkpoints are still to be written.
 
     Raises:
-      InputError: they don't fit the devices or the disk.
+      InputError: if the programs do not fit the devices or the disk.
     """
     devices.use_devices(
         options.settings,
@@ -88,7 +88,7 @@ def prepare(
             env,
             [(program.config, len(program.members)) for program in unfinished],
             options.out or pathlib.Path("runs"),
-            # The best one too.
+            # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
         )
     return env
@@ -102,19 +102,19 @@ def train(
     title: str,
     on_finished: Callable[[Job, Batch, driver.Outcome], None],
 ) -> None:
-    """Train jobs one after the other; those that are finished are left as they are.
+    """Train the unfinished jobs, one after the other.
 
     Args:
-      options: of the run or sweep.
+      options: options of the run or sweep.
       env: one environment.
-      jobs: in this order.
-      title: of the progress display.
+      jobs: the jobs in order, including finished ones.
+      title: title of the progress display.
       on_finished: called when a job has been trained to its end.
 
     Raises:
-      Interrupted: by a signal, after a checkpoint.
-      OSError: a folder can't be written any more.
-      ValueError: what is there to go on with does not fit.
+      Interrupted: if a signal was received; a checkpoint was written first.
+      OSError: if a folder can no longer be written.
+      ValueError: if a job to continue does not fit the options.
     """
     schedule = driver.CheckpointSchedule(
         options.checkpoint_every, options.keep_checkpoints

@@ -1,8 +1,9 @@
-"""Engines that run the shards of a sweep: ``python -m gasil_jax.sweep --launcher ray``.
+"""Launchers that run a sweep's shards: ``python -m gasil_jax.sweep --launcher ray``.
 
-A launcher is given a command line for each job, has them run, each in a process of its
-own, runs those again whose process died (a job goes on from its checkpoint), and
-returns when all are done. Adding one is a function and a line in `LAUNCHERS`.
+A launcher gets a command line for each job and runs each job in its own process. If a
+process dies, it runs the job again, which then continues from its checkpoint. It
+returns when all jobs are done. To add a launcher, write a function and add it to
+`LAUNCHERS`.
 """
 
 import contextlib
@@ -33,11 +34,11 @@ def check(name: str) -> None:
 
 
 def _refuse_failed(failed: Mapping[str, str]) -> None:
-    """Raise `ChildProcessError` that names jobs and why, if there are any."""
+    """Raise `ChildProcessError` with the failed jobs and reasons, if there are any."""
     if failed:
-        told = ", ".join(f"{name} ({why})" for name, why in failed.items())
+        jobs = ", ".join(f"{name} ({why})" for name, why in failed.items())
         raise ChildProcessError(
-            f"{told} failed; the others are done, and the same command goes on"
+            f"{jobs} failed; the others are done, and the same command goes on"
         )
 
 
@@ -45,13 +46,13 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
     """Run jobs on this machine one after another, each with all of its devices.
 
     Args:
-      program: the module that is started.
-      jobs: arguments of each, by a name that messages use.
-      devices: not looked at: it is among the arguments.
+      program: name of the module to start.
+      jobs: the arguments of each job, by the job's name in messages.
+      devices: ignored, because the arguments include it.
 
     Raises:
-      ChildProcessError: jobs have failed; the others are done.
-      Interrupted: by a signal, which the running job was sent too.
+      ChildProcessError: if jobs have failed; the others are done.
+      Interrupted: if a signal was received; it was passed on to the running job.
     """
     failed = {}
     for name, arguments in jobs.items():
@@ -65,9 +66,9 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
 
 
 def _run_process(command: Sequence[str]) -> int:
-    """Its exit status, negative if a signal has killed it."""
+    """Run a command and return its exit status, negative if a signal killed it."""
     with Interruption() as interruption:
-        # In a session of its own Ctrl-C reaches it once, from here.
+        # The child has its own session, so that Ctrl-C reaches it only from here.
         child = subprocess.Popen(command, start_new_session=True)
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
@@ -83,14 +84,14 @@ def _run_process(command: Sequence[str]) -> int:
 
 
 class _Unfinished(Exception):
-    """A job that ended before its time, and can go on."""
+    """A job ended early, and can continue when it is run again."""
 
 
 def _run_module(program: str, arguments: Sequence[str]) -> int:
-    """Run a command line in this process; returns its exit status.
+    """Run a command line in this process and return its exit status.
 
     Raises:
-      _Unfinished: it was interrupted, or its folder could not be written.
+      _Unfinished: if it was interrupted or its folder could not be written.
     """
     status = importlib.import_module(program).main(arguments)
     if status not in (0, _BAD_INPUT):
@@ -111,7 +112,7 @@ def _ray_package() -> Any:
 
 @contextlib.contextmanager
 def _connected(ray: Any) -> Iterator[None]:
-    """Connected to the cluster of RAY_ADDRESS, or one that is there, or a new one."""
+    """Connect to the cluster of RAY_ADDRESS, an existing one, or else a new one."""
     began = not ray.is_initialized()
     if began:
         ray.init()
@@ -123,20 +124,20 @@ def _connected(ray: Any) -> Iterator[None]:
 
 
 def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
-    """Run jobs as tasks of a Ray cluster: a GPU each where it has GPUs, else CPUs.
+    """Run jobs as tasks of a Ray cluster, with a GPU each if it has GPUs, else on CPUs.
 
-    A task whose worker or node died is run again elsewhere.
+    If a task's worker or node dies, the task is run again elsewhere.
 
     Args:
-      program: the module that is started; workers must have it.
-      jobs: arguments of each, by a name that messages use. Folders in them must be the
-        same on every node.
-      devices: CPU devices of a job, and CPUs that it occupies; default 1.
+      program: name of the module to start, which workers must have installed.
+      jobs: the arguments of each job, by the job's name in messages. Folders in the
+        arguments must be the same on every node.
+      devices: number of CPU devices of a job and of CPUs that it reserves; default 1.
 
     Raises:
-      ChildProcessError: jobs have failed; the others are done.
-      InputError: no node has so much.
-      Interrupted: by a signal, which the running jobs were sent too.
+      ChildProcessError: if jobs have failed; the others are done.
+      InputError: if no node has that many CPUs.
+      Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     ray = _ray_package()
     with _connected(ray):
@@ -144,7 +145,7 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
             needs = {"num_cpus": 1, "num_gpus": 1}
         else:
             needs = {"num_cpus": devices or 1, "num_gpus": 0}
-            # A job alone would take every core of its node for itself.
+            # By default a job would use every core of its node.
             more = [] if devices else ["--devices", "1"]
             jobs = {name: [*arguments, *more] for name, arguments in jobs.items()}
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
@@ -152,8 +153,8 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
             raise InputError(
                 f"devices is {devices}: no node of the cluster has so many CPUs"
             )
-        # JAX takes its devices once in a process, so each job has a process; and it
-        # dies with the job's, so that nothing holds the folder when it runs again.
+        # JAX sets up its devices once per process, so each job needs its own. The
+        # process ends with the job, so that the folder is free when the job runs again.
         task = ray.remote(
             max_calls=1, max_retries=RETRIES, retry_exceptions=[_Unfinished], **needs
         )(_run_module)
@@ -175,7 +176,7 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
 
 
 def _wait(ray: Any, references: list[Any]) -> None:
-    """Until all are done; a signal is passed on to them."""
+    """Wait until all tasks are done; pass a signal on to them."""
     with Interruption() as interruption:
         pending = references
         while pending and interruption.signal is None:
@@ -184,7 +185,7 @@ def _wait(ray: Any, references: list[Any]) -> None:
             )
         if interruption.signal is not None:
             for reference in pending:
-                # Not forced: it comes as Ctrl-C, and the job saves.
+                # Without force the job receives it as Ctrl-C, and saves.
                 ray.cancel(reference, force=False)
             ray.wait(references, num_returns=len(references))
             raise Interrupted(interruption.signal)

@@ -1,4 +1,4 @@
-"""Makes one sweep out of its shards: their tables are written, the shards only read."""
+"""Merge the shards of a sweep: write the sweep's tables; shards are only read."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -10,10 +10,10 @@ from gasil_jax.sweeps import shards, tables
 
 
 def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The shards that a folder holds or is."""
+    """Return the folders of the shards in a folder, or the folder if it is a shard."""
     inside = shards.root(folder)
-    found = sorted(inside.iterdir()) if inside.is_dir() else [folder]
-    described = [path for path in found if run_folder.is_described(path)]
+    paths = sorted(inside.iterdir()) if inside.is_dir() else [folder]
+    described = [path for path in paths if run_folder.is_described(path)]
     if not described:
         raise InputError(f"folder is {folder}: it must hold shards or be one")
     return described
@@ -45,35 +45,37 @@ def _read(folder: pathlib.Path) -> dict[str, Any]:
 
 
 def _read_all(folders: Sequence[pathlib.Path]) -> dict[pathlib.Path, dict[str, Any]]:
-    """The shards' descriptions, all of one sweep and none missing."""
+    """Return each shard's config.json, after checking that they make one sweep."""
     every = {path: _read(path) for folder in folders for path in _shard_folders(folder)}
     (first, described), *others = every.items()
     for other in others:
         _refuse_different((first, described), other)
-    places: dict[shards.Shard, pathlib.Path] = {}
+    folder_of: dict[shards.Shard, pathlib.Path] = {}
     for path, content in every.items():
         shard = shards.parse(content["shard"])
-        if shard in places:
-            raise InputError(f"shard {shard} is there twice: {places[shard]}, {path}")
-        places[shard] = path
-    counts = {shard.count for shard in places}
+        if shard in folder_of:
+            raise InputError(
+                f"shard {shard} is there twice: {folder_of[shard]}, {path}"
+            )
+        folder_of[shard] = path
+    counts = {shard.count for shard in folder_of}
     if len(counts) > 1:
         raise InputError(
             f"there are shards of {' and of '.join(map(str, sorted(counts)))}: name "
             "the folders of those that belong together"
         )
     count = counts.pop()
-    wanted = [shards.Shard(number, count) for number in range(1, count + 1)]
-    missing = [str(shard) for shard in wanted if shard not in places]
+    expected = [shards.Shard(number, count) for number in range(1, count + 1)]
+    missing = [str(shard) for shard in expected if shard not in folder_of]
     if missing:
         raise InputError(f"missing: shards {', '.join(missing)}, which have not begun")
-    return {places[shard]: every[places[shard]] for shard in wanted}
+    return {folder_of[shard]: every[folder_of[shard]] for shard in expected}
 
 
 def _refuse_used(
     out: pathlib.Path, shard: tuple[pathlib.Path, Mapping[str, Any]]
 ) -> None:
-    """Let only the tables of the same shards be written again: they come out alike."""
+    """Refuse a folder that holds anything but earlier tables of the same shards."""
     if run_folder.is_described(out):
         _refuse_different((out, run_folder.read(out)), shard)
         used = (out / "programs").is_dir()
@@ -84,15 +86,15 @@ def _refuse_used(
 
 
 def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
-    """Write the tables of a sweep that shards have trained; returns the summary.
+    """Write the tables of a sweep that was trained in shards; return the summary.
 
     Args:
-      folders: of the sweep, or of each shard.
-      out: where to; made where it is missing.
+      folders: the folder of the sweep, or the folders of all its shards.
+      out: folder of the tables, created if it is missing.
 
     Raises:
-      InputError: shards are missing, not finished or of another sweep, or something
-        else is in `out`.
+      InputError: if a shard is missing, unfinished or of another sweep, or if `out`
+        holds something else.
     """
     every = _read_all(folders)
     described = next(iter(every.values()))

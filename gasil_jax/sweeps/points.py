@@ -1,4 +1,4 @@
-"""The points of a sweep: hyperparameters, and counts of `Config`, by name."""
+"""Read or draw the points of a sweep: values of hyperparameters and counts, by name."""
 
 import itertools
 import json
@@ -16,7 +16,7 @@ from gasil_jax.imitation import unused
 Point = Mapping[str, Any]
 
 _FIXED = ("total_steps", "num_envs", "max_episode_steps")
-#: What a sweep may vary, and what its values are.
+#: The names that a sweep may vary, with the type of their values.
 KINDS: Mapping[str, type] = {
     name: int if allowed.whole else float
     for kind in (Hyperparameters, Config)
@@ -35,10 +35,10 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 
 
 def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
-    """From NAME=VALUE,VALUE,... to values by name.
+    """Return the values by name from entries NAME=VALUE,VALUE,...
 
     Raises:
-      InputError: no such name, or one twice, or not a number.
+      InputError: if a name is unknown or given twice, or if a value is not a number.
     """
     values = {}
     for entry in grid:
@@ -50,8 +50,8 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
             raise InputError(f"grid has {name} twice: all its values must be in one")
         try:
             read = float if KINDS[name] is float else whole_number
-            found = [read(value) for value in listed.split(",")]
-            values[name] = tuple(dict.fromkeys(found))
+            numbers = [read(value) for value in listed.split(",")]
+            values[name] = tuple(dict.fromkeys(numbers))
         except ValueError:
             kind = "numbers" if KINDS[name] is float else "whole numbers"
             raise InputError(
@@ -61,10 +61,10 @@ def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
 
 
 def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
-    """The points that a file lists.
+    """Return the points that a JSON file lists.
 
     Raises:
-      InputError: it can't be read, or has something else in it.
+      InputError: if the file can't be read or holds something else.
     """
     try:
         points = json.loads(path.read_text())
@@ -124,18 +124,19 @@ def make_points(
     seed: int,
     agent: str,
 ) -> list[dict[str, Any]]:
-    """The points of a sweep, without repetitions.
+    """Return the points of a sweep, without repetitions.
 
     Args:
-      grid: NAME=VALUE,VALUE,... for what varies.
-      random: draw so many of the grid's points, or of `PAPER_RANGES` without a grid.
-      points_file: a file that lists them, in place of both.
-      seed: of the draws.
-      agent: that is swept. What it does not look at is refused, and left out of
-        `PAPER_RANGES`.
+      grid: NAME=VALUE,VALUE,... for each name that varies.
+      random: number of points to draw from the grid or, without a grid, from
+        `PAPER_RANGES`; None takes the whole grid.
+      points_file: a file that lists the points, instead of grid and random.
+      seed: seed of the draws.
+      agent: the agent of the sweep. Names that it does not use are refused in the
+        grid and the file, and left out of `PAPER_RANGES`.
 
     Raises:
-      InputError: there is nothing to vary, or it can't.
+      InputError: if nothing varies, or if something that is named can't.
     """
     if points_file is not None:
         if grid or random is not None:

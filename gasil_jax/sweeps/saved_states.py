@@ -1,4 +1,4 @@
-"""Finds and loads the training states that a run or a sweep has saved."""
+"""Find and load the training states that a run or a sweep has saved."""
 
 import dataclasses
 import json
@@ -23,36 +23,36 @@ from gasil_jax.sweeps.tables import Trained
 
 
 class Saved(NamedTuple):
-    """The members of a run, or of one point.
+    """The saved members of a run, or of one point of a sweep.
 
     Attributes:
-      root: folder of the checkpoints that they are in.
-      program: what was trained and is saved there together.
-      places: of the members in it.
+      root: folder of the checkpoints that hold the members.
+      program: the program whose members these checkpoints hold.
+      indices: indices of the run's or point's members in the program.
     """
 
     root: pathlib.Path
     program: Program
-    places: Sequence[int]
+    indices: Sequence[int]
 
     @property
     def seeds(self) -> list[int]:
         """The members' seed numbers."""
-        return [self.program.members[i][1] for i in self.places]
+        return [self.program.members[i][1] for i in self.indices]
 
 
 def find(
     folder: pathlib.Path, described: Mapping[str, Any], point: int | None
 ) -> Saved:
-    """Where the states are.
+    """Return where the states of a run, or of a sweep's point, are saved.
 
     Args:
-      folder: of the run, sweep or shard.
-      described: its config.json, of `run_folder.read`.
-      point: of a sweep; default the best by mean.
+      folder: folder of the run, sweep or shard.
+      described: its config.json, from `run_folder.read`.
+      point: number of a sweep's point; default the best by mean.
 
     Raises:
-      InputError: there is no such point in the folder.
+      InputError: if the folder has no such point.
     """
     if "points" in described:
         return _of_sweep(folder, described, _checked(folder, described, point))
@@ -68,7 +68,7 @@ def find(
 def _checked(
     folder: pathlib.Path, described: Mapping[str, Any], point: int | None
 ) -> int:
-    """The point that is asked for, or the best."""
+    """Return the requested point, or the best by mean for None."""
     points: Sequence[Point] = described["points"]
     if point is None:
         try:
@@ -89,24 +89,24 @@ def _checked(
 
 
 def _of_sweep(folder: pathlib.Path, described: Mapping[str, Any], point: int) -> Saved:
-    """All points of a program are trained together."""
+    """Return where the states of a sweep's point are saved."""
     if shards.root(folder).is_dir():
         raise InputError(
             f"run is {folder}, whose members are in its shards: name one of "
             f"{shards.root(folder)}"
         )
-    program, places = _with_point(folder, described, point)
-    return Saved(program.folder(folder) / "checkpoints", program, places)
+    program, indices = _with_point(folder, described, point)
+    return Saved(program.folder(folder) / "checkpoints", program, indices)
 
 
 def _with_point(
     folder: pathlib.Path, described: Mapping[str, Any], point: int
 ) -> tuple[Program, list[int]]:
-    """The program that trains a point, and the places of its members in it."""
+    """Return the program that trains a point, and the indices of its members."""
     for program in Trained.described(folder, described).programs:
-        places = [i for i, (index, _) in enumerate(program.members) if index == point]
-        if places:
-            return program, places
+        indices = [i for i, (index, _) in enumerate(program.members) if index == point]
+        if indices:
+            return program, indices
     raise InputError(f"point is {point}: it is not in {folder}, a shard of its sweep")
 
 
@@ -116,50 +116,51 @@ def load(
     point: int | None = None,
     seed: int | None = None,
 ) -> tuple[Any, Config, list[int], Any]:
-    """Environment, config, seed numbers and states (seed, ...) of a run or point.
+    """Return environment, config, seed numbers and states (seed, ...) of a run.
 
     Args:
-      folder: of the run or sweep, finished or not.
-      which: of its checkpoints, "last" or "best", the one with the best evaluation
-        on the way or, where there was none, the highest returns in training.
-      point: of a sweep; default the best by mean.
-      seed: its number; default all.
+      folder: folder of the run or sweep, which need not be finished.
+      which: the checkpoint to load: "last", or "best", which has the best evaluation
+        or, without evaluations, the highest returns in training.
+      point: number of a sweep's point; default the best by mean.
+      seed: number of the seed; default all seeds.
 
     Raises:
-      InputError: it is not the folder of a run, or has no such checkpoint or seed, or
-        the best is asked for of a point that shares its checkpoints with others.
+      InputError: if it is not the folder of a run, if it has no such checkpoint or
+        seed, or if "best" is requested of a point that shares its checkpoints with
+        other points.
     """
     described = run_folder.read(folder)
     saved = find(folder, described, point)
-    found, damages = checkpoint.latest(saved.root)
+    chosen, damages = checkpoint.latest(saved.root)
     for damage in damages:
         print(f"warning: {damage}", file=sys.stderr)
     config, count = saved.program.config, len(saved.program.members)
     if which == "best":
-        if len(saved.places) < count:
+        if len(saved.indices) < count:
             raise InputError(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        found = checkpoint.best(saved.root)
-    if found is None:
+        chosen = checkpoint.best(saved.root)
+    if chosen is None:
         scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     with command_line.input_checked():
         validate(config, tuple(AGENTS))
         env = environments.make_env(described["env"], **settings)
-        # All members have leaves of the same names.
+        # The leaves of all members have the same shapes.
         init = lambda seed: train.init(
             env, config, jax.random.key(seed), saved.program.hyperparameters[0]
         )
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-        states = found.restore(like)
-    seeds, places = saved.seeds, np.array(saved.places)
+        states = chosen.restore(like)
+    seeds, indices = saved.seeds, np.array(saved.indices)
     if seed is not None:
         if seed not in seeds:
             raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
-        seeds, places = [seed], places[[seeds.index(seed)]]
-    if len(places) < count:
-        states = jax.tree.map(lambda x: x[places], states)
+        seeds, indices = [seed], indices[[seeds.index(seed)]]
+    if len(indices) < count:
+        states = jax.tree.map(lambda x: x[indices], states)
     return env, config, seeds, states

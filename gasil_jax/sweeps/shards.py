@@ -1,9 +1,9 @@
-"""How a sweep is cut: into programs that compile once, and into shards that run apart.
+"""Divide a sweep into programs, which compile once, and shards, which run separately.
 
 A member is a point with a seed. The members of a program differ in `Hyperparameters`
-alone; two counts are among these, which divide the points unless it is asked that they
-share a program. A shard is one of n near-equal parts of all members, which
-are taken program by program, so that a shard compiles as few programs as may be.
+alone. Two hyperparameters are counts; points that differ in these have separate
+programs, unless `share_counts` is set. A shard is one of n nearly equal parts of all
+members. Members are taken program by program, so that a shard compiles few programs.
 """
 
 import dataclasses
@@ -16,19 +16,19 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.sweeps.points import Point
 
-#: Hyperparameters that decide shapes: of a program its configuration has the largest.
+#: Hyperparameters that decide shapes; a program's config has their largest values.
 COUNTS = tuple(x for x, allowed in ranges(Hyperparameters).items() if allowed.whole)
 
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What one compiled program trains.
+    """The members that one compiled program trains.
 
     Attributes:
-      number: among the programs of the whole sweep; names its folder.
-      config: that its members share.
-      members: (index of the point, absolute seed number) of each.
-      hyperparameters: of each.
+      number: number of the program in the whole sweep, and name of its folder.
+      config: the config that its members share.
+      members: (index of the point, absolute seed number) of each member.
+      hyperparameters: the hyperparameters of each member.
     """
 
     number: int
@@ -37,7 +37,7 @@ class Program:
     hyperparameters: tuple[Hyperparameters, ...]
 
     def part(self, begin: int, end: int) -> "Program":
-        """The same program with some of its members, from place to place."""
+        """Return the program with only the members from index `begin` to `end`."""
         return dataclasses.replace(
             self,
             members=self.members[begin:end],
@@ -45,7 +45,7 @@ class Program:
         )
 
     def folder(self, sweep: pathlib.Path) -> pathlib.Path:
-        """Where it is in the folder of a sweep or shard."""
+        """Return the program's folder inside the folder of a sweep or shard."""
         return sweep / "programs" / str(self.number)
 
 
@@ -55,14 +55,14 @@ def programs(
     seeds: Sequence[int],
     share_counts: bool = False,
 ) -> list[Program]:
-    """The programs of a sweep, all points with all seeds.
+    """Return the programs that train all points with all seeds.
 
     Args:
-      config: what the points are changes of.
-      points: hyperparameters and fields of `Config` by name.
+      config: the config that the points change.
+      points: changed hyperparameters and fields of `Config`, by name.
       seeds: absolute seed numbers.
-      share_counts: whether points that differ in the buffer's steps or the
-        discriminator's updates share a program, that of the largest.
+      share_counts: whether points with different `buffer_steps` or
+        `discriminator_updates` share a program, which then has the largest values.
     """
     configs = [config.replace(**point) for point in points]
     counts = [
@@ -91,8 +91,8 @@ class Shard:
     """One of several parts of a sweep.
 
     Attributes:
-      number: which, from 1 on.
-      count: how many there are.
+      number: number of the part, from 1 on.
+      count: number of parts.
     """
 
     number: int
@@ -102,17 +102,17 @@ class Shard:
         return f"{self.number}/{self.count}"
 
     def folder(self, sweep: pathlib.Path) -> pathlib.Path:
-        """Where it is in the folder of its sweep: the same on every host."""
+        """Return the shard's folder inside the folder of its sweep."""
         return root(sweep) / f"{self.number}-of-{self.count}"
 
 
 def root(sweep: pathlib.Path) -> pathlib.Path:
-    """The folder that holds the shards of a sweep."""
+    """Return the folder that holds the shards of a sweep."""
     return sweep / "shards"
 
 
 def refuse_whole(out: pathlib.Path) -> None:
-    """Raise `InputError` if a run or sweep that is not in shards is in the folder."""
+    """Raise `InputError` if the folder holds a run or sweep without shards."""
     if run_folder.is_described(out) and not root(out).is_dir():
         raise InputError(
             f"out is {out}, which holds a run that is not in shards: name another "
@@ -121,7 +121,7 @@ def refuse_whole(out: pathlib.Path) -> None:
 
 
 def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
-    """Raise `InputError` if the folder holds shards of another number."""
+    """Raise `InputError` if the folder holds a sweep with another number of shards."""
     inside = root(out)
     cuts = {path.name.split("-of-")[-1] for path in inside.glob("*-of-*")}
     others = cuts - {str(shard.count)}
@@ -132,7 +132,7 @@ def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
 
 
 def refuse_sharded(out: pathlib.Path) -> None:
-    """Raise `InputError` if a sweep in shards is in the folder."""
+    """Raise `InputError` if the folder holds a sweep with shards."""
     if root(out).is_dir():
         raise InputError(
             f"out is {out}, which holds shards: go on with each of them with --shard, "
@@ -141,17 +141,17 @@ def refuse_sharded(out: pathlib.Path) -> None:
 
 
 def parse(text: str, name: str = "shard") -> Shard:
-    """From "3/8".
+    """Return the shard that a text such as "3/8" names.
 
     Args:
-      text: that.
-      name: what a refusal calls it.
+      text: NUMBER/COUNT.
+      name: name of the option, for the error message.
 
     Raises:
-      InputError: it is no such thing.
+      InputError: if the text has another form.
     """
-    found = re.fullmatch(r"([1-9][0-9]*)/([1-9][0-9]*)", text, re.ASCII)
-    shard = Shard(*map(int, found.groups())) if found else None
+    match = re.fullmatch(r"([1-9][0-9]*)/([1-9][0-9]*)", text, re.ASCII)
+    shard = Shard(*map(int, match.groups())) if match else None
     if shard is None or shard.number > shard.count:
         raise InputError(
             f"{name} is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
@@ -160,12 +160,12 @@ def parse(text: str, name: str = "shard") -> Shard:
 
 
 def share(whole: Sequence[Program], shard: Shard) -> list[Program]:
-    """The part of the programs that a shard trains, in order.
+    """Return the programs that a shard trains, each with the shard's members only.
 
-    Shards differ by one member at most, and together hold each member once.
+    Sizes of shards differ by at most one member. Each member is in exactly one shard.
 
     Raises:
-      InputError: there are more shards than members.
+      InputError: if there are more shards than members.
     """
     total = sum(len(program.members) for program in whole)
     if shard.count > total:
@@ -175,11 +175,11 @@ def share(whole: Sequence[Program], shard: Shard) -> list[Program]:
         )
     first = (shard.number - 1) * total // shard.count
     last = shard.number * total // shard.count
-    mine, before = [], 0
+    shares, before = [], 0
     for program in whole:
         size = len(program.members)
         part = program.part(max(0, first - before), max(0, last - before))
         if part.members:
-            mine.append(part)
+            shares.append(part)
         before += size
-    return mine
+    return shares

@@ -1,9 +1,9 @@
-"""What a sweep comes to: from its programs' folders to results.csv and the others.
+"""Make a sweep's tables, such as results.csv, from the folders of its programs.
 
-A program's folder holds metrics.csv, a row for each member and iteration, and, once it
-is trained, training.json; and evaluations.csv where policies were evaluated. Whether
-one process trained all programs or shards did on many hosts, the tables are made here,
-from those files alone.
+A program's folder holds metrics.csv, with a row for each member and iteration; once
+trained, training.json; and evaluations.csv if policies were evaluated. The tables are
+made from these files alone, whether one process trained all programs or shards did on
+many hosts.
 """
 
 import csv
@@ -23,7 +23,7 @@ from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.shards import Program
 
-#: What metrics.csv calls the members.
+#: The columns of metrics.csv that identify the members.
 LABELS = ("point", "seed")
 _TRAINING = "training.json"
 
@@ -31,14 +31,14 @@ Member = tuple[int, int]
 
 
 def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> None:
-    """Note that a program is trained to its end.
+    """Record that a program is trained to its end.
 
     Args:
-      folder: of the sweep or shard.
-      program: which one.
+      folder: folder of the sweep or shard.
+      program: the program.
       **measured: "env_steps" (over all members), "compile_seconds", "train_seconds"
-        and "evaluation_seconds" (None without evaluations), all of the process that
-        ended it; "device" and "device_count".
+        and "evaluation_seconds" (None without evaluations), all measured in the
+        process that finished the program; "device" and "device_count".
     """
     iterations = program.config.num_iterations
     content = {"iterations": iterations, "members": len(program.members), **measured}
@@ -47,11 +47,11 @@ def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> N
 
 
 def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
-    """What `write_training` wrote; None if the program is not trained to its end.
+    """Return what `write_training` wrote; None if the program is not yet finished.
 
     Args:
-      folder: of the sweep or shard.
-      program: which one; its config says where the end is.
+      folder: folder of the sweep or shard.
+      program: the program, whose config says where its end is.
     """
     try:
         content = json.loads((program.folder(folder) / _TRAINING).read_text())
@@ -64,11 +64,11 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A folder and the programs that are trained in it: a whole sweep or a shard.
+    """A folder and the programs that are trained in it, of a whole sweep or a shard.
 
     Attributes:
-      folder: of the sweep or shard.
-      programs: with the members that are trained there.
+      folder: folder of the sweep or shard.
+      programs: the programs, with only the members that are trained there.
     """
 
     folder: pathlib.Path
@@ -76,7 +76,7 @@ class Trained:
 
     @classmethod
     def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
-        """What a folder trains, by its config.json as `run_folder.read` reads it."""
+        """Return the programs of a folder, from its config.json (`run_folder.read`)."""
         first = content["first_seed"]
         seeds = range(first, first + content["seeds"])
         programs = shards.programs(
@@ -87,7 +87,7 @@ class Trained:
         return cls(folder, programs)
 
     def unfinished(self) -> list[int]:
-        """Numbers of the programs that are not trained to their end."""
+        """Return the numbers of the programs that are not trained to their end."""
         return [
             program.number
             for program in self.programs
@@ -95,15 +95,15 @@ class Trained:
         ]
 
     def trainings(self) -> list[dict[str, Any]]:
-        """What `read_training` reads, of each program that is finished."""
+        """Return what `read_training` reads, for each finished program."""
         read = [read_training(self.folder, program) for program in self.programs]
         return [training for training in read if training is not None]
 
     def members(self) -> dict[Member, dict[str, np.ndarray]]:
-        """Every metric of every member, (iterations,) each; NaN where there is none.
+        """Return every metric of every member, (iterations,) each; NaN where empty.
 
         Raises:
-          InputError: metrics.csv is not what training has written.
+          InputError: if a metrics.csv is damaged.
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
@@ -111,10 +111,10 @@ class Trained:
         return every
 
     def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
-        """The same of every evaluation, (evaluations,) each; empty without evaluations.
+        """Return every member's scores, (evaluations,) each; empty without evaluations.
 
         Raises:
-          InputError: evaluations.csv is not what training has written.
+          InputError: if an evaluations.csv is damaged.
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program, training in zip(self.programs, self.trainings(), strict=True):
@@ -125,7 +125,7 @@ class Trained:
     def _table(
         self, program: Program, name: str, rows: int | None = None
     ) -> dict[Member, dict[str, np.ndarray]]:
-        """A program's table by member, to its end; `rows` are a member's, if known."""
+        """Return a program's complete table by member, checking a member's `rows`."""
         path, config = program.folder(self.folder) / name, program.config
         try:
             columns = metrics_files.read_metrics(path, LABELS, len(program.members))
@@ -147,15 +147,15 @@ def write(
     seeds: Sequence[int],
     parts: Sequence[Trained],
 ) -> dict[str, Any]:
-    """Write results.csv, curves.npz, summary.json and sweep.png; returns the summary.
+    """Write results.csv, curves.npz, summary.json and sweep.png; return the summary.
 
-    A cell of results.csv is empty where the point leaves the sweep's own value.
+    A cell of results.csv is empty if the point keeps the sweep's own value.
 
     Args:
-      folder: where to.
-      points: all of them.
+      folder: folder to write to.
+      points: all points of the sweep.
       seeds: absolute seed numbers.
-      parts: finished, every point with every seed in one of them.
+      parts: the finished parts, which together hold every point with every seed.
     """
     members: dict[Member, dict[str, np.ndarray]] = {}
     evaluations: dict[Member, dict[str, np.ndarray]] = {}
@@ -170,7 +170,7 @@ def write(
     length = np.array(
         [final_returns(of_point("episode_length", i)) for i in range(len(points))]
     )
-    # (points, seeds) each, in columns and fields of this name.
+    # (points, seeds) each, for columns and fields of the same names.
     finals = {"final_return": final, "final_length": length}
     if evaluations:
         scores = _curves(points, seeds, evaluations)
@@ -221,11 +221,10 @@ def write(
 
 
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Seconds, steps/s and devices of programs that were trained one by one.
+    """Return the seconds, steps/s and devices of programs trained one after the other.
 
-    "evaluation_seconds" are there where policies were evaluated.
-
-    Of shards, which run side by side, "env_steps_per_second" is one shard's on average.
+    There are "evaluation_seconds" if policies were evaluated. For shards, which run in
+    parallel, "env_steps_per_second" is the average speed of one shard.
     """
     total = lambda name: sum(training[name] for training in trainings)
     devices = _joined([{"device": training["device"]} for training in trainings])
@@ -241,7 +240,7 @@ def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """The values of all records; where they differ, all of them in one string."""
+    """Return the common value of each field, or one string of all different values."""
     every = {name: {record.get(name) for record in records} for name in records[0]}
     return {
         name: values.pop() if len(values) == 1 else ", ".join(sorted(map(str, values)))
@@ -254,7 +253,7 @@ def _curves(
     seeds: Sequence[int],
     members: Mapping[Member, Mapping[str, np.ndarray]],
 ) -> dict[str, Any]:
-    """Every metric, (points, seeds, iterations), NaN beyond a member's last."""
+    """Return every metric, (points, seeds, iterations); NaN after a member's last."""
     # Points may differ in batch_steps, and so in iterations.
     length = max(len(metrics["env_steps"]) for metrics in members.values())
     pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
@@ -274,7 +273,7 @@ def _finite(value: float) -> float | None:
 
 
 def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
-    """Lines that say how fast it was and which points are best."""
+    """Return lines of text with the speed and the best points."""
     seconds = f"{summary['train_seconds']:,.0f} s of training"
     if "evaluation_seconds" in summary:
         seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
@@ -302,7 +301,7 @@ def _label(point: Point) -> str:
 
 
 def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> None:
-    """Every seed's final return and their mean, a row for each point."""
+    """Plot every seed's final return and their mean, in a row for each point."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,4 +1,4 @@
-"""The cloning loss against plain Python, and what it does to the policy."""
+"""The cloning loss against plain Python, and its effect on the policy."""
 
 import functools
 

@@ -1,4 +1,4 @@
-"""GAIL: a scripted expert is imitated; what is no expert is refused."""
+"""GAIL imitates a scripted expert, and refuses files without expert data."""
 
 import gymnasium
 import jax
@@ -98,8 +98,8 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
     )
     observation, action = expert_module.load("minari:test/expert-v0")
     for got, name in ((observation, "observations"), (action, "actions")):
-        wanted = [getattr(e, name)[:n] for e, n in zip(episodes, lengths)]
-        np.testing.assert_array_equal(got, np.concatenate(wanted))
+        expected = [getattr(e, name)[:n] for e, n in zip(episodes, lengths)]
+        np.testing.assert_array_equal(got, np.concatenate(expected))
     with pytest.raises(ValueError, match=r"and 2 actions .* has 4 and 3"):
         expert_module.check("minari:test/expert-v0", 4, 3)
 

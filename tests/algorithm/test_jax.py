@@ -1,4 +1,4 @@
-"""That the installed JAX computes what we ask of it."""
+"""The installed JAX computes correct numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -90,17 +90,19 @@ def products(jaxpr):
 
 
 def test_matrices_are_multiplied_in_full_precision():
-    """A GPU takes TF32 unless it is told otherwise."""
+    """Products are in full float32; by default a GPU uses TF32."""
     highest = jax.lax.Precision.HIGHEST
     env = gasil_jax.make_env("point_mass")
     state = jax.eval_shape(lambda: gasil_jax.init(env, CONFIG, jax.random.key(0)))
     jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
-    found = list(products(jaxpr.jaxpr))
-    assert len(found) > 10
-    assert set(found) == {(highest, highest)}
+    precisions = list(products(jaxpr.jaxpr))
+    assert len(precisions) > 10
+    assert set(precisions) == {(highest, highest)}
     act = policy.from_state(gasil_jax.init(env, CONFIG, jax.random.key(0)), env)
-    found = list(products(jax.make_jaxpr(act)(jnp.zeros(env.observation_size)).jaxpr))
-    assert found and set(found) == {(highest, highest)}
+    precisions = list(
+        products(jax.make_jaxpr(act)(jnp.zeros(env.observation_size)).jaxpr)
+    )
+    assert precisions and set(precisions) == {(highest, highest)}
     # What the program asks for itself it gets.
     with jax.default_matmul_precision("default"):
         jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)

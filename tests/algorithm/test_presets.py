@@ -1,4 +1,4 @@
-"""Presets: valid, what the search found, used by default, and overridden by flags."""
+"""Presets are valid, hold the search's results, and are overridden by flags."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Normalization of rewards against a plain loop, and what training makes of it."""
+"""Normalization of rewards against a plain loop, and its use in training."""
 
 import jax
 import jax.numpy as jnp

@@ -42,37 +42,37 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
                     running[env] = []
         size = min(len(expected), capacity)
         assert int(jnp.sum(replay.priority > 0)) == size
-        place = (np.arange(len(expected) - size, len(expected))) % capacity
+        index = (np.arange(len(expected) - size, len(expected))) % capacity
         kept = np.array(expected[len(expected) - size :]).reshape(-1, 2)
-        np.testing.assert_allclose(replay.observation[place, 0], kept[:, 0])
-        np.testing.assert_allclose(replay.action[place, 0], -kept[:, 0])
-        np.testing.assert_allclose(replay.return_[place], kept[:, 1], rtol=1e-5)
+        np.testing.assert_allclose(replay.observation[index, 0], kept[:, 0])
+        np.testing.assert_allclose(replay.action[index, 0], -kept[:, 0])
+        np.testing.assert_allclose(replay.return_[index], kept[:, 1], rtol=1e-5)
     assert len(expected) > capacity
 
 
 def test_sampling_follows_the_priorities():
     priority = jnp.array([0.0, 1.0, 0.25, 1e-6, 3.0, 0.0])
     replay = self_imitation.init_replay(6, 1, 1).replace(priority=priority)
-    place, weight = self_imitation.sample(jax.random.key(0), replay, 100_000)
+    index, weight = self_imitation.sample(jax.random.key(0), replay, 100_000)
     mass = np.where(priority > 0, np.asarray(priority, np.float64) ** 0.6, 0.0)
     probability = mass / mass.sum()
-    found = np.bincount(place, minlength=6) / 100_000
-    np.testing.assert_allclose(found, probability, atol=5e-3)
-    importance = (4 * probability[place]) ** -0.1
+    frequency = np.bincount(index, minlength=6) / 100_000
+    np.testing.assert_allclose(frequency, probability, atol=5e-3)
+    importance = (4 * probability[index]) ** -0.1
     importance /= (4 * probability[probability > 0].min()) ** -0.1
     np.testing.assert_allclose(weight, importance, rtol=1e-4)
 
 
 def test_an_empty_place_is_never_drawn(monkeypatch):
-    """Though rounding may put the whole mass beyond the last place that is filled."""
+    """Only filled indices are drawn, although rounding may put all mass beyond them."""
     priority = jnp.array([1.0, 2.0, 0.0, 0.0])
     replay = self_imitation.init_replay(4, 1, 1).replace(priority=priority)
     rounded = lambda mass: jnp.array([1.0, 2.5, 2.5, 2.5000002], jnp.float32)
     monkeypatch.setattr(self_imitation.jnp, "cumsum", rounded)
     highest = lambda key, shape: jnp.full(shape, 0.99999994, jnp.float32)
     monkeypatch.setattr(self_imitation.jax.random, "uniform", highest)
-    place, weight = self_imitation.sample(jax.random.key(0), replay, 3)
-    assert place.tolist() == [1, 1, 1] and np.isfinite(weight).all()
+    index, weight = self_imitation.sample(jax.random.key(0), replay, 3)
+    assert index.tolist() == [1, 1, 1] and np.isfinite(weight).all()
 
 
 def test_scale_is_the_standard_deviation_of_what_is_stored():

@@ -168,11 +168,11 @@ def test_a_state_may_begin_outside_of_jit_and_be_donated():
     key = jax.random.key(0)
     state = gasil_jax.init(env, config, key)
     step = jax.jit(lambda state: gasil_jax.iterate(env, config, state)[0])
-    wanted = step(jax.jit(lambda key: gasil_jax.init(env, config, key))(key))
-    found = jax.jit(step, donate_argnums=0)(state)
+    expected = step(jax.jit(lambda key: gasil_jax.init(env, config, key))(key))
+    result = jax.jit(step, donate_argnums=0)(state)
     # A program of its own may round in another way.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7)
-    jax.tree.map(close, found.actor_critic, wanted.actor_critic)
+    jax.tree.map(close, result.actor_critic, expected.actor_critic)
 
 
 def test_double_precision_is_refused():

@@ -69,7 +69,7 @@ def test_whole_episodes_come_back(filled, capsys):
 
 def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     out, _ = filled
-    told = {}
+    metadata = {}
     load = saved_states.load
 
     def of_a_swept_point(folder, which, point, seed):
@@ -80,10 +80,10 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
 
     monkeypatch.setattr(saved_states, "load", of_a_swept_point)
     monkeypatch.setattr(
-        export_minari, "write", lambda *_, **settings: told.update(settings)
+        export_minari, "write", lambda *_, **settings: metadata.update(settings)
     )
     assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
-    assert "(gamma 0.9)" in told["description"]
+    assert "(gamma 0.9)" in metadata["description"]
 
 
 def test_a_buffer_s_last_episode_is_kept_if_it_is_whole():

@@ -51,17 +51,23 @@ def test_the_profile_counts():
 
 def test_runs_are_drawn(tmp_path, capsys):
     small = (
-        *("--env", "point_mass", "--seeds", "3", "--total-steps", "2048"),
-        *(
-            "--batch-steps",
-            "256",
-            "--num-envs",
-            "4",
-            "--num-epochs",
-            "1",
-            "--no-stagger-episodes",
-        ),
-        *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+        "--env",
+        "point_mass",
+        "--seeds",
+        "3",
+        "--total-steps",
+        "2048",
+        "--batch-steps",
+        "256",
+        "--num-envs",
+        "4",
+        "--num-epochs",
+        "1",
+        "--no-stagger-episodes",
+        "--hidden-sizes",
+        "8",
+        "--discriminator-hidden-sizes",
+        "8",
     )
     folders = []
     for name, first_seed in (("ppo", "0"), ("others", "3")):

@@ -22,9 +22,22 @@ from gasil_jax.host.members import member
 from gasil_jax.sweeps import saved_states
 
 SMALL = (
-    *("--seeds", "2", "--total-steps", "256", "--batch-steps", "128"),
-    *("--num-envs", "4", "--num-epochs", "1", "--minibatch-size", "32"),
-    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    "--seeds",
+    "2",
+    "--total-steps",
+    "256",
+    "--batch-steps",
+    "128",
+    "--num-envs",
+    "4",
+    "--num-epochs",
+    "1",
+    "--minibatch-size",
+    "32",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
 )
 
 

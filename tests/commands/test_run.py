@@ -11,11 +11,33 @@ import pytest
 from gasil_jax.run import main
 
 SMALL = (
-    *("--env", "point_mass", "--seeds", "3", "--first-seed", "5"),
-    *("--total-steps", "1e3", "--batch-steps", "256", "--num-envs", "4"),
-    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
-    *("--num-epochs", "2", "--alpha", "0.5", "--buffer-steps", "300"),
-    *("--alpha-schedule", "0", "0.5", "500", "1"),
+    "--env",
+    "point_mass",
+    "--seeds",
+    "3",
+    "--first-seed",
+    "5",
+    "--total-steps",
+    "1e3",
+    "--batch-steps",
+    "256",
+    "--num-envs",
+    "4",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
+    "--num-epochs",
+    "2",
+    "--alpha",
+    "0.5",
+    "--buffer-steps",
+    "300",
+    "--alpha-schedule",
+    "0",
+    "0.5",
+    "500",
+    "1",
 )
 
 
@@ -50,8 +72,12 @@ def test_a_run_from_end_to_end(finished):
     assert {row["seed"] for row in rows} == {"5", "6", "7"}
     assert [int(r["env_steps"]) for r in rows[::3]] == [256, 512, 768, 1024]
     assert list(rows[0])[:6] == [
-        *("seed", "env_steps", "episode_return", "episode_length"),
-        *("good_return", "discriminator_loss"),
+        "seed",
+        "env_steps",
+        "episode_return",
+        "episode_length",
+        "good_return",
+        "discriminator_loss",
     ]
     for column in ("policy_loss", "value_loss", "entropy", "explained_variance"):
         assert all(float(row[column]) is not None for row in rows)

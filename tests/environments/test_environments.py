@@ -140,8 +140,8 @@ def test_point_mass_against_a_plain_python_twin():
         limited = np.clip(action, -1.0, 1.0)
         position = np.clip(position + layout.max_speed * limited, -1.0, 1.0)
         reward = -layout.actuation_cost * np.sqrt(np.sum(limited**2))
-        for i, (place, value) in enumerate(objects):
-            if left[i] and np.hypot(*(position - place)) <= layout.radius:
+        for i, (centre, value) in enumerate(objects):
+            if left[i] and np.hypot(*(position - centre)) <= layout.radius:
                 left[i] = False
                 reward += value
                 collected += 1

@@ -22,7 +22,7 @@ SIMPLE, FLAT, PYRAMID = (
 def problems(batch, size, groups, seed=0, most_in_play=None):
     """Random problems, and the same with every constraint as a row of a matrix.
 
-    Of each group so many contacts are in play, in places that differ; default all.
+    In each group so many contacts are in play, at different indices; default all.
     """
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(*batch, size, size))

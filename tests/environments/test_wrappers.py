@@ -1,4 +1,4 @@
-"""Wrappers on a scripted environment whose every reward and ending is known."""
+"""Wrappers on a scripted environment with given rewards and endings."""
 
 import jax
 import jax.numpy as jnp

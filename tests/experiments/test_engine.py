@@ -1,4 +1,4 @@
-"""What is missing is trained, goes on where it was stopped, and stands in the store."""
+"""Missing runs are trained, continue where they were stopped, and are stored."""
 
 import dataclasses
 import multiprocessing
@@ -94,7 +94,7 @@ def test_what_is_trained_is_not_trained_again(trained, monkeypatch):
         before = records[each].episode_return
         np.testing.assert_array_equal(kept.episode_return, before)
         assert np.isfinite(kept.final_evaluation)
-        # All that it went on with is told.
+        # The provenance names everything that the program was trained with.
         assert kept.provenance["commit"] == "c, then d"
         assert kept.provenance["clean"] is None
 
@@ -120,8 +120,8 @@ def test_runs_side_by_side_are_those_of_one_program(trained, tmp_path):
     assert "agent 'pppo' is unknown" in log.read_text()
     assert store.missing([unknown, *RUNS[:2]]) == [unknown]
     for each in RUNS[:2]:
-        mine, other = store[each].episode_return, records[each].episode_return
-        np.testing.assert_allclose(mine, other, rtol=2e-3)
+        trained, other = store[each].episode_return, records[each].episode_return
+        np.testing.assert_allclose(trained, other, rtol=2e-3)
 
 
 def test_a_signal_ends_all_processes_and_they_have_saved(tmp_path):

@@ -1,4 +1,4 @@
-"""What the figures ask for."""
+"""The runs that the figures request."""
 
 import dataclasses
 
@@ -81,24 +81,26 @@ def test_the_figure_on_geometry_is_the_tuned_presets_with_other_environments():
     figure, runs = FIGURES["batch_geometry"], set()
     for panel, curves in figure.panels.items():
         for curve in curves.values():
-            mine = curve.runs(STORE)
-            assert len(mine) == (20 if panel.startswith("halfcheetah") else 10)
+            curve_runs = curve.runs(STORE)
+            assert len(curve_runs) == (20 if panel.startswith("halfcheetah") else 10)
             delay = DELAY if panel.endswith("delayed") else 1
             preset = gasil_jax.preset(
                 curve.search.env, curve.search.agent, "tuned", delay
             )
-            config = mine[0].config
+            config = curve_runs[0].config
             assert (config.batch_steps, config.total_steps) == (2048, 1_000_000)
             same = {
                 name: getattr(preset, name) for name in ("num_envs", "stagger_episodes")
             }
-            assert config.replace(**same) == preset and mine[0].reward_delay == delay
-            runs |= set(mine)
+            assert (
+                config.replace(**same) == preset and curve_runs[0].reward_delay == delay
+            )
+            runs |= set(curve_runs)
     assert len(runs) == len(figure.requested(STORE, STORE)) == 960
     assert {(x.config.num_envs, x.config.stagger_episodes) for x in runs} == {
         (count, drawn) for count in (1, 8, 32, 128) for drawn in (True, False)
     }
-    # What an earlier figure trained with the same settings is found.
+    # Runs that an earlier figure trained with the same settings are used.
     assert len(runs) - len(STORE.missing(runs)) >= 100
 
 

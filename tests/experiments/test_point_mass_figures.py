@@ -1,4 +1,4 @@
-"""The layout that was found, and what is drawn of it."""
+"""The chosen layout of the point mass, and the figures of it."""
 
 import csv
 import dataclasses

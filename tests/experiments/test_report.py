@@ -26,11 +26,11 @@ def family(*pairs):
 
 
 def test_a_clear_difference_is_told_and_none_is_not():
-    found = compare(
+    result = compare(
         scores(high=9.0, low=0.0, same=0.0), family(("high", "low"), ("low", "same"))
     )
-    assert found["a", "high", "low"].verdict == "better"
-    assert found["a", "low", "same"].verdict == "not clear"
+    assert result["a", "high", "low"].verdict == "better"
+    assert result["a", "low", "same"].verdict == "not clear"
     (other,) = compare(scores(high=9.0, low=0.0), family(("low", "high"))).values()
     assert other.verdict == "worse"
     assert other.low < other.middle < other.high < 0
@@ -42,36 +42,36 @@ def test_the_correction_is_holm_s():
     pairs = [(name, "zero") for name in means if name != "zero"]
     data = scores(**means)
     alone = {key: compare(data, {key: x})[key].p for key, x in family(*pairs).items()}
-    found = compare(data, family(*pairs))
+    result = compare(data, family(*pairs))
     order = sorted(alone, key=alone.get)
     rejected = True
     for i, key in enumerate(order):
         rejected = rejected and alone[key] <= report.LEVEL / (len(order) - i)
-        assert (found[key].verdict != "not clear") == rejected
+        assert (result[key].verdict != "not clear") == rejected
     # The correction decides something here.
-    assert any(alone[key] <= report.LEVEL < found[key].p for key in order)
+    assert any(alone[key] <= report.LEVEL < result[key].p for key in order)
 
 
 def test_a_contrast_is_a_weighted_sum():
     data = scores(ours=5.0, other=1.0, calm=2.0)
     terms = (*difference("a", "ours", "other"), *difference("a", "other", "calm"))
-    (found,) = compare(data, {("x",): terms}).values()
+    (result,) = compare(data, {("x",): terms}).values()
     (same,) = compare(data, {("x",): difference("a", "ours", "calm")}).values()
-    assert (found.middle, found.low, found.high) == pytest.approx(
+    assert (result.middle, result.low, result.high) == pytest.approx(
         (same.middle, same.low, same.high)
     )
 
 
 def test_few_seeds_make_nothing_clear():
     few = {name: x[:3] for name, x in scores(high=9.0, low=0.0).items()}
-    (found,) = compare(few, family(("high", "low"))).values()
-    assert found.verdict == "not clear"
+    (result,) = compare(few, family(("high", "low"))).values()
+    assert result.verdict == "not clear"
     assert report.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
     # Nor does a seed that ended no episode.
     none = scores(high=9.0, low=0.0)
     none["a", "low"][0] = np.nan
-    (found,) = compare(none, family(("high", "low"))).values()
-    assert found.verdict == "not clear"
+    (result,) = compare(none, family(("high", "low"))).values()
+    assert result.verdict == "not clear"
     assert report.interval(np.arange(5.0)).startswith("2.0 [")
 
 

@@ -1,4 +1,4 @@
-"""What a search tries, and what it takes."""
+"""The points that a search tries, and the one that it chooses."""
 
 import collections
 import dataclasses

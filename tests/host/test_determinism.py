@@ -6,8 +6,15 @@ import numpy as np
 from test_resume import SMALL, finish, start
 
 BASE = (
-    *(*SMALL, "--agent", "ppo+gasil", "--total-steps", str(10 * 128)),
-    *("--seeds", "4", "--first-seed", "5"),
+    *SMALL,
+    "--agent",
+    "ppo+gasil",
+    "--total-steps",
+    str(10 * 128),
+    "--seeds",
+    "4",
+    "--first-seed",
+    "5",
 )
 
 # A batch of another size is vectorized in another order, so sums are rounded in

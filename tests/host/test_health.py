@@ -68,7 +68,7 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
     filled = int(after.good_trajectories.size[1])
     for leaf in (after.good_trajectories.observation, after.good_trajectories.return_):
         assert np.isfinite(leaf[1, :filled]).all()
-    # Of what it returned nothing is known.
+    # Its return is unknown.
     assert np.isnan(after.history.reward).sum(axis=(1, 2)).tolist() == [0, 1, 0, 0]
     # The others are what they were, bit for bit.
     others = np.array([0, 2, 3])
@@ -104,9 +104,24 @@ def test_an_update_that_is_not_finite_is_skipped_and_flagged():
 def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
     out = tmp_path / "out"
     arguments = (
-        *("--env", "point_mass", "--seeds", "2", "--total-steps", "256"),
-        *("--batch-steps", "128", "--num-envs", "4", "--minibatch-size", "32"),
-        *("--hidden-sizes", "8", "--num-epochs", "1", "--learning-rate", "1e38"),
+        "--env",
+        "point_mass",
+        "--seeds",
+        "2",
+        "--total-steps",
+        "256",
+        "--batch-steps",
+        "128",
+        "--num-envs",
+        "4",
+        "--minibatch-size",
+        "32",
+        "--hidden-sizes",
+        "8",
+        "--num-epochs",
+        "1",
+        "--learning-rate",
+        "1e38",
     )
     assert run.main([*arguments, "--out", str(out)]) == 0
     assert "warning: numbers that were not finite in seeds [0, 1]" in (
@@ -118,18 +133,18 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
 
 
 class Fragile:
-    """A line whose reward, and nothing else, is NaN beyond a place."""
+    """A line whose reward, and nothing else, is NaN beyond a certain position."""
 
     observation_size, action_size, episode_length = 1, 1, 20
 
     def reset(self, key):
-        place = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
-        return State(place, place, jnp.float32(0), jnp.float32(0))
+        position = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
+        return State(position, position, jnp.float32(0), jnp.float32(0))
 
     def step(self, state, action):
-        place = state.pipeline_state + 0.1 * action
-        reward = jnp.where(place[0] > 0.6, jnp.nan, -(place[0] ** 2))
-        return state.replace(pipeline_state=place, obs=place, reward=reward)
+        position = state.pipeline_state + 0.1 * action
+        reward = jnp.where(position[0] > 0.6, jnp.nan, -(position[0] ** 2))
+        return state.replace(pipeline_state=position, obs=position, reward=reward)
 
 
 @pytest.mark.parametrize("limit", [20, 15])

@@ -36,8 +36,13 @@ OPTIONS = [
     *names(gasil_jax.Config),
     *names(gasil_jax.Hyperparameters),
     *names(Settings),
-    *("seeds", "first_seed", "devices", "checkpoint_every", "keep_checkpoints"),
-    *("evaluate_every", "evaluate_episodes"),
+    "seeds",
+    "first_seed",
+    "devices",
+    "checkpoint_every",
+    "keep_checkpoints",
+    "evaluate_every",
+    "evaluate_episodes",
 ]
 NEVER_VALID = st.one_of(
     st.sampled_from(["-1", "-0.5", "nan", "inf", "-inf", "", "true", "1e999", "0x10"]),

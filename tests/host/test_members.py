@@ -1,4 +1,4 @@
-"""Members side by side, over devices."""
+"""Members are trained together, on one or several devices."""
 
 import jax
 import numpy as np

@@ -31,12 +31,40 @@ ITERATIONS, EVERY, EPISODES = 22, 5, 3
 SEEDS = (5, 6, 7)
 # Three members on two devices: one is padding.
 SMALL = (
-    *("--env", "point_mass", "--agent", "ppo", "--seeds", "3", "--first-seed", "5"),
-    *("--devices", "2", "--total-steps", str(ITERATIONS * 128), "--num-envs", "4"),
-    *("--batch-steps", "128", "--minibatch-size", "32", "--num-epochs", "1"),
-    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
-    *("--buffer-steps", "300", "--reward-delay", "7", "--learning-rate", "0.01"),
-    *("--checkpoint-every", str(8 * 128), "--keep-checkpoints", "99"),
+    "--env",
+    "point_mass",
+    "--agent",
+    "ppo",
+    "--seeds",
+    "3",
+    "--first-seed",
+    "5",
+    "--devices",
+    "2",
+    "--total-steps",
+    str(ITERATIONS * 128),
+    "--num-envs",
+    "4",
+    "--batch-steps",
+    "128",
+    "--minibatch-size",
+    "32",
+    "--num-epochs",
+    "1",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
+    "--buffer-steps",
+    "300",
+    "--reward-delay",
+    "7",
+    "--learning-rate",
+    "0.01",
+    "--checkpoint-every",
+    str(8 * 128),
+    "--keep-checkpoints",
+    "99",
 )
 # Rounded up to five iterations.
 EVALUATED = ("--evaluate-every", "600", "--evaluate-episodes", str(EPISODES))
@@ -44,7 +72,7 @@ TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
 
 
 class Collector:
-    """A tracker that keeps what it is given."""
+    """A tracker that keeps the scalars it gets."""
 
     taken: list = []  # noqa: RUF012
 
@@ -321,7 +349,7 @@ def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
     for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
         assert point["final_evaluation"] == pytest.approx(mean)
         assert point["final_length"] == 50.0
-    # A sweep's table that is cut short is told.
+    # A sweep's truncated table is reported.
     path = out / "programs" / "1" / "evaluations.csv"
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     assert sweep.main(["--resume", "--out", str(out)]) == 2

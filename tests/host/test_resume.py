@@ -1,4 +1,4 @@
-"""A run that ends before its time: nothing is lost, and it goes on bit for bit."""
+"""A run that is stopped early loses nothing, and continues bit for bit."""
 
 import json
 import os
@@ -24,11 +24,34 @@ from gasil_jax.host.members import make_batch
 ITERATIONS = 400
 # PPO's state, which has the buffer too, compiles soonest; every agent's: below.
 SMALL = (
-    *("--env", "point_mass", "--agent", "ppo", "--seeds", "3", "--devices", "2"),
-    *("--total-steps", str(ITERATIONS * 128), "--batch-steps", "128"),
-    *("--minibatch-size", "32", "--num-envs", "4", "--num-epochs", "1"),
-    *("--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
-    *("--buffer-steps", "300", "--reward-delay", "7", "--obs-noise", "0.1"),
+    "--env",
+    "point_mass",
+    "--agent",
+    "ppo",
+    "--seeds",
+    "3",
+    "--devices",
+    "2",
+    "--total-steps",
+    str(ITERATIONS * 128),
+    "--batch-steps",
+    "128",
+    "--minibatch-size",
+    "32",
+    "--num-envs",
+    "4",
+    "--num-epochs",
+    "1",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
+    "--buffer-steps",
+    "300",
+    "--reward-delay",
+    "7",
+    "--obs-noise",
+    "0.1",
 )
 OFTEN = ("--checkpoint-every", str(20 * 128))
 
@@ -79,7 +102,7 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
     root = out / "checkpoints"
     new = lambda: set(checkpoints(out)) - before
 
-    # Before the first save: begun anew.
+    # A run that was killed before its first checkpoint starts again.
     before = set()
     child = start(out, *SMALL, "--checkpoint-every", str(10**9))
     wait_for(lambda: rows(out) > 30, child)
@@ -229,10 +252,10 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_pat
     for i, state in enumerate(states):
         checkpoint.write(root, i, state, {"score": None})
     damage(root / "00000002")
-    found, damages = checkpoint.latest(root)
-    assert found.iteration == 1
+    newest, damages = checkpoint.latest(root)
+    assert newest.iteration == 1
     assert len(damages) == 1 and "00000002 is damaged" in damages[0]
-    np.testing.assert_array_equal(found.restore(states[1])["x"], states[1]["x"])
+    np.testing.assert_array_equal(newest.restore(states[1])["x"], states[1]["x"])
     # Written again, it is whole.
     checkpoint.write(root, 2, states[2], {"score": None})
     assert checkpoint.latest(root)[0].iteration == 2
@@ -285,8 +308,8 @@ def test_a_full_disk_in_mid_run_leaves_the_last_checkpoint(whole, tmp_path):
     status, _, err = finish(child)
     assert status == 1, err
     assert err.splitlines()[-1].startswith("error: ") and "Traceback" not in err
-    found, damages = checkpoint.latest(out / "checkpoints")
-    assert found is not None and damages == []
+    newest, damages = checkpoint.latest(out / "checkpoints")
+    assert newest is not None and damages == []
     status, _, err = finish(start(out, "--resume"))
     assert status == 0, err
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
@@ -324,9 +347,9 @@ def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
     states, _ = runs.train(advance, states, 0, 1)
     states, _ = runs.train(advance, states, 1, 1)
     checkpoint.write(tmp_path, 2, runs.trim(states), {})
-    found, _ = checkpoint.latest(tmp_path)
+    newest, _ = checkpoint.latest(tmp_path)
     like = jax.eval_shape(lambda: runs.trim(runs.init()))
-    for before in (states, runs.place(found.restore(like))):
+    for before in (states, runs.place(newest.restore(like))):
         after, metrics = runs.train(advance, before, 2, 1)
         after, more = runs.train(advance, after, 3, 1)
         after = jax.tree.leaves(runs.trim(after))

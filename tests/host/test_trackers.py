@@ -12,10 +12,26 @@ from gasil_jax.host import progress, run_options, trackers
 from gasil_jax.sweeps import assembly
 
 SMALL = (
-    *("--env", "point_mass", "--seeds", "2", "--first-seed", "3"),
-    *("--total-steps", "512", "--batch-steps", "128", "--num-envs", "4"),
-    *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
-    *("--discriminator-hidden-sizes", "8"),
+    "--env",
+    "point_mass",
+    "--seeds",
+    "2",
+    "--first-seed",
+    "3",
+    "--total-steps",
+    "512",
+    "--batch-steps",
+    "128",
+    "--num-envs",
+    "4",
+    "--num-epochs",
+    "1",
+    "--minibatch-size",
+    "32",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
 )
 
 
@@ -48,10 +64,10 @@ def test_the_means_and_the_members_are_given():
 
 def test_a_run_in_tensorboard(tmp_path, monkeypatch):
     pytest.importorskip("tensorboardX")
-    out, said = tmp_path / "out", []
+    out, phases = tmp_path / "out", []
 
     def announced(title, name):
-        said.append(name)
+        phases.append(name)
         return contextlib.nullcontext()
 
     for module in (run, run_options, assembly, progress):
@@ -68,8 +84,8 @@ def test_a_run_in_tensorboard(tmp_path, monkeypatch):
     # Episodes of 50 steps end in every second iteration.
     for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
         assert content.count(name) == 2
-    # What a run does before, beside and after training is said.
-    assert said == [
+    # The phases before, during and after training are shown.
+    assert phases == [
         "building the environment",
         "starting the devices",
         "starting the trackers",
@@ -114,8 +130,8 @@ def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(wandb, "init", refuse)
     out = ("--out", str(tmp_path / "out"))
     assert run.main([*SMALL, "--log", "wandb", *out]) == 2
-    *_, told = capsys.readouterr().err.splitlines()
-    assert "error: log is 'wandb', which says: No API key configured." in told
+    *_, message = capsys.readouterr().err.splitlines()
+    assert "error: log is 'wandb', which says: No API key configured." in message
 
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):

@@ -86,10 +86,10 @@ def train(folder, shard=None, *arguments):
         programs = shards.share(programs, shards.parse(shard))
     run_options.write_config(options, folder, points=points)
     for program in programs:
-        place = program.folder(folder)
-        place.mkdir(parents=True)
+        program_folder = program.folder(folder)
+        program_folder.mkdir(parents=True)
         labels = dict(zip(tables.LABELS, zip(*program.members)))
-        writer = metrics_files.MetricsWriter(place / "metrics.csv", labels)
+        writer = metrics_files.MetricsWriter(program_folder / "metrics.csv", labels)
         steps = np.array([100.0, 200.0, 300.0])
         value = np.array([[10.0 * i + seed] for i, seed in program.members]) + steps
         zero = np.zeros_like(value)
@@ -167,13 +167,13 @@ def test_what_does_not_belong_together_is_not_merged(tmp_path, capsys):
     assert "several folders need --out" in refused(first.folder, second)
     assert "1/3 is there twice" in refused(out, copy(first.folder), "--out", tmp_path)
     # Begun and killed; then cut short while it was copied.
-    place = trained.programs[0].folder(second)
-    training = place / "training.json"
+    program_folder = trained.programs[0].folder(second)
+    training = program_folder / "training.json"
     kept = training.read_text()
     training.unlink()
     assert "not finished: shards 2/3" in refused(out)
     training.write_text(kept)
-    metrics = place / "metrics.csv"
+    metrics = program_folder / "metrics.csv"
     content = metrics.read_bytes()
     rows = content.splitlines(keepends=True)
     for part in (rows[:-1], rows[: 1 + len(trained.programs[0].members)], []):
@@ -231,7 +231,7 @@ def program(tmp_path, monkeypatch):
             if what == "killed" and tries < 2:
                 os.kill(os.getpid(), signal.SIGKILL)
             if what == "waits":
-                signal.signal(signal.SIGTERM, lambda *_: (folder / "told").touch())
+                signal.signal(signal.SIGTERM, lambda *_: (folder / "signalled").touch())
                 os.kill(os.getppid(), signal.SIGTERM)
                 signal.pause()
             sys.exit(2 if what == "refused" else 0)
@@ -260,7 +260,7 @@ def test_a_signal_reaches_the_job_and_ends_the_launch(program, tmp_path):
     with pytest.raises(Interrupted) as interrupted:
         launch.run_locally(program, {"waits": [str(folder), "waits"]}, None)
     assert interrupted.value.signal == signal.SIGTERM
-    assert (folder / "told").exists()
+    assert (folder / "signalled").exists()
 
 
 def test_a_launcher_that_is_not_installed_is_named(monkeypatch):

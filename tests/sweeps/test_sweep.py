@@ -1,4 +1,4 @@
-"""Sweeps: what runs, what is refused, and that a point is what it is alone."""
+"""Sweeps: which run, which are refused; a point's results are those of a single run."""
 
 import csv
 import json
@@ -20,9 +20,22 @@ from gasil_jax.sweeps import saved_states, shards, tables
 from gasil_jax.sweeps.points import PAPER_RANGES
 
 SMALL = (
-    *("--env", "point_mass", "--total-steps", "512", "--batch-steps", "256"),
-    *("--num-envs", "4", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
-    *("--num-epochs", "2", "--buffer-steps", "300"),
+    "--env",
+    "point_mass",
+    "--total-steps",
+    "512",
+    "--batch-steps",
+    "256",
+    "--num-envs",
+    "4",
+    "--hidden-sizes",
+    "8",
+    "--discriminator-hidden-sizes",
+    "8",
+    "--num-epochs",
+    "2",
+    "--buffer-steps",
+    "300",
 )
 
 
@@ -158,10 +171,10 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     more = ("--discriminator-updates", "3", "--out", str(alone))
     assert run.main([*SMALL, "--seeds", "2", *more]) == 0
     expected = json.loads((alone / "summary.json").read_text())["final_return"]
-    found = {
+    result = {
         row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
     }
-    assert found == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    assert result == pytest.approx(expected, rel=1e-3, abs=1e-3)
     _, config, seeds, states = saved_states.load(out, point=1)
     assert config.hyperparameters.discriminator_updates == 3 and seeds == [0, 1]
     _, _, _, by_itself = saved_states.load(alone)

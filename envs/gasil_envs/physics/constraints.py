@@ -1,12 +1,14 @@
 """Joint limits and contacts as one-sided constraints for `newton`.
 
-The numbers are those of MJX's rows (``mjx.make_constraint``), which are C MuJoCo's;
-what does not depend on the state is worked out once, in NumPy. Two things differ from
-MJX. The tangent of a capsule on a plane is the capsule's axis however steep it is, as
-in C MuJoCo; MJX takes a fixed one above 60 degrees, and the pyramidal friction cone,
-and with it the motion, depends on the tangent. And in a model that can only move in a
-plane the tangent across the plane is left out: nothing moves along it, so the two
-edges that it would make are the normal, twice.
+The numbers are those of MJX's rows (``mjx.make_constraint``), which are C MuJoCo's.
+Everything that does not depend on the state is computed once, in NumPy. Two things
+differ from MJX:
+
+- The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
+  C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
+  therefore the motion, depends on the tangent.
+- In a model that can only move in a plane, the tangent across the plane is left out.
+  Nothing moves along it, so its two edges would both equal the normal.
 """
 
 import dataclasses
@@ -21,7 +23,7 @@ from mujoco import mjx
 from gasil_envs.physics import newton
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
-# Edges of normal +- tangent, and the normal with twice the weight.
+# The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1,), (-1,), (0,))
 
 #: Joint types with one degree of freedom.
@@ -34,7 +36,7 @@ _PLANE_AND_CAPSULE = [
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Impedance:
-    """MuJoCo's solref and solimp of some constraints, (n,) each, worked out.
+    """The coefficients that follow from MuJoCo's solref and solimp, (n,) each.
 
     See https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters.
     """
@@ -69,13 +71,18 @@ class Impedance:
                 damping_ratio > 0, 2 / (highest * safe), -damping_ratio / highest
             )
         arrays = (
-            *(stiffness, damping, lowest, highest),
-            *(np.maximum(width, mujoco.mjMINVAL), midpoint, np.maximum(power, 1.0)),
+            stiffness,
+            damping,
+            lowest,
+            highest,
+            np.maximum(width, mujoco.mjMINVAL),
+            midpoint,
+            np.maximum(power, 1.0),
         )
         return cls(*(x.astype(np.float32) for x in arrays))
 
     def __call__(self, distance: jax.Array) -> jax.Array:
-        """The impedance d(r), in (0, 1), at each distance: (n,) -> (n,)."""
+        """Return the impedance d(r), in (0, 1), at each distance: (n,) -> (n,)."""
         x = jnp.abs(distance) / self.width
         below = _power(x, self.power) / self.midpoint ** (self.power - 1)
         above = 1.0 - _power(jnp.maximum(1.0 - x, 0.0), self.power) / (
@@ -108,9 +115,10 @@ class Limits:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Contacts:
-    """Possible contacts of one condim; `index` is their place in MJX's contacts.
+    """The possible contacts with the same condim.
 
-    `edges` are those of `newton.Contacts`. `mask` (n, nv) is 1 where a degree of
+    `edges` are those of `newton.Contacts`, and `index` (n,) are the contacts' indices
+    in MJX's contacts. `mask` (n, nv) is 1 where a degree of
     freedom moves the second body, -1 where it moves the first and 0 where it moves both
     or none; `root` is the body whose subtree's centre of mass the motion is expressed
     about.
@@ -127,13 +135,13 @@ class Contacts:
 
 
 class Layout(NamedTuple):
-    """All that is known of a model's constraint rows before the state is.
+    """The parts of a model's constraint rows that do not depend on the state.
 
     Attributes:
-      limits: of joints.
-      contacts: by condim.
-      capsule_on_plane: (2, n), which of MJX's contacts are of a capsule on a plane,
-        and the capsule's geom.
+      limits: the limits of joints.
+      contacts: a group of contacts for each condim.
+      capsule_on_plane: (2, n), indices in MJX's contacts of those between a capsule
+        and a plane, and the capsules' geoms.
       plane: (3,), the normal of the plane that all motion is in, or None.
     """
 
@@ -144,7 +152,7 @@ class Layout(NamedTuple):
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
-    """Why `layout` can't describe this model, or None."""
+    """Return why `layout` can't describe this model, or None if it can."""
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return "its friction cones are elliptic"
     if model.neq:
@@ -167,7 +175,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 
 
 def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
-    """Work out everything that does not depend on the state."""
+    """Compute everything that does not depend on the state."""
     limited = np.flatnonzero(model.jnt_limited)
     dof = model.jnt_dofadr[limited]
     limits = Limits(
@@ -204,7 +212,7 @@ def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
 
 
 def _plane(model: mujoco.MjModel) -> np.ndarray | None:
-    """The normal of the plane that all of the model's motion is in, or None."""
+    """Return the normal of the plane that contains all motion, or None if none does."""
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
@@ -252,7 +260,7 @@ def _contacts(
 def make(
     layout: Layout, data: mjx.Data
 ) -> tuple[newton.Limits, tuple[newton.Contacts, ...]]:
-    """The constraints at the state of `data`, after MJX's collision."""
+    """Return the constraints at the state of `data`, after MJX's collision."""
     return (
         _make_limits(layout.limits, data),
         tuple(_make_contacts(group, layout.plane, data) for group in layout.contacts),
@@ -260,7 +268,7 @@ def make(
 
 
 def row_forces(layout: Layout, solution: newton.Solution) -> jax.Array:
-    """The forces in the rows and the order that MJX and C MuJoCo have them in, (R,)."""
+    """Return the forces of all rows in the order of MJX and C MuJoCo, (R,)."""
     forces = [solution.limit_force[layout.limits.dof]]
     for group, force in zip(layout.contacts, solution.edge_forces, strict=True):
         if group.edges == _FLAT_PYRAMID:
@@ -286,15 +294,15 @@ def _make_limits(limits: Limits, data: mjx.Data) -> newton.Limits:
     pull = limits.impedance.stiffness * impedance * distance
     damp = limits.impedance.damping * sign * data.qvel[limits.dof]
     of_limit = (sign, -damp - pull, _weight(impedance, limits.inverse_weight))
-    # Each limit in the place of its degree of freedom, without a scatter.
-    place = np.full(data.qvel.shape[0], limits.dof.size)
-    place[limits.dof] = np.arange(limits.dof.size)
-    spread = lambda x: jnp.concatenate([x, jnp.zeros(1, jnp.float32)])[place]
+    # Put each limit at the index of its degree of freedom, without a scatter.
+    index = np.full(data.qvel.shape[0], limits.dof.size)
+    index[limits.dof] = np.arange(limits.dof.size)
+    spread = lambda x: jnp.concatenate([x, jnp.zeros(1, jnp.float32)])[index]
     return newton.Limits(*map(spread, of_limit))
 
 
 def align_frames(layout: Layout, data: mjx.Data) -> mjx.Data:
-    """Contact frames as C MuJoCo chooses them, after MJX's collision."""
+    """Return `data` with the contact frames that C MuJoCo chooses, after collision."""
     index, capsule = layout.capsule_on_plane
     if not index.size:
         return data

@@ -22,14 +22,14 @@ _JOINT_TRANSMISSION = [
 
 
 class Dynamics(NamedTuple):
-    """A model, and what of it does not depend on the state.
+    """A model, and the parts of its dynamics that do not depend on the state.
 
     Attributes:
-      model: MJX's.
-      layout: of the constraints.
+      model: MJX's model.
+      layout: layout of the constraints.
       motor: (nu, nv), generalized force of one unit of control.
-      control_range: (2, nu).
-      iterations: of the solver.
+      control_range: (2, nu), lowest and highest control.
+      iterations: number of iterations of the solver.
     """
 
     model: mjx.Model
@@ -40,7 +40,7 @@ class Dynamics(NamedTuple):
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
-    """Why `make` can't take this model, or None."""
+    """Return why `make` does not support this model, or None if it does."""
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
     if model.opt.integrator not in integrators:
         return "its integrator is neither Euler nor RK4"
@@ -62,7 +62,7 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 
 
 def make(model: mujoco.MjModel, mjx_model: mjx.Model, iterations: int = 4) -> Dynamics:
-    """Work out what does not depend on the state, for a supported model."""
+    """Compute what does not depend on the state, for a supported model."""
     motor = np.zeros((model.nu, model.nv), np.float32)
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
     motor[np.arange(model.nu), dof] = (
@@ -80,14 +80,14 @@ def make(model: mujoco.MjModel, mjx_model: mjx.Model, iterations: int = 4) -> Dy
 
 
 def step(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
-    """Advance one time step; what is derived in `data` is of the last evaluation."""
+    """Advance one time step; derived fields of `data` are of the last evaluation."""
     if dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
         return _runge_kutta(dynamics, data)
     return _euler(dynamics.model, forward(dynamics, data))
 
 
 def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
-    """Accelerations and forces at the positions, velocities and controls of `data`."""
+    """Compute accelerations and forces from positions, velocities and controls."""
     model = dynamics.model
     data = mjx.kinematics(model, data)
     data = mjx.com_pos(model, data)
@@ -182,7 +182,7 @@ def _runge_kutta(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     """Classical Runge-Kutta of order 4.
 
     The first evaluation, at the state itself, is a stage of the loop too, so that
-    `forward`, most of what a physics step compiles, is compiled once.
+    `forward`, the largest part of the program, is compiled only once.
     """
     model = dynamics.model
     dt = model.opt.timestep
@@ -191,7 +191,7 @@ def _runge_kutta(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     def stage(carry: Any, coefficients: Any) -> Any:
         data, velocity_sum, acceleration_sum = carry
         ahead, weight = coefficients
-        # Both at once: the position moves with the velocity of the stage before.
+        # Both are replaced at once: positions use the velocity of the previous stage.
         position = _integrate_positions(model, qpos, ahead * data.qvel)
         data = data.replace(qpos=position, qvel=qvel + dt * ahead * data.qacc)
         data = forward(dynamics, data)

@@ -1,21 +1,21 @@
-"""What an environment asks of a physics engine."""
+"""The interface between environments and physics engines."""
 
 from typing import Protocol
 
 import jax
 from flax import struct
 
-#: Arrays of MuJoCo's ``mjData`` by their name there, float32.
+#: Arrays of MuJoCo's ``mjData`` by their names, float32.
 Fields = dict[str, jax.Array]
 
 
 class PhysicsState(struct.PyTreeNode):
-    """All that a later step depends on, so that replacing it resets everything.
+    """The complete state of a simulation: everything that the next step depends on.
 
     Attributes:
       qpos: positions, float32 (nq,).
       qvel: velocities, float32 (nv,).
-      qacc_warmstart: where the constraint solver starts, float32 (nv,).
+      qacc_warmstart: initial guess of the constraint solver, float32 (nv,).
     """
 
     qpos: jax.Array
@@ -24,16 +24,16 @@ class PhysicsState(struct.PyTreeNode):
 
 
 class Physics(Protocol):
-    """Steps one model. Pure functions: jit them, and `jax.vmap` them for many.
+    """Steps one model with pure functions, which work under `jax.jit` and `jax.vmap`.
 
-    Which fields of ``mjData`` are given is chosen when it is built.
+    The constructor takes the names of the ``mjData`` arrays that are returned.
     """
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
+        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
 
     def kinematics(self, state: PhysicsState) -> Fields:
-        """The fields at `state`; forces are 0."""
+        """Return the fields at `state`, with all forces 0."""
 
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
@@ -41,5 +41,5 @@ class Physics(Protocol):
         """Advance `frame_skip` time steps under one control (nu,).
 
         As in MuJoCo, the fields belong to the last evaluation of the dynamics, not to
-        the new state. Physics that fails gives a state that is not finite.
+        the new state. If the physics fails, the new state is not finite.
         """

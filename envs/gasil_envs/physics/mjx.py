@@ -15,7 +15,7 @@ from gasil_envs.precision import full_precision
 
 _LOGGER = logging.getLogger(__name__)
 
-#: What `MjxPhysics` takes as `solver`.
+#: The solvers that `MjxPhysics` offers.
 SOLVERS = ("small", "mjx")
 
 _FIELDS: dict[str, Callable[[mjx.Data], jax.Array]] = {
@@ -33,15 +33,15 @@ class MjxPhysics:
 
     Args:
       model: the model; its solver options are overwritten.
-      fields: names of the ``mjData`` arrays that are given.
-      solver: "small" takes our constraint rows and Newton's method for small dense
-        problems (`dynamics`), or, for a model that these can't take, falls back to
-        "mjx" with a warning in the log; "mjx" takes MJX's own step.
-      iterations: Newton iterations, of both solvers.
-      ls_iterations: line-search steps of MJX's solver. Float32 never meets the
-        tolerance that is tuned for float64, so MuJoCo's 100 iterations would all be
-        spent; with 4 and 8 the result is the same (relative error against C MuJoCo
-        6e-7 on walker2d).
+      fields: names of the ``mjData`` arrays to return.
+      solver: "small" uses our constraint rows and our Newton's method for small dense
+        problems (`dynamics`). For a model that these do not support it falls back to
+        "mjx" and logs a warning. "mjx" uses MJX's own step.
+      iterations: Newton iterations of either solver.
+      ls_iterations: line-search steps of MJX's solver. Float32 never meets MuJoCo's
+        tolerance, which is meant for float64, so that all of its 100 iterations would
+        run. 4 and 8 give the same result (relative error against C MuJoCo 6e-7 on
+        walker2d).
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class MjxPhysics:
     ):
         model.opt.iterations = iterations
         model.opt.ls_iterations = ls_iterations
-        # humanoid.xml asks for PGS, which MJX lacks.
+        # humanoid.xml specifies PGS, which MJX does not have.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         self._fields = tuple(fields)
         self._mjx_model = mjx.put_model(model)
@@ -69,7 +69,7 @@ class MjxPhysics:
             self._step = functools.partial(mjx.step, self._mjx_model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
+        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     def _data(self, state: PhysicsState) -> mjx.Data:
@@ -82,7 +82,7 @@ class MjxPhysics:
 
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
-        """The fields at `state`; forces are 0."""
+        """Return the fields at `state`, with all forces 0."""
         data = mjx.kinematics(self._mjx_model, self._data(state))
         data = mjx.com_pos(self._mjx_model, data)
         return self._pick(mjx.com_vel(self._mjx_model, data))

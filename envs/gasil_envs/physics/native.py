@@ -1,9 +1,9 @@
 """MuJoCo physics in C, on the host's cores, from inside a jitted program.
 
-One host call advances every environment of a device: `jax.pure_callback`, with the
-batch axes of all `jax.vmap`s around it. The callback is a function of its arguments
-alone and touches NumPy only; a JAX operation inside could deadlock. A simulation in
-which MuJoCo raises an error or a warning comes back as NaN, which ends its episode.
+A single host call by `jax.pure_callback`, with the batch axes of all `jax.vmap`s around
+it, advances every environment of a device. The callback depends on its arguments alone
+and uses NumPy only, because a JAX operation inside could deadlock. If MuJoCo raises an
+error or a warning in a simulation, its result is NaN, which ends its episode.
 """
 
 import collections
@@ -25,21 +25,21 @@ from gasil_envs.physics.mjx import MjxPhysics
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 
-# JAX copies a host call's arguments with the threads that its CPU devices compute on.
-# Before jax 0.12 large ones wait for ever if every thread is a device inside a call.
+# JAX copies a host call's arguments on the threads that its CPU devices compute with.
+# Before jax 0.12 copies of large arguments wait for ever if all threads are in calls.
 _POOL_SIZE = "PJRT_NPROC"
 _NEEDS_THREADS = tuple(map(int, jax.__version__.split(".")[:2])) < (0, 12)
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def reserve_threads(num_devices: int) -> None:
-    """Let `num_devices` CPU devices make host calls at once; before JAX starts."""
+    """Let `num_devices` CPU devices make host calls at once; call before JAX starts."""
     if _NEEDS_THREADS and num_devices > 1:
         os.environ.setdefault(_POOL_SIZE, str(2 * num_devices))
 
@@ -56,16 +56,25 @@ def _check_threads() -> None:
 
 
 class _Simulations(Protocol):
-    """Room for a fixed number of simulations; used by one thread at a time."""
+    """A fixed number of simulations, for use by one thread at a time."""
 
     def step(
         self, inputs: dict[str, np.ndarray], frame_skip: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """From state and "ctrl" to state and fields, (n, ...) each, and faults (n,)."""
+        """Advance all simulations.
+
+        Args:
+          inputs: arrays of the state and "ctrl", (n, ...) each.
+          frame_skip: number of time steps.
+
+        Returns:
+          Arrays of the state and the fields, (n, ...) each, and whether each
+          simulation failed, bool (n,).
+        """
 
 
 class _BatchSimulations:
-    """On MuJoCo's own `mujoco.batch.Batch`, which gives states alone."""
+    """Simulations with MuJoCo's own `mujoco.batch.Batch`, which returns no fields."""
 
     def __init__(self, model: mujoco.MjModel, count: int, threads: int):
         self._batch = mujoco.batch.Batch(model, count, threads)
@@ -88,9 +97,10 @@ class _BatchSimulations:
 
 
 class _ThreadedSimulations:
-    """A thread and an `mujoco.MjData` for each share; gives contact forces too.
+    """Simulations with a thread and an `mujoco.MjData` for each share of them.
 
-    `Batch` has none: ``cfrc_ext`` takes ``mj_rnePostConstraint`` after the step.
+    They return fields, also contact forces, which `Batch` can't: ``cfrc_ext`` needs
+    ``mj_rnePostConstraint`` after the step.
     """
 
     def __init__(
@@ -146,9 +156,9 @@ class MujocoPhysics:
 
     Args:
       model: the model, with its own solver and integrator.
-      fields: names of the ``mjData`` arrays that are given.
-      threads: of one host call; default the cores that this process may use, shared
-        by the local devices of JAX's default backend.
+      fields: names of the ``mjData`` arrays to return.
+      threads: number of threads of one host call; default the cores that this process
+        may use, divided by the local devices of JAX's default backend.
     """
 
     def __init__(
@@ -160,17 +170,19 @@ class MujocoPhysics:
         self._model, self._fields, self._threads = model, tuple(fields), threads
         shape = lambda name: getattr(mujoco.MjData(model), name).shape
         self._shapes = {name: shape(name) for name in (*_STATE, *self._fields)}
-        # By number of simulations. Devices call at the same time, each takes its own.
+        # By number of simulations. Devices call at the same time, and each call takes
+        # its own simulations.
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
-        # Starts are drawn far more often than they are used: no host call for them.
+        # Initial states are computed far more often than they are used, so MJX computes
+        # them without a host call.
         self._at_start = MjxPhysics(copy.copy(model), fields, solver="mjx")
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """The state at rest in the solver: (nq,), (nv,) -> `PhysicsState`."""
+        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return self._at_start.init(qpos, qvel)
 
     def kinematics(self, state: PhysicsState) -> Fields:
-        """The fields at `state`; forces are 0."""
+        """Return the fields at `state`, with all forces 0."""
         return self._at_start.kinematics(state)
 
     def step(
@@ -190,7 +202,10 @@ class MujocoPhysics:
         result = jax.pure_callback(
             on_host,
             shapes,
-            *(state.qpos, state.qvel, state.qacc_warmstart, control),
+            state.qpos,
+            state.qvel,
+            state.qacc_warmstart,
+            control,
             vmap_method="broadcast_all",
         )
         state = PhysicsState(*(result[name] for name in _STATE))
@@ -213,7 +228,7 @@ class MujocoPhysics:
         values, failed = simulations.step(inputs, frame_skip)
         results = {}
         for name, shape in self._shapes.items():
-            # A copy, before the next caller takes these simulations.
+            # Copied before the next caller may use these simulations.
             result = np.array(values[name], np.float32)
             result[failed] = np.nan
             results[name] = result.reshape(batch + shape)

@@ -17,11 +17,11 @@ E the small constant matrix that makes edges of normal and tangents, J = E B, an
 
     J q = E (B q),    J' diag(w) J = B' (E' diag(w) E) B,
 
-where B has 2 or 3 rows a contact where J has 4. Of the contacts that are possible the
-solver is given those in play, as long as these are few.
+where B has 2 or 3 rows for each contact and J has 4. If only a few of the possible
+contacts are in play, the solver is given only these.
 
-Not reverse-mode differentiable (MJX's own solver is not either, its loop being
-dynamic).
+It is not reverse-mode differentiable. Neither is MJX's own solver, because its loop is
+dynamic.
 """
 
 import functools
@@ -32,16 +32,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Shape letters: V degrees of freedom, B batch; of a group of contacts that are alike:
-# C contacts, T tangents, E edges.
+# Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
+# same number of edges: C contacts, T tangents, E edges.
 
 
 class Contacts(struct.PyTreeNode):
-    """Contacts that have as many edges each; float32.
+    """A group of contacts with the same number of edges; float32.
 
     Attributes:
       normal: (C, V), Jacobian of the normal; zero where out of play.
-      tangents: (C, T, V), of the tangents, times the friction.
+      tangents: (C, T, V), Jacobian of the tangents, times the friction.
       reference: (C, E), aref of the edges.
       weight: (C, E), D of the edges; 0 where out of play and above 0 elsewhere.
       edges: E rows of T signs: an edge is normal + signs @ tangents.
@@ -69,14 +69,14 @@ class Limits(struct.PyTreeNode):
 
 
 class Problem(struct.PyTreeNode):
-    """Constrained dynamics of one instant; float32.
+    """The constrained dynamics of one instant; float32.
 
     Attributes:
       inertia: (V, V), the joint-space inertia M.
       force: (V,), all forces but the constraints': M qacc_smooth.
-      warmstart: (V,), where to start if that is better than qacc_smooth.
-      limits: of the joints.
-      contacts: groups of them.
+      warmstart: (V,), initial guess, used if it is better than qacc_smooth.
+      limits: the limits of the joints.
+      contacts: groups of contacts.
     """
 
     inertia: jax.Array
@@ -87,7 +87,7 @@ class Problem(struct.PyTreeNode):
 
 
 class Solution(struct.PyTreeNode):
-    """What the constraints do.
+    """The accelerations and the forces of the constraints; float32.
 
     Attributes:
       qacc: (V,), acceleration.
@@ -105,7 +105,7 @@ class Solution(struct.PyTreeNode):
 
 
 def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
-    """Solve one problem; `jax.vmap` it for many, nested as deep as needed."""
+    """Solve one problem; use `jax.vmap`, nested if needed, for many."""
     function = functools.partial(_solve, iterations, line_search)
     batched = _batch_last(
         _in_tiles(functools.partial(_without_idle_contacts, function))
@@ -115,13 +115,13 @@ def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Soluti
 
 
 def linear_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """x of A x = b for symmetric positive A: (V, V), (V,) -> (V,); `jax.vmap` it."""
+    """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,)."""
     batched = _batch_last(lambda pair: _eliminate(*pair))
     return batched((matrix[..., None], right[..., None]))[..., 0]
 
 
 def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """`function` of a tree with trailing batch axes, vmapped by making them longer."""
+    """Make `jax.vmap` extend the trailing batch axis of a function's arrays."""
     function = jax.custom_batching.custom_vmap(function)
 
     @function.def_vmap
@@ -146,12 +146,12 @@ def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return function
 
 
-# With more problems at once than this a CPU's caches do not hold what they work on.
+# A CPU's caches hold the data of no more problems than this.
 _MOST_IN_A_TILE = 64
 
 
 def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """`function` of arrays with a trailing batch, on a CPU a part of it at a time."""
+    """Make a function of arrays with a trailing batch run in parts on a CPU."""
 
     def in_tiles(tree: Any) -> Any:
         batch = jax.tree.leaves(tree)[0].shape[-1]
@@ -166,20 +166,20 @@ def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return in_tiles
 
 
-# Bodies touch little of what they could: humanoid has 138 possible contacts and, short
-# of lying on the floor with its arms folded, no more than 8 of a kind at once.
+# Few of the possible contacts are in play at once: humanoid has 138 possible contacts,
+# and no more than 8 in play in any group unless it lies with folded arms.
 _MOST_IN_PLAY = 8
-# A GPU's host looks at every decision: that pays from this many possible contacts on.
+# On a GPU a decision needs the host, which pays from this many possible contacts on.
 _FEWEST_WORTH_A_DECISION = 20
 
 
 def _without_idle_contacts(
     solve: Callable[[Problem, bool], Solution], problem: Problem
 ) -> Solution:
-    """Solve problems, batch last, with the contacts in play moved together.
+    """Solve problems, batch last, with only the contacts that are in play.
 
-    Where one of them has more of these than there is room for, all are solved as they
-    are, which is rare enough to be compiled for brevity.
+    If one of the problems has more than `_MOST_IN_PLAY` in a group, all are solved with
+    all contacts. This is rare, so that program is compiled for size and not for speed.
     """
     large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
     most = max((x.normal.shape[0] for x in large), default=0)
@@ -201,14 +201,19 @@ def _without_idle_contacts(
 def _together(
     contacts: Contacts,
 ) -> tuple[Contacts, Callable[[jax.Array], jax.Array]]:
-    """The contacts in play in `_MOST_IN_PLAY` places, and how their forces go back."""
+    """Gather the contacts in play into `_MOST_IN_PLAY` slots.
+
+    Returns:
+      The gathered contacts, and a function that puts their forces (P, ...) back at the
+      indices of all contacts (C, ...).
+    """
     num_contacts = contacts.normal.shape[0]
     if num_contacts <= _MOST_IN_PLAY:
         return contacts, lambda forces: forces
     in_play = contacts.weight[:, 0] > 0  # (C, B)
-    place = jnp.cumsum(in_play, axis=0, dtype=jnp.int32) - 1
+    slot = jnp.cumsum(in_play, axis=0, dtype=jnp.int32) - 1
     number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
-    chosen = in_play & (place == jnp.arange(_MOST_IN_PLAY)[:, None, None])  # (P, C, B)
+    chosen = in_play & (slot == jnp.arange(_MOST_IN_PLAY)[:, None, None])  # (P, C, B)
     index = jnp.max(jnp.where(chosen, number, -1), axis=1)  # (P, B), -1 for none
 
     def move(x: jax.Array) -> jax.Array:
@@ -217,14 +222,14 @@ def _together(
         return jnp.where(at < 0, 0.0, moved)
 
     def restore(forces: jax.Array) -> jax.Array:
-        at = jnp.clip(place, 0, _MOST_IN_PLAY - 1)[:, None]
+        at = jnp.clip(slot, 0, _MOST_IN_PLAY - 1)[:, None]
         return jnp.where(in_play[:, None], jnp.take_along_axis(forces, at, axis=0), 0.0)
 
     return jax.tree.map(move, contacts), restore
 
 
 # XLA's CPU backend fuses a chain of elementwise operations into each of its users and
-# computes it anew there; where many read one value, it has to be told to store it.
+# computes it again in each. A value with many users must be stored explicitly.
 _materialize = jax.lax.optimization_barrier
 
 
@@ -232,11 +237,11 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
     return jnp.sum(a * b, axis=0)
 
 
-# Above this many entries of a matrix, sums are left to reductions: spelled out they
-# are up to 4 times as fast, but the time to compile them grows with the entries, on a
-# GPU faster (ant: 89 s for MJX's 20).
+# Sums over matrices with more entries than this are left to reductions. Spelled out
+# they are up to 4 times as fast, but their compile time grows with the entries, on a
+# GPU more steeply (ant: 89 s instead of MJX's 20).
 _MOST_ENTRIES_SPELLED_OUT = {"cpu": 1100, "gpu": 300}
-# Of these systems a GPU's compiler unrolls the loops in bearable time.
+# A GPU's compiler unrolls the loops of systems up to this size in acceptable time.
 _MOST_DEGREES_UNROLLED = 10
 
 
@@ -250,7 +255,7 @@ def _spells_out(matrix: jax.Array) -> bool:
 
 
 def _sum(terms: Iterable[jax.Array]) -> jax.Array:
-    # Of one term or more, which `sum`'s type does not know.
+    # There is at least one term, which the type of `sum` does not express.
     return cast(jax.Array, sum(terms))
 
 
@@ -271,7 +276,7 @@ def _matvec_transposed(
 
 
 def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> jax.Array:
-    """left' right, known to be symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
+    """Return left' right, if it is symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
     num_rows, size, _ = left.shape
     if not spell_out:
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
@@ -293,7 +298,7 @@ def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> ja
 class _Rows:
     """The constraint matrix J of a `Problem` whose batch is the last axis.
 
-    A vector of one number a row is a list: (V, B) for the limits, and (E, C, B) for
+    A vector with one number per row is a list: (V, B) for the limits, and (E, C, B) for
     each group of contacts.
     """
 
@@ -310,7 +315,7 @@ class _Rows:
             problem.limits.weight,
             *(edges_first(group.weight) for group in problem.contacts),
         ]
-        # B: normals, then the first tangents, then the second, of group after group.
+        # B has, group after group, the normals, the first and the second tangents.
         parts = []
         for group in problem.contacts:
             parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
@@ -394,7 +399,7 @@ def _add_signed(
 
 
 def _sum_signed(values: jax.Array, signs: list[int]) -> jax.Array:
-    """Sum over the leading axis with constant signs, of which some may be 0."""
+    """Sum over the leading axis with constant signs -1, 0 or 1."""
     chosen = [
         value if sign > 0 else -value for value, sign in zip(values, signs) if sign
     ]
@@ -402,10 +407,10 @@ def _sum_signed(values: jax.Array, signs: list[int]) -> jax.Array:
 
 
 def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """x of A x = b by Gauss and Jordan's elimination: (V, V, B), (V, B) -> (V, B).
+    """Return x of A x = b by Gauss-Jordan elimination: (V, V, B), (V, B) -> (V, B).
 
-    Symmetric positive matrices need no pivoting. Each step drops the first column
-    and moves the first row to the end, so that all steps are alike.
+    Symmetric positive matrices need no pivoting. Each step drops the first column and
+    moves the first row to the end, so that all steps are the same.
     """
     table = jnp.concatenate([matrix, right[:, None]], axis=1)
     for _ in range(matrix.shape[0]):
@@ -418,14 +423,14 @@ def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 def _solve(
     iterations: int, line_search: int, problem: Problem, for_speed: bool
 ) -> Solution:
-    """`solve` with the batch as the last axis of everything."""
+    """Solve problems whose arrays have the batch as their last axis."""
     inertia, force = problem.inertia, problem.force
     rows = _Rows(problem, for_speed)
     spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
     each = jax.tree.map
-    # A loop costs a GPU more than what is in it (a fifth of all on walker2d), and a CPU
-    # the time to compile it.
+    # On a GPU the loop itself costs more than its body (a fifth of the time of
+    # walker2d). On a CPU unrolling it only costs compile time.
     unroll = not _on_cpu() and force.shape[0] <= _MOST_DEGREES_UNROLLED
     loop = functools.partial(jax.lax.fori_loop, unroll=unroll)
     total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
