@@ -48,8 +48,8 @@ class Options:
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the hyperparameters to start from: tuned, by environment and agent, or
-        paper, with the paper's single environment per seed, which is several times
-        slower. Flags override them.
+        paper, with the paper's single environment per seed, which is slow where
+        seeds are few. Flags override them.
       devices: number of host devices to spread the seeds over; default one for each
         core.
       settings: settings of the environment.
