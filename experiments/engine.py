@@ -23,7 +23,7 @@ import numpy as np
 
 import gasil_jax
 from experiments.store import Record, Run, Store
-from gasil_jax import evaluate
+from gasil_jax.evaluation import evaluate
 from gasil_jax.host import (
     command_line,
     driver,
@@ -242,7 +242,7 @@ def _evaluate(env: Any, program: Program, states: Any, episodes: int) -> np.ndar
 
     def score(state: Any, seed: jax.Array) -> jax.Array:
         key = jax.random.fold_in(jax.random.key(seed), 1)
-        scores = evaluate.evaluate(env, config, state, key, num_episodes=episodes)
+        scores = evaluate(env, config, state, key, num_episodes=episodes)
         return scores["episode_return"].mean()
 
     seeds = np.array([run.seed for run in program.runs], np.uint32)

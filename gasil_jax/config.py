@@ -244,7 +244,7 @@ def _validate_sizes(config: Config) -> None:
         value = getattr(config, name)
         if value is None and name == "max_episode_steps":
             continue
-        is_list = name.endswith("_sizes") or name == "hidden_sizes"
+        is_list = name.endswith("_sizes")
         if is_list and not isinstance(value, tuple):
             raise ValueError(f"{name} is {value!r}: it must be a tuple of sizes")
         if any(number not in allowed for number in (value if is_list else (value,))):

@@ -37,17 +37,20 @@ def train(
       OSError: if the folder can no longer be written.
       ValueError: if the run to continue does not fit the options.
     """
-    summaries = []
     write_config(options, folder)
     title = f"{options.env} {options.config.agent}"
-
-    def on_finished(job: assembly.Job, runs: Batch, outcome: driver.Outcome) -> None:
-        with announced(title, "writing the curve, the policies and the summary"):
-            summaries.append(_write_results(options, env, folder, runs, outcome))
-
     job = assembly.Job(program, folder, {"seed": seeds_of(options)})
-    assembly.train(options, env, [job], title=title, on_finished=on_finished)
-    return summaries[0]
+    finished: list[tuple[Batch, driver.Outcome]] = []
+    assembly.train(
+        options,
+        env,
+        [job],
+        title=title,
+        on_finished=lambda job, runs, outcome: finished.append((runs, outcome)),
+    )
+    # Only now, when the progress display has ended.
+    with announced(title, "writing the curve, the policies and the summary"):
+        return _write_results(options, env, folder, *finished[0])
 
 
 def _write_results(

@@ -168,6 +168,7 @@ def _train_discriminator(
         step, state, (jax.random.split(key, num_updates), counts)
     )
     ready = source.is_ready(context)
+    # Times the inverse, as XLA divides by a constant: a single run has the same bits.
     mean = lambda x: jnp.sum(x, where=counts) * (1.0 / jnp.sum(counts))
     metrics = {
         name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
