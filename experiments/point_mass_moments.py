@@ -118,7 +118,7 @@ def reward_field(
             jnp.broadcast_to(action, (len(positions), 2)),
         )
     )(jnp.asarray(actions))
-    reward = np.asarray(adversarial.bonus(logits, jnp.float32(1.0)))
+    reward = np.asarray(adversarial.softplus_bonus(logits))
     return positions, actions[reward.argmax(axis=0)], reward.max(axis=0)
 
 
