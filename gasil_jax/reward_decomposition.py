@@ -301,12 +301,7 @@ def decompose(
         network=trained,
         rates=rates,
         next_observation=next_observation,
-        reward=good_trajectories.write(
-            decomposition.reward,
-            # As in the history, no return of such an episode is one.
-            jnp.where(batch.faulty | batch.cut_short, jnp.nan, reward),
-            cursor,
-        ),
+        reward=good_trajectories.write(decomposition.reward, reward, cursor),
         open_reward=running[0],
         open_steps=running[1],
         recorded_steps=recorded_steps,

@@ -361,7 +361,11 @@ def learner_rewards(
             hyperparameters=hyperparameters,
             action_range=rollout.action_range(env),
         )
-        history = history.replace(reward=decomposition.reward)
+        # What is not a number in the history marks an episode without a return.
+        unknown = jnp.isnan(history.reward)
+        history = history.replace(
+            reward=jnp.where(unknown, jnp.nan, decomposition.reward)
+        )
     normalizer, scale = None, jnp.float32(1.0)
     if state.reward_normalizer is not None:
         normalizer = reward_normalization.update(
