@@ -9,7 +9,6 @@ import pytest
 from experiments import report, summary
 from experiments.figures import FIGURES, Curve, Figure, difference
 from experiments.report import Page, compare
-from experiments.search import Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax.errors import InputError
 
@@ -92,9 +91,7 @@ FIGURE = Figure(
     "Claim.",
     {
         panel: {
-            name: Curve(
-                Search(env, "ppo"), seeds=6, preset=True, changes={"alpha": alpha}
-            )
+            name: Curve(env, "ppo", seeds=6, changes={"alpha": alpha})
             for name, alpha in (("ours", 0.5), ("other", 0.6))
         }
         for panel, env in (("one", "hopper"), ("two", "swimmer"))
@@ -118,7 +115,7 @@ def page(tmp_path):
         for curve, mean in zip(FIGURE.panels[panel].values(), means, strict=True):
             for i, run in enumerate(curve.runs(store)):
                 values = np.full(10, mean + i)
-                store.add({run: Record(np.arange(1, 11), values, nan, nan, 0.0, by)})
+                store.add({run: Record(np.arange(1, 11), values, nan, by)})
     return Page("mujoco", store, figure=FIGURE)
 
 
@@ -140,7 +137,7 @@ def test_what_lacks_seeds_is_not_compared(page, tmp_path):
     curve = dataclasses.replace(FIGURE.panels["one"]["ours"], seeds=7)
     panels = {**FIGURE.panels, "one": {**FIGURE.panels["one"], "ours": curve}}
     lacking = dataclasses.replace(FIGURE, panels=panels)
-    page = Page("mujoco", page.store, figure=lacking)
+    page = Page("mujoco", page.searched, figure=lacking)
     assert "| one | ours | 6 of 7 |" in page.table()
     assert ("one", "ours", "other") not in page.comparisons
     assert "Not trained yet: 1 of 25 runs." in page.text()
@@ -159,7 +156,7 @@ def test_a_page_is_written_with_its_plot(page, tmp_path):
 def test_lock_step_is_told_as_long_as_runs_have_it(page):
     assert report.IN_STEP not in page.text()
     changes = {"stagger_episodes": False}
-    store = page.store
+    store = page.searched
     for curves in FIGURE.panels.values():
         for curve in curves.values():
             run = dataclasses.replace(curve, changes=changes).runs(store)[0]
@@ -189,7 +186,7 @@ def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
         drawn = curve.changes["stagger_episodes"] and curve.changes["num_envs"] == 128
         for run in curve.runs(store):
             values = np.full(10, rng.normal(90.0 if drawn else 30.0, 1.0))
-            records[run] = Record(np.arange(1, 11), values, nan, nan, 0.0, by)
+            records[run] = Record(np.arange(1, 11), values, nan, by)
     store.add(records)
     page = Page("batch_geometry", store)
     rows = page.geometry().splitlines()[2:]
