@@ -1,27 +1,20 @@
 """The figures: a table of which curves each has, as questions to the store of runs.
 
-A new figure is one more row of `FIGURES`, and its page is ``notes/NAME.md``. Panels are
-made by `grid` from tasks, delays and arms; an arm is a name, an agent and what it
-changes. Two examples with one setting for all tasks instead of the tuned presets:
+A new figure is one more row of `FIGURES`, and its page is ``notes/NAME.md``. Its panels
+are a `grid` of tasks, delays and arms: a name, an agent and what the arm changes.
+For example, an ablation with the same settings on all tasks, and many delays:
 
-    "ablation": Figure(
-        "Parts of the method", "",
-        grid(TASKS, (Arm("whole", "ppo+gasil"), Arm("no bonus", "ppo+gasil",
-             {"alpha": 0.0}), "ppo"), delays=(DELAY,), base=None, num_envs=64),
-        favourite="whole",
-    ),
-    "delays": Figure(
-        "Delays of the reward", "",
-        grid(TASKS, AGENTS, delays=(1, 5, 20, 100, 1000), panel="{env}",
-             curve="{arm}-{delay}", base=None, num_envs=64),
-        over=("reward_delay", "delay"),
-    ),
+    grid(TASKS, ("ppo", "ppo+gasil", Arm("no bonus", "ppo+gasil", {"alpha": 0.0})),
+         (DELAY,), base=None, changes={"num_envs": 64})
+    grid(TASKS, AGENTS, (1, 5, 20, 100, 1000), panel="{env}", curve="{arm}-{delay}")
+
+The second is drawn over the delay with ``over=("reward_delay", "delay")``.
 """
 
 import dataclasses
 import itertools
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.search import AGENTS, DELAY, NOISE, PAIR, TASKS, Point, Search
@@ -35,9 +28,6 @@ Terms = tuple[tuple[float, str, str], ...]
 #: What is compared: terms by (panel, ours, other), or (panel, ours, other, a panel
 #: whose difference is subtracted).
 Comparisons = Mapping[tuple[str, ...], Terms]
-#: What a curve's settings start from: a search, the name of a preset, or None for the
-#: defaults of `Config`.
-Base = Search | str | None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,41 +37,46 @@ class Curve:
     Attributes:
       env: name of the task.
       agent: name of the agent.
+      changes: hyperparameters and other fields of `Config` to change.
       reward_delay: the task's reward delay.
       obs_noise: the task's observation noise.
-      base: the settings to start from.
-      changes: hyperparameters and other fields of `Config` to change.
+      base: the settings that are changed: a preset's by its name, the defaults of
+        `Config` (None), or what a search chose, by a function of task, agent, delay
+        and noise that returns the search.
       seeds: number of seeds, from seed 0 on.
       total_steps: environment steps per seed.
     """
 
     env: str
     agent: str
+    changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
     obs_noise: float = 0.0
-    base: Base = "tuned"
-    changes: Point = dataclasses.field(default_factory=dict)
+    base: str | Callable[..., Search] | None = "tuned"
     seeds: int = 10
     total_steps: int = 1_000_000
+
+    @property
+    def _search(self) -> Search | None:
+        task = (self.env, self.agent, self.reward_delay, self.obs_noise)
+        return self.base(*task) if callable(self.base) else None
 
     def point(self, searched: Store) -> Point | None:
         """Return what differs from the appendix's or the preset's values.
 
         It is None if the curve's search is not complete in the store `searched`.
         """
-        chosen = self.base.chosen(searched) if isinstance(self.base, Search) else {}
+        chosen = self._search.chosen(searched) if self._search else {}
         return None if chosen is None else {**chosen, **self.changes}
 
     def runs(self, searched: Store) -> tuple[Run, ...]:
         """Return its runs, or none if its search is not complete."""
         if (point := self.point(searched)) is None:
             return ()
-        version = ALGORITHM_VERSION
-        if isinstance(self.base, Search):
-            config, version = self.base.config({}), SEARCHED_VERSION
-        elif self.base is None:
-            config = Config(agent=self.agent)
-        else:
+        config, version = Config(agent=self.agent), ALGORITHM_VERSION
+        if self._search:
+            config, version = self._search.config({}), SEARCHED_VERSION
+        elif isinstance(self.base, str):
             config = presets.preset(self.env, self.agent, self.base, self.reward_delay)
         config = config.replace(**{"total_steps": self.total_steps, **point})
         delay, noise = self.reward_delay, self.obs_noise
@@ -136,29 +131,27 @@ class Figure:
         value = {**vars(curve), **curve.changes}[self.over[0]]
         return name.replace(f"-{value}", "", 1), value
 
+    def rival(self, panel: str, name: str) -> str | None:
+        """Return the favourite's curve at the place of another curve, if it has one."""
+        place = (self.favourite, self.point_of(panel, name)[1])
+        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == place)
+        return next((x for x in curves if x != name), None)
+
     def compared(self) -> Comparisons:
         """Return everything that its page compares: one family of tests."""
         if self.comparisons is not None:
             return self.comparisons
-        parts = ("", " early") if self.early else ("",)
-        return {
-            (panel, ours + part, other + part): difference(
-                panel, ours + part, other + part
-            )
-            for panel, curves in self.panels.items()
-            for part in parts
-            for ours, other in itertools.permutations(curves, 2)
-            if self._are_compared(panel, ours, other)
-        }
-
-    def _are_compared(self, panel: str, ours: str, other: str) -> bool:
-        names = list(self.panels[panel])
-        line, value = self.point_of(panel, ours)
-        if value != self.point_of(panel, other)[1]:
-            return False
-        if self.favourite is None:
-            return names.index(ours) < names.index(other)
-        return line == self.favourite
+        compared: dict[tuple[str, ...], Terms] = {}
+        for panel, curves in self.panels.items():
+            pairs = [(self.rival(panel, name), name) for name in curves]
+            if self.favourite is None:
+                pairs = [*itertools.combinations(curves, 2)]
+            for part in ("", " early") if self.early else ("",):
+                for ours, other in pairs:
+                    if ours is not None:
+                        names = f"{ours}{part}", f"{other}{part}"
+                        compared[panel, *names] = difference(panel, *names)
+        return compared
 
     def requested(self, searched: Store) -> list[Run]:
         """Return all its runs that are known so far.
@@ -195,76 +188,57 @@ def searched_normalized(env: str, agent: str, delay: int, noise: float = 0.0) ->
 
 
 class Arm(NamedTuple):
-    """A curve of each panel of a grid.
-
-    Attributes:
-      name: its name in the panels.
-      agent: name of the agent.
-      changes: hyperparameters and other fields of `Config` to change.
-      base: the settings to start from, if they are not the grid's.
-      seeds: number of seeds, if it is not the grid's.
-    """
+    """A curve of each panel of a grid: its name, its agent and what it changes."""
 
     name: str
     agent: str
     changes: Point = types.MappingProxyType({})
-    base: Callable[..., Search] | str | None = None
-    seeds: int | None = None
 
 
 def grid(
     tasks: Sequence[str],
     arms: Sequence[Arm | str],
-    *,
     delays: Sequence[int] = (1,),
-    obs_noise: float = 0.0,
-    base: Callable[..., Search] | str | None = "tuned",
-    seeds: int | Mapping[str, int] = 10,
-    total_steps: int = 1_000_000,
+    *,
     panel: str = "{task}",
     curve: str = "{arm}",
-    **changes: Any,
+    changes: Point = types.MappingProxyType({}),
+    **shared: Any,
 ) -> Panels:
     """Return the panels of all tasks and delays, with a curve for each arm.
 
     Args:
       tasks: names of the tasks.
-      arms: the arms; a name alone is that of an agent without changes.
+      arms: the arms; an agent's name alone is the agent without changes.
       delays: reward delays of the tasks.
-      obs_noise: observation noise of the tasks.
-      base: the settings to start from, see `Base`, or a function of task, agent, delay
-        and noise that returns a search.
-      seeds: number of seeds, or the numbers by task if they are not 10.
-      total_steps: environment steps per seed.
       panel: name of a panel, of {task} with its delay, {env} without, and {delay}.
       curve: name of a curve, of {arm} and {delay}.
-      **changes: hyperparameters and other fields of `Config` to change in all arms.
+      changes: what all arms change.
+      **shared: other fields of all curves.
     """
     panels: dict[str, dict[str, Curve]] = {}
     for env, delay, arm in itertools.product(tasks, delays, arms):
-        own = Arm(arm, arm) if isinstance(arm, str) else arm
-        start = own.base or base
-        start = start(env, own.agent, delay, obs_noise) if callable(start) else start
-        of_task = seeds if isinstance(seeds, int) else seeds.get(env, 10)
-        name = panel.format(task=name_of(env, delay), env=env, delay=delay)
-        panels.setdefault(name, {})[curve.format(arm=own.name, delay=delay)] = Curve(
-            env,
-            own.agent,
-            delay,
-            obs_noise,
-            start,
-            {**changes, **own.changes},
-            own.seeds or of_task,
-            total_steps,
+        name, agent, own = Arm(arm, arm) if isinstance(arm, str) else arm
+        curves = panels.setdefault(
+            panel.format(task=name_of(env, delay), env=env, delay=delay), {}
         )
+        curves[curve.format(arm=name, delay=delay)] = Curve(
+            env, agent, {**changes, **own}, delay, **shared
+        )
+    return panels
+
+
+def joined(grids: Iterable[Panels]) -> Panels:
+    """Return the panels of several grids; those of the same name are one."""
+    panels: dict[str, dict[str, Curve]] = {}
+    for name, curves in itertools.chain(*(panels.items() for panels in grids)):
+        panels.setdefault(name, {}).update(curves)
     return panels
 
 
 #: The tasks with normalized rewards: ant and humanoid cost several times as much, and
 #: no agent has learned to walk there.
 NORMALIZED = TASKS[:4]
-#: Ten seeds tell few agents apart where one learns to run and another does not.
-_DELAYED_SEEDS = {"hopper": 20, "walker2d": 20, "halfcheetah": 20}
 #: Searches without and with normalized rewards, and how names of panels end.
 _REWARDS = ((searched, ""), (searched_normalized, "-normalized"))
 
@@ -279,22 +253,34 @@ def _searches(base: Callable[..., Search], tasks: Sequence[str]) -> dict[str, Se
     return searches | noisy
 
 
+def _delayed(tasks: Sequence[str], **shared: Any) -> Panels:
+    """Return all agents on delayed tasks.
+
+    Where one seed learns to run and another does not, ten tell few agents apart.
+    """
+    runners = grid(tasks[:3], AGENTS, (DELAY,), seeds=20, **shared)
+    return {**runners, **grid(tasks[3:], AGENTS, (DELAY,), **shared)}
+
+
 _NOISES = (0.0, 0.05, 0.1, 0.5)
 
 
-def _noise_panels() -> tuple[Panels, Comparisons]:
-    """Return a panel for each noise; compare the gaps, and their growth with noise."""
-    panels: dict[str, Mapping[str, Curve]] = {}
+def _noisy(noise: float, end: str) -> str:
+    """Return the name of a panel with noise."""
+    return f"noise-{noise:g}{end}"
+
+
+def _noise_comparisons() -> Comparisons:
+    """Compare the gap at each noise, and its growth with noise."""
     compared: dict[tuple[str, ...], Terms] = {}
-    for (base, suffix), noise in itertools.product(_REWARDS, _NOISES):
-        panel, calm = f"noise-{noise:g}{suffix}", f"noise-0{suffix}"
-        panels |= grid(("walker2d",), PAIR, obs_noise=noise, base=base, panel=panel)
+    for (_, end), noise in itertools.product(_REWARDS, _NOISES):
+        panel, calm = _noisy(noise, end), _noisy(0.0, end)
         gap = difference(panel, "ppo+gasil", "ppo")
         compared[panel, "ppo+gasil", "ppo"] = gap
         if noise:
             less = difference(calm, "ppo", "ppo+gasil")
             compared[panel, "ppo+gasil", "ppo", calm] = (*gap, *less)
-    return panels, compared
+    return compared
 
 
 #: The values of the paper's figure 8.
@@ -302,22 +288,6 @@ _VALUES = {
     "buffer_steps": (500, 1000, 2000, 5000, 10000),
     "discriminator_updates": (1, 5, 10, 20),
 }
-
-
-def _value_panels() -> Panels:
-    """Return a panel for each hyperparameter, delay and scale of rewards."""
-    panels: dict[str, Mapping[str, Curve]] = {}
-    for (base, suffix), delay, name in itertools.product(_REWARDS, (1, DELAY), _VALUES):
-        panels |= grid(
-            ("walker2d",),
-            [Arm(str(value), "ppo+gasil", {name: value}) for value in _VALUES[name]],
-            delays=(delay,),
-            base=base,
-            panel=f"{name_of(name, delay)}{suffix}",
-        )
-    return panels
-
-
 #: A discriminator that its entropy bonus holds at 1/2 everywhere: alpha log 2 a step.
 #: Against this weight what tells good from other moves a logit by 4 / 1000.
 CONSTANT = {
@@ -342,6 +312,7 @@ def _bonus_comparisons() -> Comparisons:
 #: The paper's schedule of alpha for humanoid (appendix).
 _SCHEDULED = {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))}
 _LONG: Any = {"base": searched, "total_steps": 3_000_000}
+_WIDER = Arm("wider", "ppo+gasil")
 
 
 def _wider(env: str, agent: str, delay: int, noise: float = 0.0) -> Search:
@@ -353,27 +324,15 @@ def _wider(env: str, agent: str, delay: int, noise: float = 0.0) -> Search:
 
 #: Numbers of environments per seed in the figure on batch geometry, and whether they
 #: start at random ages, in words.
-GEOMETRY_NUM_ENVS = (1, 8, 32, 128)
-AGES = {True: "drawn", False: "not-drawn"}
-_GEOMETRY = grid(
-    ("halfcheetah", "swimmer"),
-    [
-        Arm(
-            f"{agent}-{num_envs}-{AGES[drawn]}",
-            agent,
-            {"num_envs": num_envs, "batch_steps": 2048, "stagger_episodes": drawn},
-        )
-        for agent, drawn, num_envs in itertools.product(PAIR, AGES, GEOMETRY_NUM_ENVS)
-    ],
-    delays=(1, DELAY),
-    seeds={"halfcheetah": 20},
-)
-_GEOMETRY_COMPARISONS = {
-    (panel, *names): difference(panel, *names)
-    for panel, agent, count in itertools.product(_GEOMETRY, PAIR, GEOMETRY_NUM_ENVS)
-    for names in [tuple(f"{agent}-{count}-{ages}" for ages in AGES.values())]
-}
-
+_NUM_ENVS, _AGES = (1, 8, 32, 128), {True: "drawn", False: "not-drawn"}
+_GEOMETRY = [
+    Arm(
+        f"{agent}-{num_envs}-{_AGES[drawn]}",
+        agent,
+        {"num_envs": num_envs, "batch_steps": 2048, "stagger_episodes": drawn},
+    )
+    for agent, drawn, num_envs in itertools.product(PAIR, _AGES, _NUM_ENVS)
+]
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
     "on most of them."
@@ -398,26 +357,33 @@ FIGURES: Mapping[str, Figure] = {
         "Walker2d with noisy observations (paper, figure 6)",
         "The gap between PPO and PPO+GASIL is larger when Gaussian noise, of standard "
         "deviation 0.05, 0.1 and 0.5, is added to the observations.",
-        _noise_panels()[0],
-        comparisons=_noise_panels()[1],
+        joined(
+            grid(("walker2d",), PAIR, panel=_noisy(x, end), obs_noise=x, base=base)
+            for (base, end), x in itertools.product(_REWARDS, _NOISES)
+        ),
+        comparisons=_noise_comparisons(),
     ),
     "delayed_mujoco": Figure(
         "MuJoCo tasks with delayed rewards (paper, figure 7)",
         _DELAYED,
-        grid(
-            TASKS,
-            AGENTS,
-            delays=(DELAY,),
-            base=searched,
-            seeds=_DELAYED_SEEDS,
-            panel="{env}",
-        ),
+        _delayed(TASKS, base=searched, panel="{env}"),
     ),
     "hyperparameters": Figure(
         "Effect of GASIL's hyperparameters (paper, figure 8)",
         "The agent performs poorly when the buffer is too small (500 steps) or too "
         "large (5000 steps), and with too few or too many discriminator updates.",
-        _value_panels(),
+        joined(
+            grid(
+                ("walker2d",),
+                [Arm(f"{value}", "ppo+gasil", {name: value}) for value in values],
+                (delay,),
+                panel=f"{name_of(name, delay)}{end}",
+                base=base,
+            )
+            for base, end in _REWARDS
+            for delay in (1, DELAY)
+            for name, values in _VALUES.items()
+        ),
         favourite=None,
     ),
     "random_search": Figure(
@@ -430,13 +396,7 @@ FIGURES: Mapping[str, Figure] = {
         "Normalized rewards (paper, figures 5 and 7)",
         f"{_DELAYED} {_DENSE}",
         {
-            **grid(
-                NORMALIZED,
-                AGENTS,
-                delays=(DELAY,),
-                base=searched_normalized,
-                seeds=_DELAYED_SEEDS,
-            ),
+            **_delayed(NORMALIZED, base=searched_normalized),
             **grid(NORMALIZED, AGENTS, base=searched_normalized),
         },
         searches=_searches(searched_normalized, NORMALIZED),
@@ -448,7 +408,7 @@ FIGURES: Mapping[str, Figure] = {
         grid(
             ("hopper", "walker2d"),
             ("ppo", Arm("constant", "ppo+gasil", CONSTANT), "ppo+gasil"),
-            delays=(DELAY,),
+            (DELAY,),
             base=searched_normalized,
             seeds=20,
         ),
@@ -458,26 +418,23 @@ FIGURES: Mapping[str, Figure] = {
         "Humanoid over 3M steps (paper, figures 5 and 7)",
         "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
         "where the reward is delayed.",
-        {
-            **grid(
-                ("humanoid",),
-                (*AGENTS, Arm("ppo+gasil-from-2M", "ppo+gasil", _SCHEDULED)),
-                panel="dense",
-                **_LONG,
-            ),
-            **grid(("humanoid",), AGENTS, delays=(DELAY,), panel="delayed", **_LONG),
-        },
+        joined(
+            grid(("humanoid",), arms, (delay,), panel=panel, **_LONG)
+            for panel, delay, arms in (
+                ("dense", 1, AGENTS),
+                ("dense", 1, [Arm("ppo+gasil-from-2M", "ppo+gasil", _SCHEDULED)]),
+                ("delayed", DELAY, AGENTS),
+            )
+        ),
     ),
     "wider_search": Figure(
         "PPO+GASIL on delayed tasks, searched further",
         _DELAYED,
-        grid(
-            NORMALIZED,
-            (*AGENTS, Arm("wider", "ppo+gasil", base=_wider, seeds=10)),
-            delays=(DELAY,),
-            base=searched,
-            seeds=_DELAYED_SEEDS,
-            panel="{env}",
+        joined(
+            [
+                _delayed(NORMALIZED, base=searched, panel="{env}"),
+                grid(NORMALIZED, [_WIDER], (DELAY,), panel="{env}", base=_wider),
+            ]
         ),
         favourite="wider",
         searches={name_of(x, DELAY): _wider(x, "ppo+gasil", DELAY) for x in NORMALIZED},
@@ -485,9 +442,18 @@ FIGURES: Mapping[str, Figure] = {
     "batch_geometry": Figure(
         "Number of environments, and episodes in step",
         "",
-        _GEOMETRY,
+        {
+            **grid(("halfcheetah",), _GEOMETRY, (1, DELAY), seeds=20),
+            **grid(("swimmer",), _GEOMETRY, (1, DELAY)),
+        },
+        comparisons={
+            (f"{env}{end}", *names): difference(f"{env}{end}", *names)
+            for env in ("halfcheetah", "swimmer")
+            for end in ("", "-delayed")
+            for agent, count in itertools.product(PAIR, _NUM_ENVS)
+            for names in [[f"{agent}-{count}-{ages}" for ages in _AGES.values()]]
+        },
         favourite=None,
-        comparisons=_GEOMETRY_COMPARISONS,
         over=("num_envs", "environments"),
     ),
 }

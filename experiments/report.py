@@ -273,7 +273,8 @@ class Page:
             for label, results in curves.items():
                 cells = [panel, label, results.seeds, interval(results.final)]
                 if favourite:
-                    against = self.comparisons.get((panel, favourite, label))
+                    rival = str(self.figure.rival(panel, label))
+                    against = self.comparisons.get((panel, rival, label))
                     cells += [str(against), against.verdict] if against else ["", ""]
                 rows.append(cells)
         return markdown_table(head, rows)
@@ -306,23 +307,23 @@ class Page:
           *panels: the panels; default all.
           scores: the scores to compare, as a family of their own; default the page's.
         """
-        comparisons, favourite = self.comparisons, str(self.figure.favourite)
+        comparisons, lines = self.comparisons, []
         if scores is not None:
             comparisons = compare(scores, self.figure.compared())
         scores, panels = scores or self.scores, panels or tuple(self.figure.panels)
-        lines = []
         for other in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
-            complete = [p for p in panels if (p, favourite, other) in comparisons]
+            with_other = [p for p in panels if other in self.figure.panels[p]]
+            ours = str(self.figure.rival(with_other[0], other))
+            complete = [p for p in panels if (p, ours, other) in comparisons]
             if not complete:
                 continue
-            verdicts = [comparisons[p, favourite, other].verdict for p in complete]
-            line = f"- {favourite} against {other}: {counted(verdicts)}"
-            line += f" of {len(complete)}"
-            above = positive(scores, complete, favourite, other)
+            verdicts = [comparisons[p, ours, other].verdict for p in complete]
+            line = f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
+            above = positive(scores, complete, ours, other)
             if len(above) > 1:
                 which = f"the {len(above)} where every seed's return is above 0"
                 which = "all of them" if len(above) == len(complete) else which
-                line += f"; over {which} {together(scores, above, favourite, other)}"
+                line += f"; over {which} {together(scores, above, ours, other)}"
             lines.append(f"{line}.")
         return "\n".join(lines)
 

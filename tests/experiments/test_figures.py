@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from experiments.figures import CONSTANT, FIGURES, Curve
+from experiments.figures import CONSTANT, FIGURES, Arm, Curve, Figure, grid
 from experiments.search import DELAY, PAIR
 from experiments.store import RESULTS, Store
 from gasil_jax.config import Config, validate
@@ -112,3 +112,50 @@ def test_a_curve_changes_what_was_chosen():
     assert scheduled.replace(alpha=alpha, alpha_schedule=()) == fixed
     bare = dataclasses.replace(curve, base="tuned", changes={})
     assert isinstance(bare, Curve) and bare.point(STORE) == {}
+
+
+SHARED = {"num_envs": 64, "normalize_rewards": True}
+DELAYS = Figure(
+    "Delays",
+    "",
+    grid(
+        ("hopper", "swimmer"),
+        PAIR,
+        (1, 5, 20, 1000),
+        panel="{env}",
+        curve="{arm}-{delay}",
+        base=None,
+        changes=SHARED,
+    ),
+    over=("reward_delay", "delay"),
+)
+
+
+def test_an_ablation_is_a_row():
+    weak = Arm("weak", "ppo+gasil", {"alpha": 0.01, "num_envs": 8})
+    arms = ("ppo", weak, "ppo+gasil")
+    panels = grid(("hopper", "ant"), arms, (DELAY,), base=None, changes=SHARED, seeds=5)
+    figure = Figure("Ablation", "", panels, favourite="ppo+gasil")
+    assert list(figure.panels) == ["hopper-delayed", "ant-delayed"]
+    for _, name, curve in figure.curves():
+        runs = curve.runs(STORE)
+        assert [run.seed for run in runs] == [0, 1, 2, 3, 4]
+        assert {run.reward_delay for run in runs} == {DELAY}
+        agent = "ppo" if name == "ppo" else "ppo+gasil"
+        expected = Config(agent=agent, total_steps=1_000_000).replace(**SHARED)
+        if name == "weak":
+            expected = expected.replace(alpha=0.01, num_envs=8)
+        assert runs[0].config == expected
+    others = [key[1:] for key in figure.compared() if key[0] == "ant-delayed"]
+    assert others == [("ppo+gasil", "ppo"), ("ppo+gasil", "weak")]
+
+
+def test_a_figure_over_delays_is_a_row():
+    assert list(DELAYS.panels) == ["hopper", "swimmer"]
+    for _, name, curve in DELAYS.curves():
+        (run, *_) = curve.runs(STORE)
+        assert name == f"{run.config.agent}-{run.reward_delay}"
+        assert run.config.num_envs == 64
+    # Agents are compared where the delay is the same.
+    others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
+    assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from test_figures import DELAYS
 
 from experiments import report, summary
 from experiments.figures import FIGURES, Curve, Figure, difference
@@ -196,6 +197,25 @@ def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
         assert verdict.startswith("better" if count == "128" else "not clear")
     page.write(tmp_path)
     assert (tmp_path / "batch_geometry.png").stat().st_size > 5000
+
+
+def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
+    store, nan = Store(tmp_path / "runs"), np.full(10, np.nan)
+    by = {"physics": "mjx", "device": None, "versions": None, "commit": "c"}
+    records = {}
+    for i, (_, _, curve) in enumerate(DELAYS.curves()):
+        for run in curve.runs(store):
+            values = np.full(10, 100.0 + i % 2 * run.reward_delay + run.seed)
+            records[run] = Record(np.arange(1, 11), values, nan, by | {"clean": True})
+    store.add(records)
+    page = Page("delays", store, figure=DELAYS)
+    assert "| hopper | ppo-1000 | 10 | 104 [102, 107] | 1000 [" in page.table()
+    tally = page.tally().splitlines()
+    assert len(tally) == 4
+    assert tally[0].startswith("- ppo+gasil-1 against ppo-1: not clear on 2 of 2;")
+    assert tally[3].startswith("- ppo+gasil-1000 against ppo-1000: better on 2 of 2;")
+    page.write(tmp_path)
+    assert (tmp_path / "delays.png").stat().st_size > 3000
 
 
 @pytest.mark.parametrize("name", FIGURES)
