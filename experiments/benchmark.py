@@ -13,6 +13,7 @@ ratio compares numbers from the same minutes. A speed is the median of the repea
 """
 
 import dataclasses
+import functools
 import importlib.util
 import multiprocessing
 import time
@@ -20,13 +21,13 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
 from experiments.search import TASKS
+from gasil_envs import wrappers
 from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, metrics_files
@@ -40,7 +41,7 @@ VARIANTS = {
     "ours-euler": {"integrator": "euler"},
     "mujoco-euler": {"physics": "mujoco", "integrator": "euler"},
 }
-_NUM_STEPS, _ERROR_ENVS, _BASELINE_STEPS = 20, 64, 3 * 2048
+_NUM_STEPS, _BASELINE_STEPS = 20, 3 * 2048
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,69 +93,61 @@ class Row:
     error: float | None = None
 
 
-def _random_actions(env: Any, num_envs: int, key: jax.Array) -> jax.Array:
+def _make(env_name: str, variant: str) -> Any:
+    return wrappers.AutoReset(gasil_envs.make(env_name, **VARIANTS[variant]))
+
+
+def _random_step(env: Any, states: Any, key: jax.Array) -> Any:
+    """Return the states of environments after a random action."""
     low, high = env.action_range
-    shape = (num_envs, env.action_size)
-    return jax.random.uniform(key, shape, minval=low, maxval=high)
+    shape = (states.done.shape[0], env.action_size)
+    action = jax.random.uniform(key, shape, minval=low, maxval=high)
+    return jax.vmap(env.step)(states, action)
 
 
-def _after_random_actions(env: Any, states: Any, key: jax.Array) -> Any:
-    """Return the states of environments after random actions."""
-    num_envs = states.done.shape[0]
-
-    def step(states: Any, key: jax.Array) -> Any:
-        action_key, reset_key = jax.random.split(key)
-        action = _random_actions(env, num_envs, action_key)
-        stepped = jax.vmap(env.step)(states, action)
-        fresh = jax.vmap(env.reset)(jax.random.split(reset_key, num_envs))
-
-        def restart(first: jax.Array, now: jax.Array) -> jax.Array:
-            done = (stepped.done > 0).reshape((-1,) + (1,) * (now.ndim - 1))
-            return jnp.where(done, first, now).astype(now.dtype)
-
-        return jax.tree.map(restart, fresh, stepped), None
-
+def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
+    step = lambda states, key: (_random_step(env, states, key), None)
     return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
 
 
 def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     """Random actions in environments that are spread over the devices."""
-    env = gasil_envs.make(env_name, **VARIANTS[variant])
+    env = _make(env_name, variant)
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
     mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
-    shard = lambda function, specs: jax.shard_map(
-        function, mesh=mesh, in_specs=specs, out_specs=spec, check_vma=False
+    shard = lambda function: jax.jit(
+        jax.shard_map(
+            function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+        )
     )
-    rollout = lambda states, keys: _after_random_actions(env, states, keys[0])
-    reset = jax.jit(shard(jax.vmap(env.reset), spec))
-    states = reset(jax.random.split(jax.random.key(0), num_envs))
-    keys = lambda number: jax.random.split(jax.random.key(number), count)
+    keys = lambda number, count: jax.random.split(jax.random.key(number), count)
+    states = shard(jax.vmap(env.reset))(keys(0, num_envs))
+    rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
     began = time.perf_counter()
-    advance = jax.jit(shard(rollout, (spec, spec))).lower(states, keys(0)).compile()
+    advance = rollout.lower((states, keys(0, count))).compile()
     compile_seconds = time.perf_counter() - began
     # Not from the start, because most bodies have fallen to the ground after a while.
-    states = jax.block_until_ready(advance(states, keys(0)))
+    states, _ = jax.block_until_ready(advance((states, keys(0, count))))
 
     def run() -> float:
         began = time.perf_counter()
-        jax.block_until_ready(advance(states, keys(1)))
+        jax.block_until_ready(advance((states, keys(1, count))))
         return num_envs * _NUM_STEPS / (time.perf_counter() - began)
 
     return Row(env_name, variant, num_envs, run, compile_seconds)
 
 
-def one_step_error(env: Any, reference: Any) -> float:
+def one_step_error(env_name: str, variant: str) -> float:
     """Return the relative error of an observation after one step from the same states.
 
-    It is the error of the worst entry, and the median over environments.
+    It is the error of the worst entry, and the median over 64 environments.
     """
-    keys = jax.random.split(jax.random.key(1), _ERROR_ENVS)
+    env, reference = _make(env_name, variant), _make(env_name, "mujoco")
+    keys = jax.random.split(jax.random.key(1), 64)
     states = jax.jit(jax.vmap(reference.reset))(keys)
-    advance = jax.jit(lambda *x: _after_random_actions(reference, *x))
-    states = advance(states, keys[0])
-    action = _random_actions(env, _ERROR_ENVS, keys[1])
+    states = jax.jit(functools.partial(_random_steps, reference))(states, keys[0])
     obs, right = (
-        np.asarray(jax.jit(jax.vmap(x.step))(states, action).obs)
+        np.asarray(jax.jit(functools.partial(_random_step, x))(states, keys[1]).obs)
         for x in (env, reference)
     )
     error = np.abs(obs - right) / (1.0 + np.abs(right))
@@ -163,11 +156,8 @@ def one_step_error(env: Any, reference: Any) -> float:
 
 def physics_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """The rows of each number of environments."""
-    reference = gasil_envs.make(env_name, physics="mujoco")
-    errors = {
-        name: one_step_error(gasil_envs.make(env_name, **VARIANTS[name]), reference)
-        for name in options.variants or VARIANTS
-    }
+    variants = options.variants or VARIANTS
+    errors = {name: one_step_error(env_name, name) for name in variants}
     for num_envs in options.num_envs:
         rows = [physics_row(env_name, name, num_envs) for name in errors]
         yield [dataclasses.replace(row, error=errors[row.name]) for row in rows]

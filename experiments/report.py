@@ -109,7 +109,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
     for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):
         least = max(least, min(1.0, raw[key].p * (len(raw) - i)))
         corrected[key] = dataclasses.replace(raw[key], p=least)
-    return corrected
+    return {key: corrected[key] for key in raw}
 
 
 def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
@@ -180,11 +180,6 @@ class Results:
         return len(self.records) == self.curve.seeds
 
     @property
-    def config(self) -> Any:
-        """The config of its runs."""
-        return next(iter(self.records)).config
-
-    @property
     def seeds(self) -> str:
         """How many seeds there are, in words."""
         of = "" if self.complete else f" of {self.curve.seeds}"
@@ -232,7 +227,7 @@ class Page:
     """
 
     SLOTS = (
-        *("table", "final", "compared", "differences", "tally", "added", "best"),
+        *("table", "compared", "differences", "tally", "added", "best"),
         *("geometry", "geometry_tally", "searches", "effects"),
     )
 
@@ -246,7 +241,7 @@ class Page:
         self.name, self.figure = name, figure or FIGURES[name]
         self.searched = searched or store
         self.note = "{{table}}" if figure else (NOTES / f"{name}.md").read_text()
-        self.results: dict[str, dict[str, Results]] = {}
+        self.results: dict[tuple[str, str], Results] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
         for panel, label, curve in self.figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
@@ -254,7 +249,7 @@ class Page:
                 continue
             point = curve.point(self.searched) or {}
             results = Results(curve, point, {run: store[run] for run in runs})
-            self.results.setdefault(panel, {})[label] = results
+            self.results[panel, label] = results
             if results.complete:
                 self.scores[panel, label] = results.final
                 if self.figure.early is not None:
@@ -269,19 +264,14 @@ class Page:
         head = ["task", "agent", "seeds", "final return"]
         head += [f"{favourite} ahead by", f"{favourite} is"] if favourite else []
         rows = []
-        for panel, curves in self.results.items():
-            for label, results in curves.items():
-                cells = [panel, label, results.seeds, interval(results.final)]
-                if favourite:
-                    rival = str(self.figure.rival(panel, label))
-                    against = self.comparisons.get((panel, rival, label))
-                    cells += [str(against), against.verdict] if against else ["", ""]
-                rows.append(cells)
+        for (panel, label), results in self.results.items():
+            cells = [panel, label, results.seeds, interval(results.final)]
+            if favourite:
+                rival = str(self.figure.rival(panel, label))
+                against = self.comparisons.get((panel, rival, label))
+                cells += [str(against), against.verdict] if against else ["", ""]
+            rows.append(cells)
         return markdown_table(head, rows)
-
-    def final(self, panel: str, curve: str) -> str:
-        """Return the final return of a curve as text."""
-        return interval(self.scores[panel, curve])
 
     def compared(self, panel: str, ours: str, other: str) -> str:
         """Return a comparison in words."""
@@ -293,8 +283,7 @@ class Page:
     def differences(self) -> str:
         """Return every comparison of the page, each in a line."""
         lines = []
-        for key in filter(self.comparisons.get, self.figure.compared()):
-            (panel, ours, other, *less), comparison = key, self.comparisons[key]
+        for (panel, ours, other, *less), comparison in self.comparisons.items():
             more = f", less that of {less[0]}" if less else ""
             difference = f"{comparison}, {comparison.verdict}"
             lines.append(f"- {panel}, {ours} - {other}{more}: {difference}.")
@@ -369,10 +358,9 @@ class Page:
     def geometry(self) -> str:
         """Return final returns with drawn ages and without, for each cell."""
         rows = []
-        for panel, *names in filter(self.comparisons.get, self.figure.compared()):
-            comparison = self.comparisons[panel, *names]
+        for (panel, *names), comparison in self.comparisons.items():
             cells = [panel, *names[0].split("-")[:2]]
-            cells += [self.final(panel, name) for name in names]
+            cells += [interval(self.scores[panel, name]) for name in names]
             rows.append([*cells, str(comparison), comparison.verdict])
         head = ["task", "agent", "environments", "ages drawn", "not drawn"]
         head += ["difference", "drawn is"]
@@ -381,7 +369,7 @@ class Page:
     def geometry_tally(self) -> str:
         """Return for each number of environments how often drawn ages are better."""
         keys_of: dict[str, list[tuple[str, ...]]] = {}
-        for key in filter(self.comparisons.get, self.figure.compared()):
+        for key in self.comparisons:
             keys_of.setdefault(key[1].split("-")[1], []).append(key)
         lines = []
         for count, keys in keys_of.items():
@@ -440,15 +428,13 @@ class Page:
     def settings(self) -> str:
         """Return what each curve was trained with, beyond the appendix's values."""
         rows = []
-        for panel, curves in self.results.items():
-            for label, results in curves.items():
-                normalized = results.config.normalize_rewards
-                point = point_in_words(results.point)
-                point += ", rewards normalized" if normalized else ""
-                rows.append([panel, label, point, results.provenance()])
-        return markdown_table(
-            ["task", "agent", "hyperparameters", "trained with"], rows
-        )
+        for names, results in self.results.items():
+            point = point_in_words(results.point)
+            if next(iter(results.records)).config.normalize_rewards:
+                point += ", rewards normalized"
+            rows.append([*names, point, results.provenance()])
+        head = ["task", "agent", "hyperparameters", "trained with"]
+        return markdown_table(head, rows)
 
     def value(self, slot: str, *arguments: str) -> str:
         """Return what stands in a slot.
@@ -467,12 +453,7 @@ class Page:
     @property
     def in_step(self) -> bool:
         """Whether environments of locomotion were reset together in some runs."""
-        runs = [
-            run
-            for curves in self.results.values()
-            for x in curves.values()
-            for run in x.records
-        ]
+        runs = [run for results in self.results.values() for run in results.records]
         for search in self.figure.searches.values():
             for stage in search.stages(self.searched)[:1]:
                 runs += [seeds[0] for seeds in search.runs(stage)]
@@ -491,9 +472,7 @@ class Page:
         picture = [f"![{self.name}]({self.name}.png)"] if self.results else []
         parts += [*picture, *note] if self.figure.claim else [*note, *picture]
         total = sum(curve.seeds for _, _, curve in self.figure.curves())
-        stored = [
-            len(x.records) for curves in self.results.values() for x in curves.values()
-        ]
+        stored = [len(results.records) for results in self.results.values()]
         if missing := total - sum(stored):
             parts.append(f"Not trained yet: {missing} of {total} runs.")
         if self.results:
@@ -517,7 +496,8 @@ def fill(note: str, value: Callable[..., str]) -> str:
 
 def _draw(page: Page) -> matplotlib.figure.Figure:
     """Return a plot with axes for each panel."""
-    count = len(page.results)
+    panels = list(dict.fromkeys(panel for panel, _ in page.results))
+    count = len(panels)
     # Four panels are drawn in a square, so that none is alone in its row.
     columns = min({4: 2}.get(count, 4 if count > 6 else 3), count)
     rows = math.ceil(count / columns)
@@ -526,7 +506,7 @@ def _draw(page: Page) -> matplotlib.figure.Figure:
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
-    for axes, panel in zip(grid.flat, page.results, strict=False):
+    for axes, panel in zip(grid.flat, panels, strict=False):
         (_draw_over if page.figure.over else _draw_curves)(page, panel, axes)
         axes.set_title(panel)
         if axes.get_lines():
@@ -545,8 +525,10 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
     if set(curves) & set(AGENTS):
         names = dict.fromkeys([*AGENTS, *curves])
         color_of = dict(zip(names, plotting.COLORS, strict=False))
-    for label, results in page.results[panel].items():
-        records = list(results.records.values())
+    for label in curves:
+        if (panel, label) not in page.results:
+            continue
+        records = list(page.results[panel, label].records.values())
         # As coarse as the coarsest record.
         steps = min((record.env_steps for record in records), key=len)
         returns = np.array(

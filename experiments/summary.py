@@ -126,8 +126,8 @@ class Summary:
         """Return the final returns of all agents."""
         table = []
         for name, (figure, panel) in rows.items():
-            results, cells = self.pages[figure].results.get(panel, {}), []
-            for x in map(results.get, AGENTS):
+            cells = []
+            for x in (self.pages[figure].results.get((panel, y)) for y in AGENTS):
                 seeds = "" if x is None or x.complete else f" ({x.seeds} seeds)"
                 cells.append(f"{report.interval(x.final)}{seeds}" if x else "")
             table.append([name, *cells])
