@@ -104,9 +104,8 @@ class Program:
         words = [f"{run.env} {run.config.agent}", f"{run.config.num_envs} environments"]
         words += [f"delayed {run.reward_delay}"] if run.reward_delay > 1 else []
         words += [] if run.config.stagger_episodes else ["in step"]
-        return ", ".join(
-            [*words, f"seed {run.seed}" if count == 1 else f"{count} runs"]
-        )
+        words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
+        return ", ".join(words)
 
 
 def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
@@ -137,8 +136,13 @@ def train(program: Program) -> dict[Run, Record]:
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     run, setup, folder = program.runs[0], program.setup, program.folder
-    delay, noise = run.reward_delay, run.obs_noise
     episodes = setup.evaluate_episodes or None
+    settings = Settings(
+        reward_delay=run.reward_delay,
+        obs_noise=run.obs_noise,
+        physics=setup.physics,
+        integrator=run.integrator,
+    )
     options = run_options.Options(
         env=run.env,
         out=folder,
@@ -146,9 +150,7 @@ def train(program: Program) -> dict[Run, Record]:
         evaluate_every=episodes and math.ceil(run.config.total_steps / EVALUATIONS),
         evaluate_episodes=episodes,
         devices=setup.devices,
-        settings=Settings(
-            delay, noise, physics=setup.physics, integrator=run.integrator
-        ),
+        settings=settings,
         config=run.config,
     )
     seeds = tuple(run.seed for run in program.runs)
@@ -196,10 +198,8 @@ def _provenance(program: Program) -> dict[str, Any]:
     every = lambda name: ", then ".join(
         dict.fromkeys(str(session[name]) for session in sessions if session[name])
     )
-    # A checkout that was changed in one session counts as changed, then as unknown.
-    clean = min(
-        (session["clean"] for session in sessions), key=[False, None, True].index
-    )
+    # False if a session's checkout was changed, or else None if one is unknown.
+    clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
     commit = every("commit") or None
     return {**now, "device": every("device"), "commit": commit, "clean": clean}
 
