@@ -523,8 +523,9 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
     color_of = dict(zip(curves, shades, strict=True))
     if set(curves) & set(AGENTS):
-        names = dict.fromkeys([*AGENTS, *curves])
-        color_of = dict(zip(names, plotting.COLORS, strict=False))
+        names = list(dict.fromkeys([*AGENTS, *curves]))
+        names = curves if len(names) > len(plotting.COLORS) else names
+        color_of |= dict(zip(names, plotting.COLORS, strict=False))
     for label in curves:
         if (panel, label) not in page.results:
             continue

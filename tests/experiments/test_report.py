@@ -8,7 +8,7 @@ import pytest
 from test_figures import DELAYS
 
 from experiments import report, summary
-from experiments.figures import FIGURES, Curve, Figure, difference
+from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
 from experiments.report import Page, compare
 from experiments.store import RESULTS, Record, Store
 from gasil_jax.errors import InputError
@@ -217,6 +217,16 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
     assert tally[3].startswith("- ppo+gasil-1000 against ppo-1000: better on 2 of 2;")
     page.write(tmp_path)
     assert (tmp_path / "delays.png").stat().st_size > 3000
+
+
+@pytest.mark.parametrize("count", [3, 9])
+def test_every_arm_has_a_color(page, tmp_path, count):
+    arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
+    panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
+    figure = Figure("Arms", "", panels, favourite="ppo")
+    drawn = report._draw(Page("mujoco", page.searched, figure=figure))
+    colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
+    assert len(set(colors)) == len(colors) == count + 1
 
 
 @pytest.mark.parametrize("name", FIGURES)
