@@ -1,4 +1,4 @@
-"""The figures: a table of which curves each has, as questions to the store of runs.
+"""The table of figures: the curves of each, whose runs are requested from the store.
 
 A new figure is one more row of `FIGURES`, and its page is ``notes/NAME.md``. Its panels
 are a `grid` of tasks, delays and arms: a name, an agent and what the arm changes.
@@ -288,8 +288,9 @@ _VALUES = {
     "buffer_steps": (500, 1000, 2000, 5000, 10000),
     "discriminator_updates": (1, 5, 10, 20),
 }
-#: A discriminator that its entropy bonus holds at 1/2 everywhere: alpha log 2 a step.
-#: Against this weight what tells good from other moves a logit by 4 / 1000.
+#: A discriminator that its entropy bonus holds at 1/2 everywhere, so that its reward is
+#: alpha log 2 in each step. With this weight of the entropy, the difference between
+#: good and other trajectories moves a logit by only 4 / 1000.
 CONSTANT = {
     "discriminator_entropy_coefficient": 1e3,
     "discriminator_updates": 5,

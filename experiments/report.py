@@ -1,9 +1,10 @@
-"""Statistics, tables, plots and pages: every number and verdict is of stored runs.
+"""Statistics, tables, plots and pages, all made from the stored runs.
 
 A page is ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, filled in. Verdicts are
 corrected for the number of comparisons of their page by Holm's method.
 """
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -33,7 +34,7 @@ NOTES = pathlib.Path(__file__).parent / "notes"
 #: The probability that any verdict of a page is wrong, at most.
 LEVEL = 0.05
 _DRAWS = 10_000
-#: An interval over fewer seeds covers far less than it says, and nothing is clear.
+#: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
 _FEWEST_SEEDS = 5
 _VERDICTS = ("better", "not clear", "worse")
 #: Scores, (seeds,), by panel and curve.
@@ -442,13 +443,14 @@ class Page:
         Raises:
           InputError: if there is no such slot, or nothing to stand in it.
         """
-        try:
-            return getattr(self, self.SLOTS[self.SLOTS.index(slot)])(*arguments)
-        except (ValueError, KeyError, TypeError):
-            raise InputError(
-                f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
-                f"one of {', '.join(self.SLOTS)}, of complete curves"
-            ) from None
+        if slot in self.SLOTS:
+            # Curves that are not complete, or wrong arguments, are reported below.
+            with contextlib.suppress(KeyError, TypeError):
+                return getattr(self, slot)(*arguments)
+        raise InputError(
+            f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
+            f"one of {', '.join(self.SLOTS)}, of complete curves"
+        )
 
     @property
     def in_step(self) -> bool:
@@ -530,7 +532,7 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
         if (panel, label) not in page.results:
             continue
         records = list(page.results[panel, label].records.values())
-        # As coarse as the coarsest record.
+        # Returns are compared at the steps of the record with the fewest rows.
         steps = min((record.env_steps for record in records), key=len)
         returns = np.array(
             [np.interp(steps, x.env_steps, x.episode_return) for x in records]

@@ -20,20 +20,21 @@ Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
 
 AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
-#: Those of the figures that compare two.
+#: The agents of the figures that compare two.
 PAIR = ("ppo", "ppo+gasil")
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
-#: The reward is given every so many steps where it is delayed (paper, section 5.4).
+#: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
 #: Noise on walker2d's observations in its search: the middle of the paper's three.
 NOISE = 0.1
-#: Environments a seed. More where physics is slow: a GPU is fast only with thousands.
+#: Environments per seed: more where physics is slow, because a GPU is fast only with
+#: thousands of environments.
 NUM_ENVS, NUM_ENVS_OF = 32, {"ant": 64, "humanoid": 64}
 #: The runs of these figures and searches had all environments reset together.
 STAGGER_EPISODES, ALGORITHM_VERSION = False, 1
 
 _RATES = (3e-4, 1e-4, 5e-5, 3e-5)
-# PPO's search shows what the lower two cost in 1M steps.
+# PPO's search shows how much the lower two rates cost in 1M steps.
 _RATE, _HIGHER = {"learning_rate": _RATES}, {"learning_rate": _RATES[:2]}
 _COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
 #: What each agent's search draws from.
@@ -64,11 +65,11 @@ _OTHER_SPACES: Mapping[tuple[str, str], Space] = {
 #: Steps of a run in a search where they are not 1M; humanoid's figure has three times
 #: as many.
 STEPS = {"point_mass": 500_000, "humanoid": 333_000}
-# In the first stage so many runs; in the second so many points and seeds.
+# Runs of the first stage; points of the second stage, and their seeds.
 _RUNS, _RUNS_OF = 32, {"ant": 16, "humanoid": 16}
 _BEST, _SEEDS, _SEEDS_OF = 4, 4, {"ant": 2, "humanoid": 2}
 _FIRST_SEED, _SECOND_SEED = 1000, 2000
-#: Points that have so many seeds are not tried again.
+#: With this number of seeds in the first stage there is no second stage.
 _ENOUGH_SEEDS = 8
 # Multiplication by 1, 2 and 3 in the field of four elements; its sum is exclusive or.
 _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
