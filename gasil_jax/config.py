@@ -158,6 +158,21 @@ class Config:
     """Replayed steps in one gradient step on PPO+SIL's loss."""
     sil_buffer_steps: int = _count(50_000)
     """Capacity of PPO+SIL's replay buffer, in steps."""
+    discriminator_gradient_penalty: float = _number(0.0, 0.0)
+    """Weight of the penalty on the discriminator's gradient with respect to its input,
+    which is pulled to norm 1 between good pairs and the policy's (as in WGAN-GP)."""
+    discriminator_normalizes_actions: bool = False
+    """Whether the discriminator sees actions in units of the batch's mean and standard
+    deviation; otherwise as they are."""
+    buffer_episodes: int | None = _count(None)
+    """Number of episodes that the good-trajectory buffer keeps at most, beside its
+    capacity in steps; None for any number."""
+    buffer_discounts: bool = True
+    """Whether the good-trajectory buffer ranks episodes by their discounted return, as
+    the paper does; otherwise by the undiscounted one."""
+    sample_by_return: bool = False
+    """Whether good steps are drawn with weights exp(R / s), with R the return of their
+    episode and s its standard deviation over the buffer; otherwise uniformly."""
     learning_rate_schedule: Schedule = ()
     """Factor that multiplies the learning rate, over environment steps: STEPS FACTOR
     pairs, linear between them (from Python also any Optax schedule)."""
@@ -247,7 +262,15 @@ def validate(config: Config, agents: Sequence[str]) -> None:
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))
     _validate_sizes(config)
-    for name in ("normalize_rewards", "decompose_rewards", "stagger_episodes"):
+    switches = (
+        "normalize_rewards",
+        "decompose_rewards",
+        "stagger_episodes",
+        "discriminator_normalizes_actions",
+        "buffer_discounts",
+        "sample_by_return",
+    )
+    for name in switches:
         if not isinstance(value := getattr(config, name), bool):
             raise ValueError(f"{name} is {value!r}: it must be True or False")
     for name in ("num_envs", "minibatch_size"):
@@ -265,7 +288,7 @@ def validate(config: Config, agents: Sequence[str]) -> None:
 def _validate_sizes(config: Config) -> None:
     for name, allowed in ranges(Config).items():
         value = getattr(config, name)
-        if value is None and name == "max_episode_steps":
+        if value is None and name in ("max_episode_steps", "buffer_episodes"):
             continue
         is_list = name.endswith("_sizes")
         if is_list and not isinstance(value, tuple):

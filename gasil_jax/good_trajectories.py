@@ -13,6 +13,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+#: Settings of the buffer, which all agents that imitate it use.
+FIELDS = ("buffer_steps", "buffer_episodes", "buffer_discounts", "sample_by_return")
+
 # Shape letters: C capacity in steps, E offered episodes, H steps of history per
 # environment, N environments.
 
@@ -175,6 +178,7 @@ def insert(
     history: History,
     episodes: Episodes,
     max_steps: jax.Array | float | None = None,
+    max_episodes: int | None = None,
 ) -> GoodTrajectories:
     """Return the buffer with the best `capacity` of its own and the offered steps.
 
@@ -185,6 +189,7 @@ def insert(
         every episode with a step that is not finite must have such a return.
       max_steps: a smaller capacity, (), which may be traced. A buffer must always be
         given the same one.
+      max_episodes: number of episodes to keep at most; None for any number.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
     """
@@ -209,6 +214,9 @@ def insert(
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
     order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
+    if max_episodes is not None:
+        # Entries of length 0 come last, so the first ones are the best episodes.
+        length = length.at[order[max_episodes:]].set(0)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
     if max_steps is not None:
@@ -240,16 +248,39 @@ def insert(
 
 
 def sample(
-    key: jax.Array, good_trajectories: GoodTrajectories, num_samples: int
+    key: jax.Array,
+    good_trajectories: GoodTrajectories,
+    num_samples: int,
+    by_return: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
-    """Draw steps uniformly with replacement: (samples, obs), (samples, action).
+    """Draw steps with replacement: (samples, obs), (samples, action).
 
     An empty buffer gives zeros, so check ``size`` first. The key is consumed.
+
+    Args:
+      key: random key; consumed.
+      good_trajectories: the buffer.
+      num_samples: number of steps.
+      by_return: draw with the probabilities `return_weights`; otherwise uniformly.
     """
     uniform = jax.random.uniform(key, (num_samples,))
-    index = (uniform * good_trajectories.size).astype(jnp.int32)
+    if by_return:
+        cumulative = jnp.cumsum(return_weights(good_trajectories))
+        index = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
+    else:
+        index = (uniform * good_trajectories.size).astype(jnp.int32)
     index = jnp.clip(index, 0, jnp.maximum(good_trajectories.size - 1, 0))
     return good_trajectories.observation[index], good_trajectories.action[index]
+
+
+def return_weights(good_trajectories: GoodTrajectories) -> jax.Array:
+    """Return exp((R - best R) / deviation of R) of each step, (C,); 0 where empty."""
+    filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
+    return_ = jnp.where(filled, good_trajectories.return_, 0.0)
+    deviation = jnp.std(return_, where=filled)
+    # The best episode comes first.
+    excess = (return_ - return_[0]) / jnp.maximum(deviation, 1e-8)
+    return jnp.where(filled, jnp.exp(excess), 0.0)
 
 
 def mean_return(good_trajectories: GoodTrajectories) -> jax.Array:

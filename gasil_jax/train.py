@@ -170,11 +170,20 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Sample policy trajectories.
     environments, batch = sample_trajectories(
-        env, config, state, act_key, policy=policy, gamma=hyperparameters.gamma
+        env,
+        config,
+        state,
+        act_key,
+        policy=policy,
+        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
     )
     # Update the good trajectory buffer.
     history, buffer = remember(
-        state.history, state.good_trajectories, batch, hyperparameters.buffer_steps
+        state.history,
+        state.good_trajectories,
+        batch,
+        max_steps=hyperparameters.buffer_steps,
+        max_episodes=config.buffer_episodes,
     )
     # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
     rewards, reward_metrics = learner_rewards(
@@ -263,7 +272,7 @@ def sample_trajectories(
       state: with the policy and the running episodes.
       key: consumed.
       policy: (params, normalized observation) -> mean, log standard deviation.
-      gamma: discount of the episodes' returns.
+      gamma: discount of the returns by which the buffer ranks episodes.
 
     Returns:
       the running episodes after the batch, and the batch, (time, env, ...).
@@ -286,7 +295,9 @@ def remember(
     history: good_trajectories.History,
     buffer: good_trajectories.GoodTrajectories,
     batch: Rollout,
-    buffer_steps: jax.Array | float,
+    *,
+    max_steps: jax.Array | float,
+    max_episodes: int | None = None,
 ) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
     """Record a batch, and offer the whole episodes that ended in it to the buffer.
 
@@ -294,7 +305,8 @@ def remember(
       history: the last steps of each environment, before the batch.
       buffer: the good trajectories so far.
       batch: of the environment's own reward.
-      buffer_steps: how many steps the buffer keeps, ().
+      max_steps: number of steps that the buffer keeps at most, ().
+      max_episodes: number of episodes that it keeps at most; None for any number.
     """
     history = good_trajectories.record(
         history,
@@ -307,7 +319,9 @@ def remember(
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length
     )
-    return history, good_trajectories.insert(buffer, history, episodes, buffer_steps)
+    return history, good_trajectories.insert(
+        buffer, history, episodes, max_steps, max_episodes
+    )
 
 
 class Rewards(NamedTuple):

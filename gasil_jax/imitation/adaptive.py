@@ -158,7 +158,12 @@ PPO_GASIL_ADAPTIVE = Imitation(
     _init,
     _update_and_reward,
     leave_policy,
-    fields=("imitation_weight", "imitation_rule", *adversarial.FIELDS, "buffer_steps"),
+    fields=(
+        "imitation_weight",
+        "imitation_rule",
+        *adversarial.FIELDS,
+        *good_trajectories.FIELDS,
+    ),
     num_streams=2,
     mix=_mix,
 )

@@ -95,8 +95,34 @@ def loss(
         "discriminator_loss": -log_likelihood,
         "discriminator_policy_probability": jnp.mean(jax.nn.sigmoid(policy_logit)),
         "discriminator_good_probability": jnp.mean(jax.nn.sigmoid(good_logit)),
+        "discriminator_policy_accuracy": jnp.mean(policy_logit > 0),
+        "discriminator_good_accuracy": jnp.mean(good_logit < 0),
     }
     return -log_likelihood - entropy_coefficient * entropy, metrics
+
+
+def gradient_penalty(
+    logit: Callable[..., jax.Array], policy_pair: Any, good_pair: Any, share: jax.Array
+) -> jax.Array:
+    """Return the mean of (|gradient of the logit| - 1)^2 between pairs, ().
+
+    See Gulrajani et al. 2017, algorithm 1.
+
+    Args:
+      logit: (observation, action) -> (minibatch,), the logit of D.
+      policy_pair: observation (minibatch, obs) and action (minibatch, action).
+      good_pair: the same, from the buffer.
+      share: (minibatch,), from 0 to 1; where between the pairs the gradient is taken.
+    """
+    between = jax.tree.map(
+        lambda x, y: share[:, None] * x + (1.0 - share[:, None]) * y,
+        policy_pair,
+        good_pair,
+    )
+    gradients = jax.grad(lambda pair: jnp.sum(logit(*pair)))(between)
+    squares = sum(jnp.sum(x**2, axis=-1) for x in gradients)
+    # The root of 0 has no gradient.
+    return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
 def _network(config: Config) -> Any:
@@ -134,7 +160,9 @@ class Source(NamedTuple):
 def _sample_good(
     key: jax.Array, context: Context, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
-    return good_trajectories.sample(key, context.good_trajectories, num_samples)
+    return good_trajectories.sample(
+        key, context.good_trajectories, num_samples, context.config.sample_by_return
+    )
 
 
 def _sample_expert(
@@ -150,6 +178,21 @@ GOOD_TRAJECTORIES = Source(
     _sample_good, lambda context: context.good_trajectories.size > 0
 )
 _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
+
+
+def _input(
+    context: Context,
+) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+    """Return the function from pairs to what the discriminator sees of them."""
+    batch = normalization.init(context.rollout.action.shape[-1])
+    batch = normalization.update(batch, context.rollout.action)
+
+    def enter(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
+        if context.config.discriminator_normalizes_actions:
+            action = normalization.normalize(batch, action)
+        return normalization.normalize(context.normalizer, observation), action
+
+    return enter
 
 
 def _train_discriminator(
@@ -168,25 +211,32 @@ def _train_discriminator(
     action = rollout.action.reshape(-1, rollout.action.shape[-1])
     minibatch_size = config.discriminator_minibatch_size
 
-    def objective(params: Any, policy_pair: Any, good_pair: Any) -> Any:
-        return loss(
+    enter = _input(context)
+    penalty = config.discriminator_gradient_penalty
+
+    def objective(params: Any, policy_pair: Any, good_pair: Any, key: Any) -> Any:
+        value, metrics = loss(
             network.apply(params, *policy_pair),
             network.apply(params, *good_pair),
             hyperparameters.discriminator_entropy_coefficient,
         )
+        if penalty:
+            share = jax.random.uniform(key, (minibatch_size,))
+            logit = lambda *pair: network.apply(params, *pair)
+            value += penalty * gradient_penalty(logit, policy_pair, good_pair, share)
+        return value, metrics
 
     def step(state: Learner, key_and_counts: tuple[Any, Any]) -> Any:
         key, counts = key_and_counts
-        policy_key, good_key = jax.random.split(key)
+        policy_key, good_key, between_key = jax.random.split(key, 3)
         rows = jax.random.randint(
             policy_key, (minibatch_size,), 0, observation.shape[0]
         )
-        normalize = lambda x: normalization.normalize(context.normalizer, x)
-        good_observation, good_action = source.sample(good_key, context, minibatch_size)
         gradient, metrics = jax.grad(objective, has_aux=True)(
             state.params,
-            (normalize(observation[rows]), action[rows]),
-            (normalize(good_observation), good_action),
+            enter(observation[rows], action[rows]),
+            enter(*source.sample(good_key, context, minibatch_size)),
+            between_key,
         )
         stepped = learner.descend(
             state, gradient, transform, hyperparameters.discriminator_learning_rate
@@ -229,8 +279,8 @@ def update_and_score(
     """
     state, metrics = _train_discriminator(state, source, context, key)
     rollout = context.rollout
-    observation = normalization.normalize(context.normalizer, rollout.observation)
-    logit = _network(context.config).apply(state.params, observation, rollout.action)
+    pairs = _input(context)(rollout.observation, rollout.action)
+    logit = _network(context.config).apply(state.params, *pairs)
     form = BONUSES[context.config.bonus]
     return state, jnp.where(source.is_ready(context), form(logit), 0.0), metrics
 
@@ -265,9 +315,11 @@ FIELDS = (
     "discriminator_entropy_coefficient",
     "discriminator_updates",
     "discriminator_minibatch_size",
+    "discriminator_gradient_penalty",
+    "discriminator_normalizes_actions",
 )
 _FIELDS = ("alpha", *FIELDS)
-_FIELDS_OF_BUFFER = (*_FIELDS, "buffer_steps")
+_FIELDS_OF_BUFFER = (*_FIELDS, *good_trajectories.FIELDS)
 
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(

@@ -39,7 +39,10 @@ def _update_policy(
 
     def step(policy: Learner, key: jax.Array) -> Any:
         observation, action = good_trajectories.sample(
-            key, context.good_trajectories, config.behavior_cloning_minibatch_size
+            key,
+            context.good_trajectories,
+            config.behavior_cloning_minibatch_size,
+            config.sample_by_return,
         )
         observation = normalization.normalize(context.normalizer, observation)
         gradient, value = jax.grad(objective, has_aux=True)(
@@ -66,7 +69,7 @@ PPO_BC = Imitation(
     plain_reward,
     _update_policy,
     fields=(
-        "buffer_steps",
+        *good_trajectories.FIELDS,
         "behavior_cloning_coefficient",
         "behavior_cloning_updates",
         "behavior_cloning_minibatch_size",

@@ -130,3 +130,26 @@ def test_a_form_that_does_not_exist_is_refused():
         gasil_jax.make_train(ENV, SMALL.replace(bonus="softmax"))
     with pytest.raises(ValueError, match=r"imitation_rule 'bot' is unknown: .*'both'"):
         gasil_jax.make_train(ENV, SMALL.replace(imitation_rule="bot"))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"discriminator_gradient_penalty": 10.0},
+        {"discriminator_normalizes_actions": True},
+        {"buffer_episodes": 1},
+        {"buffer_discounts": False},
+        {"sample_by_return": True},
+    ],
+)
+def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):
+    run = lambda config: jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
+    config = SMALL.replace(agent="gasil", total_steps=768, buffer_steps=300)
+    (plain, _), (state, metrics) = run(config), run(config.replace(**change))
+    kernels = [jax.tree.leaves(x.imitation.params)[0] for x in (plain, state)]
+    assert not np.allclose(*kernels, atol=1e-7)
+    assert np.all(metrics["skipped_updates"] == 0)
+    if "buffer_episodes" in change:
+        assert state.good_trajectories.size == 50
+    if "buffer_discounts" in change:
+        assert metrics["good_return"][-1] > 1.02 * run(config)[1]["good_return"][-1]

@@ -34,3 +34,25 @@ def test_entropy_is_the_bernoulli_entropy():
     without = adversarial.loss(half, half, 0.0)[0]
     with_entropy = adversarial.loss(half, half, 1.0)[0]
     np.testing.assert_allclose(without - with_entropy, entropy, rtol=1e-5)
+
+
+def test_the_gradient_penalty_is_its_formula():
+    """For a logit w . (s, a) + (a ^ 2) / 2, whose gradient is known."""
+    rng = np.random.default_rng(0)
+    observations, actions = rng.normal(size=(2, 5, 3)), rng.normal(size=(2, 5, 2))
+    w, share = rng.normal(size=5), rng.random(5)
+    logit = lambda s, a: jnp.concatenate([s, a], -1) @ w + 0.5 * jnp.sum(a**2, -1)
+    between = share[:, None] * actions[0] + (1 - share[:, None]) * actions[1]
+    gradient = np.concatenate([np.tile(w[:3], (5, 1)), w[3:] + between], axis=-1)
+    expected = np.mean((np.linalg.norm(gradient, axis=-1) - 1) ** 2)
+    pairs = [(jnp.array(observations[i]), jnp.array(actions[i])) for i in range(2)]
+    result = adversarial.gradient_penalty(logit, *pairs, jnp.array(share))
+    np.testing.assert_allclose(result, expected, rtol=1e-4)
+
+
+def test_accuracy_is_the_share_that_is_told_apart():
+    metrics = adversarial.loss(
+        jnp.array([2.0, -1.0, 3.0, 1.0]), jnp.array([-1.0, 4.0]), 0.0
+    )[1]
+    assert metrics["discriminator_policy_accuracy"] == 0.75
+    assert metrics["discriminator_good_accuracy"] == 0.5

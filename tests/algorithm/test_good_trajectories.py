@@ -1,5 +1,7 @@
 """The buffer against a plain Python list that does the same."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,9 +16,10 @@ CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
 class ListBuffer:
     """All steps ever offered, sorted; the first `capacity` are the buffer."""
 
-    def __init__(self):
+    def __init__(self, max_episodes=None):
         self.steps = []  # (-return, episode, time, observation)
         self.episodes = 0
+        self.max_episodes = max_episodes
 
     def insert(self, return_, observations):
         if np.isfinite(return_):
@@ -25,17 +28,31 @@ class ListBuffer:
                 for time, observation in enumerate(observations)
             ]
         self.episodes += 1
-        self.steps = sorted(self.steps)[:CAPACITY]
+        best = sorted({step[:2] for step in self.steps})[: self.max_episodes]
+        self.steps = [step for step in sorted(self.steps) if step[:2] in best]
+        self.steps = self.steps[:CAPACITY]
 
 
-@jax.jit
-def push(buffer, history, observation, ended, return_, length, max_steps=None):
+@functools.partial(jax.jit, static_argnames="max_episodes")
+def push(
+    buffer,
+    history,
+    observation,
+    ended,
+    return_,
+    length,
+    max_steps=None,
+    max_episodes=None,
+):
     action = -observation
     history = good_trajectories.record(
         history, observation, action, jnp.zeros_like(return_), ended
     )
     episodes = good_trajectories.ended_episodes(history, ended, return_, length)
-    return good_trajectories.insert(buffer, history, episodes, max_steps), history
+    buffer = good_trajectories.insert(
+        buffer, history, episodes, max_steps, max_episodes
+    )
+    return buffer, history
 
 
 def empty(capacity=CAPACITY):
@@ -59,10 +76,10 @@ batches = st.lists(
 )
 
 
-def replay(batches):
+def replay(batches, max_episodes=None):
     """Play batches of (ends, return) into the buffer and into the list."""
     buffer, history = empty()
-    reference = ListBuffer()
+    reference = ListBuffer(max_episodes)
     running = [[] for _ in range(NUM_ENVS)]
     counter = 0.0
     for batch in batches:
@@ -81,14 +98,22 @@ def replay(batches):
                     ended[time, env] = True
                     reference.insert(value, running[env])
                     running[env] = []
-        buffer, history = push(buffer, history, observation, ended, return_, length)
+        buffer, history = push(
+            buffer,
+            history,
+            observation,
+            ended,
+            return_,
+            length,
+            max_episodes=max_episodes,
+        )
     return buffer, reference
 
 
 @settings(max_examples=150, deadline=None)
-@given(batches)
-def test_buffer_equals_a_sorted_list(batches):
-    buffer, reference = replay(batches)
+@given(batches, st.sampled_from([None, 1, 2]))
+def test_buffer_equals_a_sorted_list(batches, max_episodes):
+    buffer, reference = replay(batches, max_episodes)
     expected = reference.steps
     size = int(buffer.size)
     assert size == len(expected) <= CAPACITY
@@ -135,6 +160,22 @@ def test_samples_come_uniformly_from_the_filled_part():
     values, counts = np.unique(np.asarray(observation), return_counts=True)
     np.testing.assert_array_equal(values, [1, 3, 5])
     assert np.all(np.abs(counts - 1000) < 150)
+
+
+def test_samples_by_return_prefer_the_best_episodes():
+    going = (False, 0.0)
+    rows = [[(True, 3.0), (True, 1.0)], [going, (True, 2.0)], [(True, 3.0), going]]
+    buffer, _ = replay([rows])
+    size = int(buffer.size)
+    return_ = np.asarray(buffer.return_)[:size]
+    expected = np.exp((return_ - return_.max()) / return_.std())
+    weights = good_trajectories.return_weights(buffer)
+    np.testing.assert_allclose(weights[:size], expected, rtol=1e-5)
+    assert np.all(weights[size:] == 0)
+    drawn, _ = good_trajectories.sample(jax.random.key(0), buffer, 6000, by_return=True)
+    for observation, weight in zip(buffer.observation[:size], expected, strict=True):
+        share = np.mean(np.asarray(drawn) == np.asarray(observation))
+        assert abs(share - weight / expected.sum()) < 0.03
 
 
 def test_vmapped_insertion_equals_one_by_one():
