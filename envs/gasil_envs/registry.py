@@ -118,12 +118,14 @@ def prepare(settings: Settings, num_devices: int) -> None:
         native.reserve_threads(num_devices)
 
 
-def make(name: str, **settings: Any) -> Env:
+def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
       name: one of `names()`; "brax:" and a name in ``brax.envs``; or MODULE:NAME of
         your own class or function that builds an environment with Brax's interface.
+      max_episode_steps: number of steps after which an episode is truncated; default
+        the environment's own limit, or 1000 if it has none.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator.
 
@@ -134,6 +136,14 @@ def make(name: str, **settings: Any) -> Env:
     check(name, chosen)
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
+    if max_episode_steps is not None:
+        whole = isinstance(max_episode_steps, int)
+        if not (whole and 1 <= max_episode_steps <= limit):
+            raise ValueError(
+                f"max_episode_steps is {max_episode_steps!r}: it must be a whole "
+                f"number from 1 to {limit}, the environment's own limit"
+            )
+        limit = max_episode_steps
     env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)

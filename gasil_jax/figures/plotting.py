@@ -1,10 +1,12 @@
-"""Draw learning curves and the point mass' layout."""
+"""Draw learning curves."""
 
 import pathlib
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+
+from gasil_envs.pictures import point_mass_layout as point_mass_layout
 
 #: Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -45,28 +47,6 @@ def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=dpi)
     plt.close(figure)
-
-
-def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
-    """Draw the point mass' box and objects; `collected` ones, (objects,), are pale."""
-    import matplotlib.pyplot as plt
-
-    kinds = (
-        (layout.blue, "#0072B2", layout.blue_reward),
-        (layout.green, "#009E73", layout.green_reward),
-        (layout.orange, "#E69F00", layout.orange_reward),
-    )
-    objects = [(x, y, c, r) for centres, c, r in kinds for x, y in centres]
-    for (x, y, color, reward), taken in zip(objects, collected, strict=True):
-        alpha = 0.12 if taken else 0.6
-        axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=alpha))
-        axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
-    (x, y), spread = layout.start, layout.start_spread
-    corner = (x - spread, y - spread)
-    axes.add_patch(
-        plt.Rectangle(corner, 2 * spread, 2 * spread, color="0.85", zorder=0)
-    )
-    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")
 
 
 def learning_curve(
