@@ -158,6 +158,11 @@ def _in_one_line(refusal: str) -> str:
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
+def note(text: str) -> None:
+    """Print a line to stderr about something that is allowed but may surprise."""
+    print(f"note: {text}", file=sys.stderr)
+
+
 def check_least(options: Any, **least: int) -> None:
     """Check that numbers are not below their lowest allowed values; None is allowed.
 

@@ -13,11 +13,17 @@ __all__ = [
     "Settings",
     "available_cores",
     "check",
+    "ends_early",
     "is_locomotion",
     "is_point_mass",
     "make_env",
     "prepare",
 ]
+
+
+def ends_early(env: Any) -> bool:
+    """Return whether an episode may end before its step limit; true if unknown."""
+    return getattr(env.unwrapped, "ends_early", True)
 
 
 def is_locomotion(env: Any) -> bool:

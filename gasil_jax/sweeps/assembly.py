@@ -10,10 +10,13 @@ from typing import Any
 
 import jax
 
+from gasil_jax import train as training
+from gasil_jax.config import Config
 from gasil_jax.host import (
     command_line,
     devices,
     driver,
+    environments,
     resources,
     run_folder,
     trackers,
@@ -91,7 +94,22 @@ def prepare(
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
         )
+    tell_if_no_episode_ends(env, [program.config for program in programs])
     return env
+
+
+def tell_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
+    """Print a note if no episode can end within the steps of an environment."""
+    for config in configs:
+        steps = config.num_iterations * config.num_steps
+        limit = training.max_episode_steps(env, config)
+        if steps < limit and not environments.ends_early(env):
+            command_line.note(
+                f"no return will be known: each of {config.num_envs} environments "
+                f"takes {steps:,} steps, and an episode has {limit:,}: give fewer "
+                "--num-envs or more --total-steps"
+            )
+            return
 
 
 def train(
@@ -119,10 +137,12 @@ def train(
     schedule = driver.CheckpointSchedule(
         options.checkpoint_every, options.keep_checkpoints
     )
+    num_members = sum(len(job.program.members) for job in jobs)
+    total_steps = options.config.total_steps * num_members
     steps_before = 0
     with (
         Interruption() as interruption,
-        Progress(title, sum(job.env_steps for job in jobs)) as progress,
+        Progress(title, total_steps, num_members) as progress,
     ):
         for job in jobs:
             if not job.finished:

@@ -5,10 +5,14 @@ import json
 import resource
 import subprocess
 import sys
+import types
 
 import pytest
 
+import gasil_jax
+from gasil_envs import locomotion
 from gasil_jax.run import main
+from gasil_jax.sweeps import assembly
 
 SMALL = (
     "--env",
@@ -176,3 +180,21 @@ def test_a_refusal_takes_less_than_five_seconds(tmp_path):
     assert result.stdout == "" and len(result.stderr.splitlines()) == 1
     assert "did you mean 'hopper'" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_in_which_no_episode_can_end_is_told(capsys):
+    env = gasil_jax.make_env("point_mass")
+    # 3 iterations of 16 steps in each environment; an episode has 50.
+    short = gasil_jax.Config(total_steps=40, num_envs=1, batch_steps=16)
+    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50), short])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no return will be known: each of 1 environments takes 48 steps" in line
+    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50)])
+    # Where episodes may end early, they may end within few steps.
+    monopod = types.SimpleNamespace(episode_length=1000)
+    monopod.unwrapped = monopod
+    assembly.tell_if_no_episode_ends(monopod, [short])
+    assert capsys.readouterr().err == ""
+    for name, task in locomotion.TASKS.items():
+        ends = locomotion.Locomotion.ends_early.fget(types.SimpleNamespace(task=task))
+        assert ends == (name not in ("halfcheetah", "swimmer")), name
