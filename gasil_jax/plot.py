@@ -68,16 +68,18 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
             f"run is {folder}, a sweep: its plot is sweep.png, and its curves are in "
             "curves.npz"
         )
-    path, evaluations = folder / "evaluations.csv", None
+    read_table = lambda name, column: metrics_files.read_metrics(
+        folder / name, ("seed",), described["seeds"], (column,)
+    )
+    evaluations, path = None, folder / "evaluations.csv"
     # The file may still be empty.
     if path.is_file() and path.stat().st_size:
-        evaluations = metrics_files.read_metrics(path, ("seed",), described["seeds"])
+        evaluations = read_table("evaluations.csv", "mean")
     path = folder / "metrics.csv"
-    try:
-        metrics = metrics_files.read_metrics(path, ("seed",), described["seeds"])
-        steps, returns = metrics["env_steps"][0], metrics["episode_return"]
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise InputError(f"{path} has no curves to draw ({error})") from None
+    if not (path.is_file() and path.stat().st_size):
+        raise InputError(f"{path} has no curves to draw yet")
+    metrics = read_table("metrics.csv", "episode_return")
+    steps, returns = metrics["env_steps"][0], metrics["episode_return"]
     count = min(_POINTS, len(steps))
     # Training is divided into this many equal parts.
     parts = np.array_split(np.arange(len(steps)), count)
@@ -150,7 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.plot")
-    labels = options.labels or (None,) * len(options.runs)
+    # Matplotlib would read formulas between dollars.
+    labels = [label.replace("$", r"\$") for label in options.labels]
+    labels = labels or [None] * len(options.runs)
     if not options.runs:
         raise InputError("runs is empty: name one folder or more")
     if len(labels) != len(options.runs):

@@ -34,6 +34,8 @@ from gasil_jax.sweeps import saved_states
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
+# Of a frame, in pixels: all frames are in memory at once.
+_LARGEST_SIZE = 4096
 
 
 @dataclasses.dataclass(frozen=True)
@@ -206,7 +208,13 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"out is {options.out}: an .mp4 needs the package imageio-ffmpeg (pip "
             'install "gasil_jax[render]"); a .gif or .png needs nothing'
         )
-    command_line.check_least(options, steps=1, width=1, height=1)
+    command_line.check_least(options, steps=1)
+    for name in ("width", "height"):
+        if not 1 <= getattr(options, name) <= _LARGEST_SIZE:
+            raise InputError(
+                f"{name} is {getattr(options, name)}: it must be from 1 to "
+                f"{_LARGEST_SIZE}"
+            )
     command_line.check_key(options.key)
     # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)

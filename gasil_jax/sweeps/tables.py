@@ -8,19 +8,18 @@ many hosts.
 
 import csv
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures.statistics import final_returns
-from gasil_jax.host import metrics_files
+from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.points import Point
+from gasil_jax.sweeps.points import Point, check_saved
 from gasil_jax.sweeps.shards import Program
 
 #: The columns of metrics.csv that identify the members.
@@ -46,6 +45,20 @@ def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> N
     metrics_files.write_json(program.folder(folder) / _TRAINING, content)
 
 
+class _Training(TypedDict):
+    """The content of training.json."""
+
+    iterations: int
+    members: int
+    env_steps: int
+    compile_seconds: float
+    train_seconds: float
+    evaluation_seconds: NotRequired[float | None]
+    device: str
+    device_count: int
+    versions: dict[str, str | None]
+
+
 def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
     """Return what `write_training` wrote; None if the program is not yet finished.
 
@@ -54,12 +67,11 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
       program: the program, whose config says where its end is.
     """
     try:
-        content = json.loads((program.folder(folder) / _TRAINING).read_text())
-        ended = content["iterations"] == program.config.num_iterations
-        same = content["members"] == len(program.members)
-    except (OSError, ValueError, KeyError, TypeError):
+        content = json_reader.read(program.folder(folder) / _TRAINING, _Training)
+    except (OSError, ValueError):
         return None
-    return content if ended and same else None
+    ended = content["iterations"] == program.config.num_iterations
+    return content if ended and content["members"] == len(program.members) else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +88,12 @@ class Trained:
 
     @classmethod
     def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
-        """Return the programs of a folder, from its config.json (`run_folder.read`)."""
+        """Return the programs of a folder, from its config.json (`run_folder.read`).
+
+        Raises:
+          InputError: if its points can't be trained.
+        """
+        check_saved(content["points"], content["config"], folder / "config.json")
         first = content["first_seed"]
         seeds = range(first, first + content["seeds"])
         programs = shards.programs(
@@ -107,7 +124,9 @@ class Trained:
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
-            every |= self._table(program, "metrics.csv", program.config.num_iterations)
+            required = ("episode_return", *metrics_files.SUMMARIZED)
+            rows = program.config.num_iterations
+            every |= self._table(program, "metrics.csv", required, rows)
         return every
 
     def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
@@ -119,20 +138,26 @@ class Trained:
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program, training in zip(self.programs, self.trainings(), strict=True):
             if training.get("evaluation_seconds") is not None:
-                every |= self._table(program, "evaluations.csv")
+                every |= self._table(program, "evaluations.csv", ("mean",))
         return every
 
     def _table(
-        self, program: Program, name: str, rows: int | None = None
+        self,
+        program: Program,
+        name: str,
+        required: Sequence[str],
+        rows: int | None = None,
     ) -> dict[Member, dict[str, np.ndarray]]:
-        """Return a program's complete table by member, checking a member's `rows`."""
+        """Return a program's complete table by member, checking columns and `rows`."""
         path, config = program.folder(self.folder) / name, program.config
         try:
-            columns = metrics_files.read_metrics(path, LABELS, len(program.members))
-            steps = columns["env_steps"][0]
-            whole = steps[-1] == config.num_iterations * config.batch_steps
-        except (OSError, ValueError, KeyError, IndexError) as error:
+            columns = metrics_files.read_metrics(
+                path, LABELS, len(program.members), required
+            )
+        except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
+        steps = columns["env_steps"][0]
+        whole = steps[-1] == config.num_iterations * config.batch_steps
         if not whole or rows not in (None, len(steps)):
             raise InputError(f"{path} is damaged: it lacks iterations")
         return {
