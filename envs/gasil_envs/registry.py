@@ -2,11 +2,16 @@
 
 import dataclasses
 import difflib
+import importlib.metadata
 import math
+import numbers
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import brax.envs
+import jax
+import jax.numpy as jnp
 from brax.envs import Env
 
 from gasil_envs import locomotion, own_environment, point_mass, wrappers
@@ -52,8 +57,10 @@ def _constructors() -> dict[str, Callable[[Settings], Env]]:
     }
 
 
-def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
+def _refuse_unknown(kind: str, name: Any, allowed: Iterable[str]) -> None:
     allowed = tuple(allowed)
+    if not isinstance(name, str):
+        raise ValueError(f"{kind} is {name!r}: it must be one of {', '.join(allowed)}")
     if name in allowed:
         return
     nearest = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
@@ -79,14 +86,32 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     Raises:
       ValueError: if the name is unknown.
     """
-    if name.startswith(BRAX):
+    if isinstance(name, str) and name.startswith(BRAX):
         _refuse_unknown("env", name, [BRAX + x for x in brax.envs._envs])
-        return lambda settings: brax.envs.get_environment(name.removeprefix(BRAX))
-    if ":" in name:
+        return lambda settings: _build_of_brax(name)
+    if isinstance(name, str) and ":" in name:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
     _refuse_unknown("env", name, names())
     return _constructors()[name]
+
+
+def _build_of_brax(name: str) -> Env:
+    """Build an environment of Brax's and trace a step of it, without running it."""
+    try:
+        with warnings.catch_warnings():
+            # Brax warns that its physics is not maintained.
+            warnings.simplefilter("ignore", UserWarning)
+            env = brax.envs.get_environment(name.removeprefix(BRAX))
+            state = jax.eval_shape(env.reset, jax.random.key(0))
+            jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+    except Exception as error:
+        version = importlib.metadata.version("brax")
+        why = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise ValueError(
+            f"env {name!r} fails within Brax {version} itself: {why}"
+        ) from None
+    return env
 
 
 def check(name: str, settings: Settings) -> None:
@@ -106,10 +131,27 @@ def check(name: str, settings: Settings) -> None:
             f"physics is {settings.physics!r}"
         )
     delay, noise = settings.reward_delay, settings.obs_noise
-    if not isinstance(delay, int) or delay < 1:
-        raise ValueError(f"reward_delay is {delay}: it must be a whole number, from 1")
-    if not 0.0 <= noise < math.inf:
-        raise ValueError(f"obs_noise is {noise}: it must be finite and 0 or more")
+    # Steps are counted in int32.
+    if not isinstance(delay, int) or not 1 <= delay < 2**31:
+        raise ValueError(
+            f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
+            f"{2**31 - 1}"
+        )
+    if not isinstance(noise, numbers.Real) or not 0.0 <= noise < math.inf:
+        raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
+
+
+def without_effect(name: str, settings: Settings) -> list[str]:
+    """Return the names of settings that are changed and that an environment ignores.
+
+    Args:
+      name: one of `names()`, or another name that `check` accepts.
+      settings: settings that `check` accepts.
+    """
+    if ":" in name or name in locomotion.TASKS:
+        return []
+    of_physics = ("physics", "solver", "integrator")
+    return [x for x in of_physics if getattr(settings, x) != getattr(Settings, x)]
 
 
 def prepare(settings: Settings, num_devices: int) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
 from gasil_envs.point_mass import PointMass
-from gasil_envs.registry import Settings, check, make, prepare
+from gasil_envs.registry import Settings, check, make, prepare, without_effect
 
 make_env = make
 
@@ -18,6 +18,7 @@ __all__ = [
     "is_point_mass",
     "make_env",
     "prepare",
+    "without_effect",
 ]
 
 

@@ -19,6 +19,7 @@ from gasil_jax.host import (
     environments,
     resources,
     run_folder,
+    run_options,
     trackers,
 )
 from gasil_jax.host.interruption import Interruption
@@ -66,11 +67,8 @@ def prepare(
     Raises:
       InputError: if the programs do not fit the devices or the disk.
     """
-    devices.use_devices(
-        options.settings,
-        options.devices,
-        sum(len(program.members) for program in programs),
-    )
+    num_members = sum(len(program.members) for program in programs)
+    devices.use_devices(options.settings, options.devices, num_members)
     env = make_env(options)
     schedule = evaluation_schedule(options)
     with announced(options.env, "starting the devices"):
@@ -94,6 +92,7 @@ def prepare(
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
         )
+    run_options.tell_without_effect(options, num_members)
     tell_if_no_episode_ends(env, [program.config for program in programs])
     return env
 
