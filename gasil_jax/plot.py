@@ -113,6 +113,8 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
         1, 3, figsize=(13.0, 4.0), layout="constrained", width_ratios=(3, 2, 2)
     )
     every = np.concatenate([run.final for run in runs])
+    # Matplotlib would read formulas between dollars.
+    labels = [run.label.replace("$", r"\$") for run in runs]
     margin = 0.05 * (np.ptp(every) or 1.0)
     levels = np.linspace(every.min() - margin, every.max() + margin, 200)
     for number, run in enumerate(runs):
@@ -121,11 +123,11 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
         low, high = statistics.bootstrap_interval(run.returns)
         middle = statistics.interquartile_mean(run.returns, axis=0)
         curves.fill_between(run.env_steps, low, high, color=color, alpha=0.2, lw=0)
-        curves.plot(run.env_steps, middle, style, color=color, label=run.label)
+        curves.plot(run.env_steps, middle, style, color=color, label=labels[number])
         if run.evaluations is not None:
             steps = run.evaluations["env_steps"][0]
             middle = statistics.interquartile_mean(run.evaluations["mean"], axis=0)
-            label = f"{run.label}, evaluations"
+            label = f"{labels[number]}, evaluations"
             curves.plot(steps, middle, "--", color=color, lw=1, label=label)
 
         low, high = statistics.bootstrap_interval(run.final)
@@ -138,7 +140,7 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
         profile.plot(levels, share, style, color=color)
     curves.set(xlabel="environment steps", ylabel="episode return")
     curves.legend(frameon=False)
-    bars.set_yticks(range(len(runs)), [run.label for run in runs])
+    bars.set_yticks(range(len(runs)), labels)
     bars.invert_yaxis()
     bars.set(xlabel="final return")
     profile.set(xlabel="final return", ylabel="share of seeds above", ylim=(0, 1.03))
@@ -152,9 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.plot")
-    # Matplotlib would read formulas between dollars.
-    labels = [label.replace("$", r"\$") for label in options.labels]
-    labels = labels or [None] * len(options.runs)
+    labels = options.labels or (None,) * len(options.runs)
     if not options.runs:
         raise InputError("runs is empty: name one folder or more")
     if len(labels) != len(options.runs):

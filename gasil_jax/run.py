@@ -71,7 +71,7 @@ def _write_results(
     read = lambda name, required: metrics_files.read_metrics(
         folder / name, ("seed",), options.seeds, required
     )
-    metrics = read("metrics.csv", ("episode_return", *metrics_files.SUMMARIZED))
+    metrics = read("metrics.csv", (*metrics_files.SUMMARIZED, "faulty_steps"))
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     evaluations = None
     if options.evaluate_every is not None:

@@ -30,8 +30,8 @@ COLUMNS = (
     "explained_variance",
 )
 
-#: The columns of metrics.csv that summaries are made from.
-SUMMARIZED = ("episode_length", "faulty_steps", "skipped_updates")
+#: The columns of metrics.csv that tables and summaries are made from.
+SUMMARIZED = ("episode_return", "episode_length", "skipped_updates")
 
 
 def versions() -> dict[str, str | None]:

@@ -124,8 +124,7 @@ class Trained:
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
-            required = ("episode_return", *metrics_files.SUMMARIZED)
-            rows = program.config.num_iterations
+            required, rows = metrics_files.SUMMARIZED, program.config.num_iterations
             every |= self._table(program, "metrics.csv", required, rows)
         return every
 
