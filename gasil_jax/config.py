@@ -212,6 +212,8 @@ def ranges(kind: type) -> Mapping[str, Range]:
 
 #: Counts and shapes are int32.
 _LARGEST_COUNT = 2**31 - 1
+#: All other numbers are float32.
+_LARGEST_FLOAT = 3.4e38
 
 
 def validate(config: Config, agents: Sequence[str]) -> None:
@@ -263,8 +265,9 @@ def _validate_number(
         is_allowed = False
     if not is_allowed:
         raise _refusal(name, value, allowed)
-    if allowed.whole and value > most:
-        raise _refusal(name, value, f"{allowed} and at most {most}")
+    most = most if allowed.whole else _LARGEST_FLOAT
+    if value > most:
+        raise _refusal(name, value, f"{allowed}, at most {most:g}")
 
 
 def _validate_sizes(config: Config) -> None:

@@ -3,7 +3,6 @@
 import dataclasses
 import difflib
 import importlib.metadata
-import math
 import numbers
 import warnings
 from collections.abc import Callable, Iterable
@@ -137,7 +136,8 @@ def check(name: str, settings: Settings) -> None:
             f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
             f"{2**31 - 1}"
         )
-    if not isinstance(noise, numbers.Real) or not 0.0 <= noise < math.inf:
+    # Numbers are float32.
+    if not isinstance(noise, numbers.Real) or not 0.0 <= noise <= 3.4e38:
         raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
 
 
@@ -190,5 +190,5 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)
     if chosen.obs_noise > 0:
-        env = wrappers.ObservationNoise(env, chosen.obs_noise)
+        env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
     return env

@@ -159,6 +159,7 @@ WRONG = [
         for x in (2**62, 2**2000, True, 1.0, "3", [], 0, math.nan)
     ],
     *[("alpha_schedule", x) for x in schedules_at_fault()],
+    ("alpha", 1e300),
     ("expert", 3),
     ("normalize_rewards", 1),
     ("hyperparameters", 3),
