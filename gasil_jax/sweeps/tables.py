@@ -240,7 +240,7 @@ def write(
         "versions": _joined([training["versions"] for training in trainings]),
     }
     metrics_files.write_json(folder / "summary.json", summary)
-    _plot(folder / "sweep.png", points, final)
+    _plot(folder / "sweep.png", points, final, summary["best_by_mean"])
     return summary
 
 
@@ -324,21 +324,40 @@ def _label(point: Point) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 
-def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> None:
-    """Plot every seed's final return and their mean, in a row for each point."""
+def _plot(
+    path: pathlib.Path,
+    points: Sequence[Point],
+    final: np.ndarray,
+    best: int | None,
+) -> None:
+    """Plot every seed's final return and their mean, in a row for each point.
+
+    Args:
+      path: the image file.
+      points: all points.
+      final: (points, seeds).
+      best: index of the best point by mean, which is marked; None if there is none.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    size = (11.0, 1.4 + 0.35 * len(points))
+    names = {name for point in points for name in point}
+    varied = {x for x in names if len({point.get(x) for point in points}) > 1}
+    size = (8.0, 1.4 + 0.35 * len(points))
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     for row in range(len(points)):
         axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
-        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
-    labels = [_label(point) for point in points]
+        color = "#D55E00" if row == best else "#0072B2"
+        axes.plot(final[row].mean(), row, "|", color=color, markersize=14, mew=2)
+    short = [{x: point[x] for x in point if x in varied} for point in points]
+    labels = [_label(point) or "the sweep's own values" for point in short]
     axes.set_yticks(range(len(points)), labels, fontsize=8)
-    axes.set(xlabel="final return (each seed; the bar is their mean)")
+    if best is not None:
+        axes.get_yticklabels()[best].set(color="#D55E00", weight="bold")
+    axes.set(xlabel=f"final return: {final.shape[1]} seeds, the bar is their mean")
+    axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)
     plt.close(figure)
