@@ -1,37 +1,24 @@
-"""``python -m experiments FIGURE``: train what a figure lacks, write its page.
+"""``python -m experiments NAME``: train a figure's missing runs and write its page.
 
-Without a name it lists the figures and what else there is.
+Without a name it lists the figures and the other commands.
 """
 
 import dataclasses
-import importlib
 import pathlib
 import sys
-from collections.abc import Sequence
-from typing import Annotated
+from collections.abc import Callable, Mapping, Sequence
+from typing import Annotated, Any
 
 import tyro
 
-from experiments import engine, store
+from experiments import benchmark, engine, point_mass_layouts, point_mass_moments, store
 from experiments.figures import FIGURES, Figure
 from experiments.report import Page
-from experiments.store import RESULTS, Run, Store
+from experiments.store import RESULTS, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
-
-_QUICK_STEPS = 100_000
-_OTHERS = {
-    "report": "all pages and plots, and the README's tables, from the stored runs",
-    "merge": "FOLDER: add the runs of another machine's results",
-}
-#: Modules with a command line of their own.
-_MODULES = {
-    "benchmark": "speed and fidelity",
-    "point_mass_layouts": "the search for the point mass' layout",
-    "point_mass_moments": "policies, buffers, discriminator (paper, figures 3 and 4)",
-}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,121 +26,94 @@ class Options:
     """Train the runs that a figure lacks, then write its page.
 
     Attributes:
-      quick: train three seeds of a few panels, 100,000 steps each, below RUNS/quick.
+      quick: train a small version below the folder `runs`: three seeds of the first
+        panel, or of those that `only` names, for 100,000 steps each.
       list: only print the missing runs.
-      report: do not train; write the page from the stored runs.
-      only: panels (or searches) to train; default all.
-      part: I/N: train every N-th run, from the I-th on. Other machines train the
-        others, and `merge` adds their results.
-      processes: number of runs to train at a time, on the CPU, each in a process with
-        its own cores; best with physics mujoco on many cores. By default runs that can
-        share a program are trained together, which is best on a GPU.
-      physics: physics engine of locomotion: mjx or mujoco.
-      devices: number of host devices to shard members over; default one per core.
-      evaluate: episodes of the evaluation after training; 0 for no evaluation.
-      commit: commit of the code, if there is no repository.
-      runs: folder of the training in progress; stopped training continues from there.
-      results: folder of the pages and, below runs/, of the store.
+      only: panels and searches to train; default all.
+      part: I/N: train every N-th run, from the I-th on. Other processes or machines
+        train the others, and `merge` adds another machine's results.
+      results: folder of the pages and, below runs/, of the stored runs. Runs that are
+        stored there are not trained again.
+      setup: how runs are trained.
     """
 
     quick: bool = False
     list: bool = False
-    report: bool = False
     only: tuple[str, ...] = ()
     part: str = "1/1"
-    processes: int | None = None
-    physics: str = "mjx"
-    devices: int | None = None
-    evaluate: int = 0
-    commit: str | None = None
-    runs: pathlib.Path = pathlib.Path("runs", "experiments")
     results: pathlib.Path = RESULTS
+    setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
+        default_factory=engine.Setup
+    )
 
 
-def _selected(figure: Figure, only: Sequence[str]) -> Figure:
+def _selected(figure: Figure, names: Sequence[str]) -> Figure:
     """Return a figure with only the named panels and searches, or all for no names.
 
     Raises:
       InputError: if the figure has no panel or search of that name.
     """
-    names = (*figure.panels, *figure.searches)
-    for name in only:
-        if name not in names:
-            raise InputError(unknown("only", name, names))
-    select = lambda values: {k: x for k, x in values.items() if not only or k in only}
+    allowed = (*figure.panels, *figure.searches)
+    for name in names:
+        if name not in allowed:
+            raise InputError(unknown("only", name, allowed))
+    select = lambda values: {k: x for k, x in values.items() if not names or k in names}
     panels, searches = select(figure.panels), select(figure.searches)
     return dataclasses.replace(figure, panels=panels, searches=searches)
 
 
-def _quick(figure: Figure) -> Figure:
-    """Return a figure with three seeds of each curve and fewer steps."""
-    small = lambda curve: dataclasses.replace(curve, seeds=3, total_steps=_QUICK_STEPS)
+def _small(figure: Figure, names: Sequence[str]) -> Figure:
+    """Return the small version of a figure, of the named panels or the first one."""
+    figure = _selected(figure, names or [*figure.panels][:1])
+    small = lambda x: dataclasses.replace(x, seeds=3, total_steps=100_000)
     panels = {
-        panel: {label: small(curve) for label, curve in curves.items()}
+        panel: {name: small(curve) for name, curve in curves.items()}
         for panel, curves in figure.panels.items()
     }
-    return dataclasses.replace(figure, panels=panels)
+    return dataclasses.replace(figure, panels=panels, searches={})
 
 
-def _quick_runs(figure: Figure, searched: Store) -> list[Run]:
-    """Return its curves' runs, and the searches' first points, one seed each."""
-    curves = dataclasses.replace(figure, searches={})
-    runs = curves.requested(searched, searched)
-    for search in figure.searches.values():
-        for stage in search.stages(searched)[:1]:
-            for run, *_ in search.runs(stage)[:4]:
-                config = run.config.replace(total_steps=_QUICK_STEPS)
-                runs.append(dataclasses.replace(run, config=config))
-    return runs
-
-
-def _figure(name: str, options: Options) -> None:
+def _train(name: str, options: Options) -> None:
+    """Train the runs that a figure lacks, then write its page."""
+    setup, results, figure = options.setup, options.results, FIGURES[name]
     part = shards.parse(options.part, "part")
-    command_line.check_least(options, processes=1, devices=1, evaluate=0)
-    figure, results, work = FIGURES[name], options.results, options.runs
-    if options.processes is not None and options.devices is not None:
-        raise InputError(f"devices is {options.devices}: with processes each has one")
+    command_line.check_least(setup, devices=1, evaluate_episodes=0)
+    if options.quick and results != RESULTS:
+        raise InputError(f"results is {results}: --quick writes below --runs")
     if options.quick:
-        if results != RESULTS:
-            raise InputError(f"results is {results}: --quick writes below --runs")
-        work, results = options.runs / "quick", options.runs / "quick" / "results"
-    chosen = _selected(figure, options.only or (figure.quick if options.quick else ()))
-    chosen = _quick(chosen) if options.quick else chosen
-    runs_of, checked_in = Store(results / "runs"), Store(RESULTS / "runs")
-    # Figures without searches of their own use the checked-in searches.
-    searched = runs_of if figure.searches and not options.quick else checked_in
+        setup = dataclasses.replace(setup, runs=setup.runs / "quick")
+        results, figure = setup.runs / "results", _small(figure, options.only)
+    chosen = _selected(figure, options.only)
 
-    def missing_runs() -> list[Run]:
-        runs = chosen.requested(runs_of, searched)
-        runs = _quick_runs(chosen, checked_in) if options.quick else runs
-        return runs_of.missing(engine.part_of(runs, part))
+    def stores() -> tuple[Store, Store]:
+        """Return the stores of the figure's runs and of the searches' runs."""
+        # They are made anew because other processes may have added runs. A figure
+        # without searches of its own uses those that are checked in.
+        searched = results if figure.searches else RESULTS
+        return Store(results / "runs"), Store(searched / "runs")
 
-    missing = missing_runs()
-    print(f"{name}: {len(missing)} runs are missing", flush=True)
+    while True:
+        stored, searched = stores()
+        requested = chosen.requested(searched)
+        missing = stored.missing(engine.part_of(requested, part))
+        print(f"{name}: {len(missing)} runs are missing", flush=True)
+        if options.list or not missing:
+            break
+        # When a stage of a search has ended, the points of the next one are known.
+        engine.train_missing(missing, stored, setup)
     if options.list:
-        for program in engine.programs(missing, options.physics):
+        for program in engine.programs(missing, setup):
             print(f"  {program}")
         return
-    setup = engine.Setup(
-        work,
-        options.physics,
-        options.devices,
-        options.evaluate,
-        source=engine.source(options.commit),
-    )
-    while missing and not options.report:
-        engine.train_missing(missing, runs_of, setup, options.processes)
-        # When a stage of a search has ended, the points of the next one are known.
-        missing = missing_runs()
-    Page(name, runs_of, searched, chosen if options.quick else None).write(results)
+    Page(name, stored, searched, figure if options.quick else None).write(results)
     print(f"in {results / name}.md")
     if results == RESULTS:
-        Summary(runs_of).write()
+        Summary(stored).write()
 
 
 @dataclasses.dataclass(frozen=True)
 class MergeOptions:
-    """Add the runs of another machine to the store.
+    """Add the runs of another machine's results to the stored ones.
 
     Attributes:
       folder: folder of the other machine's results.
@@ -171,10 +131,10 @@ def _merge(options: MergeOptions) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class ReportOptions:
-    """Write all pages and plots from the stored runs."""
+    """Write all pages and plots, and the README's tables, from the stored runs."""
 
 
-def _report() -> None:
+def _report(options: ReportOptions) -> None:
     stored = Store(RESULTS / "runs")
     for name in FIGURES:
         Page(name, stored).write(RESULTS)
@@ -182,30 +142,37 @@ def _report() -> None:
     print(f"in {RESULTS}")
 
 
+#: Commands that are no figures: their options, and what they do.
+COMMANDS: Mapping[str, tuple[Any, Callable[[Any], None]]] = {
+    "report": (ReportOptions, _report),
+    "merge": (MergeOptions, _merge),
+    "benchmark": (benchmark.Options, benchmark.run),
+    "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
+    "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
+}
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     return command_line.exit_status(lambda: _main(arguments))
 
 
-def _main(arguments: Sequence[str] | None) -> int | None:
+def _main(arguments: Sequence[str] | None) -> None:
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print("python -m experiments NAME (--help for its options)\n")
-        titles = {x: figure.title for x, figure in FIGURES.items()}
-        for listed, title in (titles | _OTHERS | _MODULES).items():
+        titles = {listed: figure.title for listed, figure in FIGURES.items()}
+        for command, (options, _) in COMMANDS.items():
+            titles[command] = options.__doc__.splitlines()[0].removesuffix(".")
+        for listed, title in titles.items():
             print(f"  {listed:20} {title}")
     elif name in FIGURES:
-        _figure(name, command_line.parse(Options, rest, f"experiments {name}"))
-    elif name == "merge":
-        _merge(command_line.parse(MergeOptions, rest, "experiments merge"))
-    elif name == "report":
-        command_line.parse(ReportOptions, rest, "experiments report")
-        _report()
-    elif name in _MODULES:
-        return int(importlib.import_module(f"experiments.{name}").main(rest))
+        _train(name, command_line.parse(Options, rest, f"experiments {name}"))
+    elif name in COMMANDS:
+        options, function = COMMANDS[name]
+        function(command_line.parse(options, rest, f"experiments {name}"))
     else:
-        raise InputError(unknown("experiment", name, (*FIGURES, *_OTHERS, *_MODULES)))
-    return None
+        raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
 
 
 if __name__ == "__main__":

@@ -1,51 +1,36 @@
 """Train the runs that are missing in a store, and add them to it.
 
 Runs of the same environment and static settings are members of one compiled program. A
-program's work folder is named by a hash of everything that it trains. The folder
-therefore never holds other work, and stopped work continues from its checkpoints.
+program is trained in a scratch folder that is named by a hash of everything it trains,
+so that the folder never holds other training. Training that was interrupted there is
+only continued if `Setup.resume` is set.
 """
 
 import dataclasses
+import functools
 import hashlib
 import json
-import multiprocessing
-import os
+import math
 import pathlib
 import subprocess
-import sys
-import time
 from collections.abc import Iterable, Mapping, Sequence
-from multiprocessing import connection
 from typing import Any
 
 import jax
 import numpy as np
 
-import gasil_jax
 from experiments.store import Record, Run, Store
-from gasil_jax.evaluation import evaluate
-from gasil_jax.host import (
-    command_line,
-    driver,
-    metrics_files,
-    resources,
-    run_folder,
-    run_options,
-)
-from gasil_jax.host import devices as host_devices
+from gasil_jax.config import Hyperparameters
+from gasil_jax.errors import InputError
+from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.environments import Settings
-from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.members import make_batch
-from gasil_jax.host.progress import Progress
-from gasil_jax.sweeps import shards
+from gasil_jax.host.interruption import Interrupted
+from gasil_jax.sweeps import assembly, shards
 
-#: Equal parts of training in a record.
-ROWS = 50
+#: Equal parts of training in a record, and evaluations during training.
+ROWS, EVALUATIONS = 50, 10
 #: The columns of metrics.csv that identify the members of a program.
 _LABELS = ("member", "seed")
-_SECONDS_BETWEEN_LOOKS = 1.0
-# New interpreters, because JAX does not survive a fork.
-_CONTEXT = multiprocessing.get_context("spawn")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,21 +38,26 @@ class Setup:
     """The settings of training that do not decide a run's numbers.
 
     Attributes:
-      runs: folder of the work folders.
+      runs: scratch folder of the training in progress.
+      resume: continue interrupted training in the scratch folder, which is otherwise
+        refused. Runs that the results hold are never trained again, with or without it.
       physics: physics engine of locomotion: mjx or mujoco.
-      devices: number of host devices to shard members over; None for one per core.
-      evaluate: episodes of the evaluation after training; 0 for no evaluation.
-      source: commit of the checkout, and whether it was clean, before training.
+      devices: number of host devices to shard members over; default one per core.
+      evaluate_episodes: episodes of each of the ten evaluations during training; 0
+        for no evaluations.
+      commit: commit of the code, to be recorded if there is no repository.
     """
 
-    runs: pathlib.Path
+    runs: pathlib.Path = pathlib.Path("runs", "experiments")
+    resume: bool = False
     physics: str = "mjx"
     devices: int | None = None
-    evaluate: int = 0
-    source: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    evaluate_episodes: int = 10
+    commit: str | None = None
 
 
-def source(commit: str | None = None) -> dict[str, Any]:
+@functools.cache
+def source(commit: str | None) -> dict[str, Any]:
     """Return the checkout's commit, and whether its files are unchanged.
 
     Results are left out, because they change while experiments run.
@@ -76,18 +66,17 @@ def source(commit: str | None = None) -> dict[str, Any]:
       commit: the commit to return if there is no repository.
     """
 
-    def ask(*arguments: str) -> str | None:
-        root = pathlib.Path(__file__).parent.parent
-        command = ("git", "-C", str(root), *arguments)
+    def git(*arguments: str) -> str | None:
+        command = ("git", "-C", str(pathlib.Path(__file__).parent.parent), *arguments)
         try:
             answer = subprocess.run(command, capture_output=True, text=True)
         except OSError:
             return None
         return answer.stdout.strip() if answer.returncode == 0 else None
 
-    changed = ask("status", "--porcelain", "--", ".", ":!experiments/results")
+    changed = git("status", "--porcelain", "--", ".", ":!experiments/results")
     clean = None if changed is None else not changed
-    return {"commit": ask("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
+    return {"commit": git("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,246 +85,173 @@ class Program:
 
     Attributes:
       runs: the members, which differ only in hyperparameters and seeds.
-      physics: mjx or mujoco, whose states differ.
+      setup: how they are trained.
     """
 
     runs: tuple[Run, ...]
-    physics: str
+    setup: Setup
 
-    def folder(self, runs: pathlib.Path) -> pathlib.Path:
-        """Return the program's work folder."""
-        text = " ".join([self.physics, *(run.key for run in self.runs)])
-        return runs / hashlib.sha256(text.encode()).hexdigest()[:16]
+    @property
+    def folder(self) -> pathlib.Path:
+        """The program's scratch folder."""
+        # With other physics or evaluations, checkpoints and tables hold other things.
+        names = [self.setup.physics, str(self.setup.evaluate_episodes)]
+        text = " ".join([*names, *(run.key for run in self.runs)])
+        return self.setup.runs / hashlib.sha256(text.encode()).hexdigest()[:16]
 
     def __str__(self) -> str:
-        run = self.runs[0]
+        run, count = self.runs[0], len(self.runs)
         words = [f"{run.env} {run.config.agent}", f"{run.config.num_envs} environments"]
         words += [f"delayed {run.reward_delay}"] if run.reward_delay > 1 else []
         words += [] if run.config.stagger_episodes else ["in step"]
-        one = len(self.runs) == 1
-        return ", ".join(
-            [*words, f"seed {run.seed}" if one else f"{len(self.runs)} runs"]
-        )
+        words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
+        return ", ".join(words)
 
 
-def programs(runs: Iterable[Run], physics: str) -> list[Program]:
+def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     """Divide runs into as few programs as possible."""
     groups: dict[Run, list[Run]] = {}
     for run in runs:
         # Only counts decide shapes, so only they need separate programs.
         counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
-        shared_values = gasil_jax.Hyperparameters(**counts)
-        config = run.config.replace(hyperparameters=shared_values)
+        config = run.config.replace(hyperparameters=Hyperparameters(**counts))
         shared = dataclasses.replace(run, config=config, seed=0)
         groups.setdefault(shared, []).append(run)
     ordered = lambda group: tuple(sorted(group, key=lambda run: run.key))
-    return [Program(ordered(group), physics) for group in groups.values()]
+    return [Program(ordered(group), setup) for group in groups.values()]
 
 
 def part_of(runs: Sequence[Run], part: shards.Shard) -> list[Run]:
     """Return every n-th run in the order of their keys, the same on each machine."""
     chosen = set(sorted(runs, key=lambda run: run.key)[part.number - 1 :: part.count])
-    return [run for run in runs if run in chosen] if part.count > 1 else list(runs)
+    return [run for run in runs if run in chosen]
 
 
-def train(program: Program, setup: Setup) -> dict[Run, Record]:
+def train(program: Program) -> dict[Run, Record]:
     """Train a program, or continue its training.
 
     Raises:
-      InputError: it does not fit the memory, or another process works on it.
-      Interrupted: by a signal; it has saved.
+      InputError: if it does not fit the memory or the disk, or if another process works
+        on it.
+      Interrupted: if a signal was received; a checkpoint was written first.
     """
-    run, count = program.runs[0], len(program.runs)
+    run, setup, folder = program.runs[0], program.setup, program.folder
+    episodes = setup.evaluate_episodes or None
     settings = Settings(
-        run.reward_delay,
-        run.obs_noise,
-        physics=program.physics,
+        reward_delay=run.reward_delay,
+        obs_noise=run.obs_noise,
+        physics=setup.physics,
         integrator=run.integrator,
     )
     options = run_options.Options(
-        env=run.env, settings=settings, config=run.config, devices=setup.devices
+        env=run.env,
+        out=folder,
+        keep_checkpoints=1,
+        evaluate_every=episodes and math.ceil(run.config.total_steps / EVALUATIONS),
+        evaluate_episodes=episodes,
+        devices=setup.devices,
+        settings=settings,
+        config=run.config,
     )
-    host_devices.use_devices(settings, setup.devices, count)
-    env = run_options.make_env(options)
-    with command_line.input_checked():
-        resources.check_memory(env, run.config, count, jax.devices())
-    seeds = [run.seed for run in program.runs]
-    hyperparameters = [run.config.hyperparameters for run in program.runs]
-    members = make_batch(env, run.config, seeds, hyperparameters)
-    folder = run_folder.create(program.folder(setup.runs), "")
-    steps = run.config.num_iterations * run.config.batch_steps * count
-    with (
-        run_folder.lock(folder),
-        Interruption() as interruption,
-        Progress(str(program), steps) as progress,
-    ):
-        provenance = _provenance(folder, members.device_kind, program.physics, setup)
+    seeds = tuple(run.seed for run in program.runs)
+    hyperparameters = tuple(run.config.hyperparameters for run in program.runs)
+    members = shards.Program(0, run.config, tuple(enumerate(seeds)), hyperparameters)
+    labels = dict(zip(_LABELS, (range(len(seeds)), seeds), strict=True))
+    env = assembly.prepare(options, [members], [members])
+    read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))
+    with run_folder.lock(run_folder.create(folder, "")):
+        provenance = _provenance(program)
         try:
-            outcome = driver.drive(
-                members,
-                folder,
-                dict(zip(_LABELS, (range(count), seeds), strict=True)),
-                schedule=driver.CheckpointSchedule(every=None, keep=1),
-                progress=progress,
-                interruption=interruption,
+            assembly.train(
+                options,
+                env,
+                [assembly.Job(members, folder, labels)],
+                title=str(program),
+                on_finished=lambda job, batch, outcome: None,
             )
         except Interrupted as interrupted:
-            interrupted.add_note("go on with the same command")
+            interrupted.add_note("go on with: the same command and --resume")
             raise
-        metrics = metrics_files.read_metrics(folder / "metrics.csv", _LABELS, count)
-    final = np.full(count, np.nan)
-    if setup.evaluate:
-        final = _evaluate(env, program, outcome.states, setup.evaluate)
-    of = lambda member: {name: values[member] for name, values in metrics.items()}
+        metrics = read("metrics.csv")
+        evaluations = read("evaluations.csv") if episodes else {}
+    of = lambda table, member: {name: values[member] for name, values in table.items()}
     return {
-        run: record(of(member), float(final[member]), provenance)
+        run: record(of(metrics, member), of(evaluations, member), provenance)
         for member, run in enumerate(program.runs)
     }
 
 
-def _provenance(
-    folder: pathlib.Path, device: str, physics: str, setup: Setup
-) -> dict[str, Any]:
-    """With what a program is trained; all of it, if it went on with something else."""
-    now = {"physics": physics, "device": device, "versions": metrics_files.versions()}
-    now |= setup.source
-    path = folder / "provenance.json"
+def _provenance(program: Program) -> dict[str, Any]:
+    """Return what a program is trained with, over all sessions of its training."""
+    setup, path = program.setup, program.folder / "provenance.json"
+    devices = jax.devices()[: len(program.runs)]
+    now = {
+        "physics": setup.physics,
+        "device": f"{len(devices)} x {devices[0].device_kind}",
+        "versions": metrics_files.versions(),
+        **source(setup.commit),
+    }
     sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
     if now not in sessions:
         sessions.append(now)
         metrics_files.write_json(path, {"sessions": sessions})
     every = lambda name: ", then ".join(
-        dict.fromkeys(str(session[name]) for session in sessions if session.get(name))
+        dict.fromkeys(str(session[name]) for session in sessions if session[name])
     )
-    # The worst of them: no, or unknown.
-    order = (False, None, True)
-    clean = min((session.get("clean") for session in sessions), key=order.index)
+    # False if a session's checkout was changed, or else None if one is unknown.
+    clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
     commit = every("commit") or None
     return {**now, "device": every("device"), "commit": commit, "clean": clean}
 
 
 def record(
-    metrics: Mapping[str, np.ndarray], final: float, provenance: Mapping[str, Any]
+    metrics: Mapping[str, np.ndarray],
+    evaluations: Mapping[str, np.ndarray],
+    provenance: Mapping[str, Any],
 ) -> Record:
-    """Return a run's record: means over parts of its metrics, (iterations,) each."""
+    """Return a run's record.
+
+    Args:
+      metrics: columns of metrics.csv, (iterations,) each.
+      evaluations: columns of evaluations.csv, (evaluations,) each; empty if there were
+        none.
+      provenance: what the run was trained with.
+    """
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
 
     def means(name: str) -> np.ndarray:
-        values = metrics.get(name, np.full(len(steps), np.nan))
-        seen = [values[part][np.isfinite(values[part])] for part in parts]
-        return np.array([x.mean() if len(x) else np.nan for x in seen])
+        finite = [metrics[name][part] for part in parts]
+        finite = [values[np.isfinite(values)] for values in finite]
+        return np.array([x.mean() if len(x) else np.nan for x in finite])
 
     return Record(
         env_steps=np.array([steps[part[-1]] for part in parts]),
         episode_return=means("episode_return"),
         episode_length=means("episode_length"),
-        evaluation_return=means("evaluation_return"),
-        final_evaluation=final,
         provenance=provenance,
+        evaluation_steps=evaluations.get("env_steps", np.empty(0)),
+        evaluation_return=evaluations.get("mean", np.empty(0)),
     )
 
 
-def _evaluate(env: Any, program: Program, states: Any, episodes: int) -> np.ndarray:
-    """Return the mean return of each member's deterministic policy: (members,)."""
-    config = program.runs[0].config
-
-    def score(state: Any, seed: jax.Array) -> jax.Array:
-        key = jax.random.fold_in(jax.random.key(seed), 1)
-        scores = evaluate(env, config, state, key, num_episodes=episodes)
-        return scores["episode_return"].mean()
-
-    seeds = np.array([run.seed for run in program.runs], np.uint32)
-    return np.asarray(jax.jit(jax.vmap(score))(states, seeds))
-
-
-def train_missing(
-    missing: Sequence[Run], store: Store, setup: Setup, processes: int | None = None
-) -> None:
+def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
     """Train runs and add them to the store, each program as soon as it has ended.
 
-    Args:
-      missing: what to train.
-      store: gets them.
-      setup: with what.
-      processes: so many single runs at a time, on the CPU, a process on cores of its
-        own for each; None for one program after another that holds all runs alike.
-
     Raises:
-      ChildProcessError: processes have failed; the other runs are done.
-      Interrupted: by a signal, which the running processes were sent too.
+      InputError: if the scratch folder holds training of these runs that is not to be
+        continued.
+      Interrupted: if a signal was received; a checkpoint was written first.
     """
-    if processes is None:
-        for program in programs(missing, setup.physics):
-            store.add(train(program, setup))
-        return
-    waiting = [Program((run,), setup.physics) for run in missing]
-    total, ended, failed = len(waiting), 0, []
-    free, running = list(range(processes)), dict[Any, tuple[Program, int, Any, float]]()
-    log = lambda program: program.folder(setup.runs).with_suffix(".log")
-    with Interruption() as interruption:
-        try:
-            while waiting or running:
-                if interruption.signal is not None:
-                    interrupted = Interrupted(interruption.signal)
-                    interrupted.add_note("go on with the same command")
-                    raise interrupted
-                while free and waiting:
-                    program, slot = waiting.pop(0), free.pop(0)
-                    work = (program, store.folder, setup, (slot, processes))
-                    child = _CONTEXT.Process(target=_work, args=(*work, log(program)))
-                    child.start()
-                    running[child.sentinel] = program, slot, child, time.monotonic()
-                for sentinel in connection.wait(list(running), _SECONDS_BETWEEN_LOOKS):
-                    program, slot, child, began = running.pop(sentinel)
-                    child.join()
-                    free.append(slot)
-                    if child.exitcode != 0:
-                        failed.append(program)
-                        continue
-                    ended += 1
-                    seconds = time.monotonic() - began
-                    print(
-                        f"{program}: {seconds:.0f} s ({ended} of {total})", flush=True
-                    )
-        finally:
-            for _, _, child, _ in running.values():
-                child.terminate()
-            for _, _, child, _ in running.values():
-                child.join()
-            store.refresh()
-    if failed:
-        logs = ", ".join(str(log(program)) for program in failed)
-        raise ChildProcessError(
-            f"{len(failed)} of {total} runs failed, see {logs}; the others are done, "
-            "and the same command goes on"
+    requested = programs(missing, setup)
+    begun = [
+        program.folder for program in requested if any(program.folder.glob("[!.]*"))
+    ]
+    if begun and not setup.resume:
+        raise InputError(
+            f"runs is {setup.runs}, which holds training of these runs in "
+            f"{', '.join(folder.name for folder in begun)}: continue it with --resume, "
+            "or name another folder"
         )
-
-
-def _work(
-    program: Program,
-    store: pathlib.Path,
-    setup: Setup,
-    slot: tuple[int, int],
-    log: pathlib.Path,
-) -> None:
-    """Run the work of a process, and exit with a status."""
-    # In a session of its own Ctrl-C reaches it once, from the parent.
-    os.setsid()
-    if hasattr(os, "sched_setaffinity"):
-        number, processes = slot
-        cores = sorted(os.sched_getaffinity(0))
-        # If there are fewer cores than processes, processes share cores.
-        own = cores[number::processes] or [cores[number % len(cores)]]
-        os.sched_setaffinity(0, own)
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("a") as file:
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(file.fileno(), stream.fileno())
-    jax.config.update("jax_platforms", "cpu")
-    alone = dataclasses.replace(setup, devices=1)
-
-    def work() -> None:
-        Store(store).add(train(program, alone))
-
-    sys.exit(command_line.exit_status(work))
+    for program in requested:
+        store.add(train(program))

@@ -1,74 +1,40 @@
-"""A search for the point mass' layout: ``python -m experiments point_mass_layouts``.
+"""The random layouts that the point mass' layout was chosen from.
 
-The paper prints no coordinates, so layouts are drawn at random. In each, PPO and
-PPO+GASIL are trained with the same learning rates and the same number of runs, with
-seeds other than those of the figures; where PPO+GASIL has an alpha more, PPO has as
-many seeds more. Layouts, hyperparameters and seeds are all axes of one vmapped program.
-Returns go into a CSV file; those in which PPO+GASIL is ahead most clearly are printed.
+The paper prints no coordinates, so PPO and PPO+GASIL were trained in layouts 0 to 127,
+which are drawn at random, and then with new seeds in sixteen of the eighteen in which
+PPO+GASIL was most clearly ahead. The environment's layout is number 65. Both agents had
+the same learning rates and the same number of runs: PPO+GASIL had two alphas, and PPO
+twice the seeds. The returns of all runs are in ``results/point_mass_layouts``.
 
-The environment's own layout comes from 128 layouts (``--count 128 --seeds 2``), and the
-sixteen best of them with other seeds (``--layouts 65 103 45 ... --seeds 10 --first-seed
-2000``), of which 65 was clearest; the files are in ``results/point_mass_layouts/``.
-``--draw`` draws that layout and trains nothing.
+Any layout is an environment for ``gasil_jax.run`` and ``gasil_jax.sweep``, such as
+``--env experiments.point_mass_layouts:layout_65``.
 """
 
 import csv
 import dataclasses
-import pathlib
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-import gasil_jax
-from experiments import report
 from experiments.search import PAIR
 from experiments.store import RESULTS
-from gasil_envs import wrappers
 from gasil_envs.point_mass import Layout, PointMass
-from gasil_jax import presets
-from gasil_jax.config import Config, Hyperparameters
-from gasil_jax.errors import InputError
-from gasil_jax.figures import plotting
-from gasil_jax.host import command_line, output_file
 
-_MOST_OBJECTS = 12
-# Added to the standard error: a lead of less is none, however alike the seeds are.
+# Added to the standard error, so that a small lead does not count however alike the
+# seeds are.
 _MARGIN = 0.2
-_COLUMNS = ("layout", "agent", "learning_rate", "alpha", "seed", "early", "final")
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train in many layouts and print the best.
+    """Rank the point mass' random layouts by how clearly PPO+GASIL is ahead.
 
     Attributes:
-      first: number of the first layout; it decides what is drawn.
-      count: how many.
-      layouts: these numbers in place of `first` and `count`.
-      seeds: of PPO+GASIL at each learning rate and alpha.
-      first_seed: number of the first.
-      total_steps: of a seed.
-      learning_rates: of both agents.
-      alphas: of PPO+GASIL.
-      discriminator_updates: of PPO+GASIL.
-      out: a new CSV file.
-      draw: draw the environment's own layout instead.
+      count: number of layouts to print, of all and of those with new seeds.
     """
 
-    first: int = 0
-    count: int = 8
-    layouts: tuple[int, ...] = ()
-    seeds: int = 3
-    first_seed: int = 1000
-    total_steps: int = 250_000
-    learning_rates: tuple[float, ...] = (1e-3, 3e-4, 1e-4)
-    alphas: tuple[float, ...] = (0.1, 1.0)
-    discriminator_updates: int = 20
-    out: pathlib.Path = pathlib.Path("runs", "layouts.csv")
-    draw: bool = False
+    count: int = 16
 
 
 def draw(number: int) -> Layout:
@@ -105,196 +71,53 @@ def draw(number: int) -> Layout:
     )
 
 
-class Arrays(NamedTuple):
-    """A layout as arrays: objects (o, 2), their rewards (o,), and its numbers."""
-
-    objects: Any
-    rewards: Any
-    start: Any
-    start_spread: Any
-    radius: Any
-    max_speed: Any
-    actuation_cost: Any
-
-
-_NUMBERS = Arrays._fields[2:]
-
-
-def arrays(layout: Layout) -> Arrays:
-    """The arrays of a layout; objects that it lacks lie out of reach."""
-    env = PointMass(layout)
-    objects = np.full((_MOST_OBJECTS, 2), 9.0, np.float32)
-    rewards = np.zeros(_MOST_OBJECTS, np.float32)
-    objects[: len(env.objects)] = env.objects
-    rewards[: len(env.objects)] = env.object_rewards
-    numbers = [np.float32(getattr(layout, name)) for name in _NUMBERS]
-    return Arrays(objects, rewards, *numbers)
-
-
-class TracedPointMass(PointMass):
-    """The point mass with a layout whose numbers may be traced."""
-
-    def __init__(self, layout: Arrays):
-        floats = {name: getattr(layout, name) for name in _NUMBERS[1:]}
-        self.layout = Layout(start=(layout.start[0], layout.start[1]), **floats)
-        self.objects, self.object_rewards = layout.objects, layout.rewards
-        self.episode_length = self.layout.episode_length
-
-
-def make_returns(config: Config) -> Any:
-    """(layout, hyperparameters, seed) -> mean return of each tenth of training (10,).
-
-    A pure function, to be vmapped.
-    """
-
-    def returns(
-        layout: Arrays, hyperparameters: Hyperparameters, seed: jax.Array
-    ) -> jax.Array:
-        env = TracedPointMass(layout)
-        limited = wrappers.EpisodeLimit(env, env.episode_length)
-        train = gasil_jax.make_train(limited, config)
-        _, metrics = train(jax.random.key(seed), hyperparameters)
-        parts = np.array_split(np.arange(config.num_iterations), 10)
-        return jnp.stack([jnp.nanmean(metrics["episode_return"][x]) for x in parts])
-
-    return returns
-
-
-def _stack(trees: Sequence[Any]) -> Any:
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
-
-
-def configuration(agent: str, options: Options) -> Config:
-    """What an agent's runs have in common."""
-    return presets.preset("point_mass", agent, "tuned").replace(
-        **{
-            "total_steps": options.total_steps,
-            "discriminator_updates": options.discriminator_updates,
-            # As the layout was found.
-            "stagger_episodes": False,
-        }
-    )
-
-
-def evaluate(numbers: Sequence[int], options: Options) -> list[dict[str, Any]]:
-    """Train both agents in the layouts of these numbers; a row for each run.
-
-    "early" is the mean return over the second tenth of training, "final" over the last.
-    """
-    rows = []
-    for agent in PAIR:
-        config = configuration(agent, options)
-        program = jax.jit(jax.vmap(make_returns(config)))
-        alphas = options.alphas if agent == "ppo+gasil" else (0.0,)
-        seeds = options.seeds * len(options.alphas) // len(alphas)
-        tuned = config.hyperparameters
-        runs: list[dict[str, Any]] = [
-            {
-                "layout": number,
-                "agent": agent,
-                "learning_rate": rate,
-                "alpha": alpha,
-                "seed": options.first_seed + seed,
-            }
-            for number in numbers
-            for rate in options.learning_rates
-            for alpha in alphas
-            for seed in range(seeds)
-        ]
-        hyperparameters = [
-            tuned.replace(learning_rate=run["learning_rate"], alpha=run["alpha"])
-            for run in runs
-        ]
-        returns = program(
-            _stack([arrays(draw(run["layout"])) for run in runs]),
-            jax.tree.map(np.float32, _stack(hyperparameters)),
-            np.array([run["seed"] for run in runs], np.uint32),
-        )
-        for run, tenths in zip(runs, np.asarray(returns), strict=True):
-            early, final = (round(float(x), 3) for x in (tenths[1], tenths[-1]))
-            rows.append(run | {"early": early, "final": final})
-    return rows
+def __getattr__(name: str) -> Callable[[], PointMass]:
+    """Return the function that builds the environment layout_NUMBER."""
+    word, _, number = name.partition("_")
+    if word != "layout" or not number.isdecimal():
+        raise AttributeError(f"{name!r} must be layout_NUMBER")
+    return lambda: PointMass(draw(int(number)))
 
 
 def rank(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, str]]:
-    """How clearly PPO+GASIL is ahead in each layout, and a line about it, best first.
+    """Return each layout's lead of PPO+GASIL, with a line about it, best first.
 
-    Each agent has its best learning rate (and alpha) by the mean final return; the
-    figure is the difference of the means over its standard error and `_MARGIN`.
+    Each agent has its best learning rate (and alpha) by the mean final return. The lead
+    is the difference of the means divided by its standard error plus `_MARGIN`.
+
+    Args:
+      rows: a row for each run, with its mean return over the second tenth of training,
+        "early", and over the last one, "final".
     """
     scores: dict[tuple[int, str], dict[tuple[float, float], list[Any]]] = {}
     for row in rows:
         point = (float(row["learning_rate"]), float(row["alpha"]))
         of_point = scores.setdefault((int(row["layout"]), row["agent"]), {})
-        of_point.setdefault(point, []).append(
-            (float(row["early"]), float(row["final"]))
-        )
+        returns = (float(row["early"]), float(row["final"]))
+        of_point.setdefault(point, []).append(returns)
+    final_mean = lambda item: np.mean([final for _, final in item[1]])
     ranked = []
     for number in sorted({layout for layout, _ in scores}):
-        best = [
-            max(
-                scores[number, agent].items(),
-                key=lambda item: np.mean([final for _, final in item[1]]),
-            )
-            for agent in PAIR
-        ]
-        (ppo_point, _), (point, _) = best
-        ppo, gasil = (np.array(values) for _, values in best)
+        best = [max(scores[number, agent].items(), key=final_mean) for agent in PAIR]
+        (ppo_rate, _), (gasil_rate, alpha) = (point for point, _ in best)
+        ppo, gasil = (np.array(returns) for _, returns in best)
         error = np.sqrt(sum(x[:, 1].var(ddof=1) / len(x) for x in (ppo, gasil)))
-        ahead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + _MARGIN)
+        lead = (gasil[:, 1].mean() - ppo[:, 1].mean()) / (error + _MARGIN)
         line = (
             f"layout {number}: PPO {ppo[:, 0].mean():.1f} early, "
-            f"{ppo[:, 1].mean():.1f} final at {ppo_point[0]:g}; PPO+GASIL "
-            f"{gasil[:, 0].mean():.1f}, {gasil[:, 1].mean():.1f} at {point[0]:g}, "
-            f"alpha {point[1]:g}"
+            f"{ppo[:, 1].mean():.1f} final at {ppo_rate:g}; PPO+GASIL "
+            f"{gasil[:, 0].mean():.1f}, {gasil[:, 1].mean():.1f} at {gasil_rate:g}, "
+            f"alpha {alpha:g}"
         )
-        ranked.append((float(ahead), line))
+        ranked.append((float(lead), line))
     return sorted(ranked, reverse=True)
 
 
-def picture(layout: Layout, path: pathlib.Path) -> None:
-    """Save a drawing of the box, the objects with their reach, and the start."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(4.0, 4.0), layout="constrained")
-    count = len(layout.blue + layout.green + layout.orange)
-    plotting.point_mass_layout(axes, layout, np.zeros(count, bool))
-    axes.text(*layout.start, "start", ha="center", va="center", fontsize=9)
-    report.save_png(figure, path, dpi=100)
-
-
-def _check(options: Options) -> None:
-    for name in ("learning_rates", "alphas"):
-        if not getattr(options, name):
-            raise InputError(f"{name} is empty: name one or more")
-    if (lowest := min((options.first, *options.layouts))) < 0:
-        raise InputError(f"layout is {lowest}: it must be 0 or more")
-    command_line.check_least(options, count=1, seeds=2, total_steps=10 * 2048)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Evaluate layouts that have not been; returns the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
-    options = command_line.parse(Options, arguments, "experiments point_mass_layouts")
-    _check(options)
-    if options.draw:
-        picture(Layout(), RESULTS / "point_mass_layout.png")
-        return
-    output_file.check(options.out, (".csv",))
-    output_file.make_parent(options.out)
-    jax.config.update("jax_default_matmul_precision", "highest")
-    last = options.first + options.count
-    rows = evaluate(options.layouts or range(options.first, last), options)
-    with output_file.whole(options.out) as partial, partial.open("w") as file:
-        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    for ahead, line in rank(rows)[:20]:
-        print(f"{ahead:+.1f} {line}")
-    print(f"in {options.out}")
+def run(options: Options) -> None:
+    """Print the best layouts."""
+    for name in ("0-127.csv", "65-117.csv"):
+        with (RESULTS / "point_mass_layouts" / name).open(newline="") as file:
+            ranked = rank(list(csv.DictReader(file)))
+        print(f"{name}: lead of PPO+GASIL in {len(ranked)} layouts")
+        for lead, line in ranked[: options.count]:
+            print(f"{lead:+.1f} {line}")

@@ -1,22 +1,23 @@
-"""What is learned on the point mass (paper, figures 3 and 4).
+"""The point mass' layout, and what agents learn there (paper, figures 2, 3 and 4).
 
-``python -m experiments point_mass_moments`` trains one seed of PPO and of PPO+GASIL and
-draws them at several moments of training: episodes of the policy, the trajectories in
-the buffer, and the discriminator's reward. An arrow is the action that the
-discriminator pays most at a place, of 16 directions at full speed, with every object
-still there; the stronger its colour the higher the reward. ``--animate`` makes a film.
+One seed of PPO and one of PPO+GASIL are trained and drawn at several moments of
+training: episodes of the policy, the trajectories in the buffer, and the
+discriminator's reward. An arrow is the action that the discriminator rewards most at a
+position, of 16 directions at full speed, with every object still there. The higher the
+reward, the stronger is the arrow's color.
 """
 
 import dataclasses
+import functools
 import itertools
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
+from matplotlib.figure import Figure
 
 import gasil_jax
 from experiments import report
@@ -25,56 +26,56 @@ from experiments.store import RESULTS, Store
 from gasil_jax import normalization, policy
 from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, output_file
-from gasil_jax.host.members import make_batch, member
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
-#: Shares of training: more of the early ones, most happens there.
+#: Shares of training at the moments; most happens early.
 SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
-#: An agent's columns; PPO has no discriminator.
+#: The columns of each agent; PPO has no discriminator.
 _COLUMNS = {
     "ppo": ("policy", "good trajectories"),
     "ppo+gasil": ("policy", "good trajectories", "discriminator's reward"),
 }
-#: Agent -> its configuration and its states, one for each moment.
-Moments = Mapping[str, tuple[gasil_jax.Config, Sequence[Any]]]
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Train one seed of PPO and of PPO+GASIL and draw what they learn.
+    """Draw the point mass, and what PPO and PPO+GASIL learn there.
 
     Attributes:
-      total_steps: of the seed.
-      animate: make a film of so many frames instead.
-      out: folder of the picture or film, which is made anew.
+      total_steps: environment steps of each agent's seed.
+      out: folder of the two pictures, which are replaced.
     """
 
     total_steps: int = 500_000
-    animate: int = 0
     out: pathlib.Path = RESULTS
 
 
-def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
-    """The state of seed 0 at `moments`, in shares of training, increasing from 0."""
-    members = make_batch(env, config, [0])
-    states, advance = members.compile()
-    ends = [max(1, round(share * config.num_iterations)) for share in moments]
-    kept = []
+def states_at(env: Any, config: gasil_jax.Config, shares: Sequence[float]) -> list[Any]:
+    """Return the training states of seed 0 at increasing shares of training.
+
+    The first share may be 0, which is after one iteration.
+    """
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def advance(state: Any, count: jax.Array) -> Any:
+        step = lambda _, state: gasil_jax.iterate(env, config, state)[0]
+        return jax.lax.fori_loop(0, count, step, state)
+
+    state, states = gasil_jax.init(env, config, jax.random.key(0)), []
+    ends = [max(1, round(share * config.num_iterations)) for share in shares]
     for first, end in itertools.pairwise([0, *ends]):
-        for done in range(first, end, members.chunk):
-            count = min(members.chunk, end - done)
-            states, _ = members.train(advance, states, done, count)
-        kept.append(jax.device_get(member(members.trim(states), 0)))
-    return kept
+        state = advance(state, end - first)
+        states.append(jax.device_get(state))
+    return states
 
 
 def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
-    """Positions (episodes, steps + 1, 2) of episodes drawn from the policy."""
+    """Return positions (episodes, steps + 1, 2) of episodes drawn from the policy."""
     act = policy.from_state(state, env)
 
-    def one(key: jax.Array) -> jax.Array:
+    def episode(key: jax.Array) -> jax.Array:
         reset_key, key = jax.random.split(key)
         start = env.reset(reset_key)
 
@@ -86,11 +87,11 @@ def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
         positions = jax.lax.scan(step, start, keys)[1]
         return jnp.concatenate([start.pipeline_state.position[None], positions])
 
-    return np.asarray(jax.jit(jax.vmap(one))(jax.random.split(key, _EPISODES)))
+    return np.asarray(jax.jit(jax.vmap(episode))(jax.random.split(key, _EPISODES)))
 
 
 def buffer_paths(state: Any) -> list[np.ndarray]:
-    """Positions (steps, 2) of each episode in the buffer, the best first."""
+    """Return positions (steps, 2) of each episode in the buffer, the best first."""
     buffer = state.good_trajectories
     size = int(buffer.size)
     starts = np.flatnonzero(np.asarray(buffer.time[:size]) == 0)
@@ -99,10 +100,10 @@ def buffer_paths(state: Any) -> list[np.ndarray]:
 
 
 def reward_field(
-    env: Any, config: gasil_jax.Config, state: Any, num_lines: int = 17
+    env: Any, config: gasil_jax.Config, state: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions (n, 2), the best direction there (n, 2), and its -log D (n,)."""
-    line = np.linspace(-0.95, 0.95, num_lines, dtype=np.float32)
+    """Return positions (n, 2), the best direction (n, 2), and its -log D (n,)."""
+    line = np.linspace(-0.95, 0.95, 17, dtype=np.float32)
     positions = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
     angle = np.arange(16) * (2.0 * np.pi / 16)
     actions = np.stack([np.cos(angle), np.sin(angle)], axis=-1).astype(np.float32)
@@ -118,14 +119,13 @@ def reward_field(
             jnp.broadcast_to(action, (len(positions), 2)),
         )
     )(jnp.asarray(actions))
-    reward = np.asarray(adversarial.bonus(logits, jnp.float32(1.0)))
+    reward = np.asarray(adversarial.softplus_bonus(logits))
     return positions, actions[reward.argmax(axis=0)], reward.max(axis=0)
 
 
 def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> None:
-    """One moment of an agent: its policy, its buffer, and its discriminator if any."""
+    """Draw an agent's policy, its buffer and, if it has one, its discriminator."""
     for panel in panels:
-        panel.clear()
         none = np.zeros(len(env.unwrapped.objects), bool)
         plotting.point_mass_layout(panel, env.unwrapped.layout, none)
         panel.set(xticks=[], yticks=[])
@@ -141,73 +141,35 @@ def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> 
         )
 
 
-def _draw_row(panels: Any, env: Any, moments: Moments, number: int) -> str:
-    """Every agent at one moment; returns how far training is."""
-    steps = 0
-    for agent, (config, states) in moments.items():
-        mine, panels = np.split(panels, [len(_COLUMNS[agent])])
-        draw_moment(mine, env, config, states[number])
-        steps = int(states[number].iteration) * config.batch_steps
-    return f"{steps:,} steps"
-
-
-def _titles(panels: Sequence[Any], moments: Moments) -> None:
-    titles = [f"{agent}: {name}" for agent in moments for name in _COLUMNS[agent]]
-    for panel, title in zip(panels, titles, strict=True):
-        panel.set_title(title, fontsize=9)
-
-
-def draw(env: Any, moments: Moments, path: pathlib.Path, animate: int) -> None:
-    """Figures 3 and 4 side by side: a row for each moment, or a frame of a film."""
-    import matplotlib.pyplot as plt
-    from matplotlib.animation import FuncAnimation, PillowWriter
-
-    columns = sum(len(_COLUMNS[agent]) for agent in moments)
-    rows = 1 if animate else len(SHARES)
-    size = (2.4 * columns, 3.0 if animate else 2.5 * rows)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=size, layout="constrained", squeeze=False
-    )
-    if not animate:
-        for number, row in enumerate(grid):
-            row[0].set_ylabel(_draw_row(row, env, moments, number))
-        _titles(grid[0], moments)
-        report.save_png(figure, path, dpi=75)
-        return
-
-    def frame(number: int) -> None:
-        figure.suptitle(_draw_row(grid[0], env, moments, number))
-        _titles(grid[0], moments)
-
-    film = FuncAnimation(figure, frame, frames=animate)
-    film.save(path, writer=PillowWriter(fps=2), dpi=80)
-    plt.close(figure)
-
-
-def config(agent: str) -> gasil_jax.Config:
-    """What the figure's runs of an agent are trained with."""
-    curve = FIGURES["point_mass"].panels["point_mass"][agent]
-    return curve.runs(Store(RESULTS / "runs"))[0].config
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Train one seed of both agents and draw; returns the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
-    options = command_line.parse(Options, arguments, "experiments point_mass_moments")
-    command_line.check_least(options, total_steps=1, animate=0)
-    name = "point_mass.gif" if options.animate else "point_mass_moments.png"
-    path = options.out / name
+def run(options: Options) -> None:
+    """Draw the layout; train one seed of both agents and draw a row for each moment."""
+    command_line.check_least(options, total_steps=1)
+    path = options.out / "point_mass_moments.png"
     output_file.make_parent(path)
     jax.config.update("jax_default_matmul_precision", "highest")
-    matplotlib.use("Agg")
     env = gasil_jax.make_env("point_mass")
-    shares = np.linspace(0, 1, options.animate).tolist() or SHARES
-    moments = {}
+    layout = env.unwrapped.layout
+    figure = Figure(figsize=(4.0, 4.0), layout="constrained")
+    axes = figure.subplots()
+    plotting.point_mass_layout(axes, layout, np.zeros(len(env.unwrapped.objects), bool))
+    x, y = layout.start
+    axes.text(x, y, "start", ha="center", va="center", fontsize=9)
+    report.save_png(figure, options.out / "point_mass_layout.png", dpi=100)
+
+    titles = [(agent, title) for agent in _COLUMNS for title in _COLUMNS[agent]]
+    size = (2.4 * len(titles), 2.5 * len(SHARES))
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(len(SHARES), len(titles), squeeze=False)
     for agent in _COLUMNS:
-        own = config(agent).replace(total_steps=options.total_steps)
-        moments[agent] = own, train(env, own, shares)
-    draw(env, moments, path, options.animate)
+        curve = FIGURES["point_mass"].panels["point_mass"][agent]
+        config = curve.runs(Store(RESULTS / "runs"))[0].config
+        config = config.replace(total_steps=options.total_steps)
+        columns = [i for i, (of, _) in enumerate(titles) if of == agent]
+        for row, state in zip(grid, states_at(env, config, SHARES), strict=True):
+            draw_moment(row[columns], env, config, state)
+            steps = int(state.iteration) * config.batch_steps
+            row[0].set_ylabel(f"{steps:,} steps")
+    for panel, (agent, title) in zip(grid[0], titles, strict=True):
+        panel.set_title(f"{agent}: {title}", fontsize=9)
+    report.save_png(figure, path, dpi=75)
     print(f"in {path}")

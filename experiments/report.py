@@ -1,9 +1,10 @@
-"""Statistics, tables, plots and pages: every number and verdict is of stored runs.
+"""Statistics, tables, plots and pages, all made from the stored runs.
 
-A page is notes/NAME.md with its slots, {{NAME ARGUMENTS}}, filled in. Verdicts are
+A page is ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, filled in. Verdicts are
 corrected for the number of comparisons of their page by Holm's method.
 """
 
+import contextlib
 import dataclasses
 import functools
 import io
@@ -13,22 +14,16 @@ import pathlib
 import re
 import shlex
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
+import matplotlib
+import matplotlib.figure
 import numpy as np
+from PIL import Image
 
-from experiments import search
-from experiments.figures import (
-    AGES,
-    FIGURES,
-    GEOMETRY_NUM_ENVS,
-    Comparisons,
-    Curve,
-    Figure,
-    geometry_curve,
-)
-from experiments.search import AGENTS, PAIR
+from experiments.figures import FIGURES, Comparisons, Curve, Figure
+from experiments.search import AGENTS, SPACES, by_value, means
 from experiments.store import Record, Run, Store
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
@@ -36,11 +31,12 @@ from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 from gasil_jax.host import output_file
 
 NOTES = pathlib.Path(__file__).parent / "notes"
-#: Probability that any verdict of a page is wrong, at most.
+#: The probability that any verdict of a page is wrong, at most.
 LEVEL = 0.05
 _DRAWS = 10_000
-#: Of fewer seeds an interval covers far less than it says, and nothing is clear.
+#: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
 _FEWEST_SEEDS = 5
+_VERDICTS = ("better", "not clear", "worse")
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
 
@@ -81,33 +77,32 @@ class Comparison:
 
 @functools.cache
 def _draws(name: str, scores: tuple[float, ...]) -> np.ndarray:
-    """Interquartile means of bootstrap samples: (draws,)."""
     rng = np.random.default_rng(zlib.crc32(name.encode()))
     rows = rng.integers(len(scores), size=(_DRAWS, len(scores)))
     return interquartile_mean(np.array(scores)[rows], axis=1)
 
 
 def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
-    """Interquartile means of bootstrap samples of a curve's seeds: (draws,)."""
+    """Return interquartile means of bootstrap samples of a curve's seeds: (draws,)."""
     return _draws(f"{panel}/{curve}", tuple(scores[panel, curve].tolist()))
 
 
 def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
-    """Differences of interquartile means, of those whose curves all have scores.
+    """Return the differences of interquartile means whose curves all have scores.
 
     The p-value is the percentile bootstrap's: the share of draws on the other side of
-    0, times two. Holm: the smallest is multiplied by the number of comparisons, the
-    next by one less, and none is smaller than the one before.
+    0, times two. In Holm's method the smallest is multiplied by the number of
+    comparisons, the next by one less, and none is smaller than the one before.
     """
     raw = {}
     for key, terms in family.items():
         if not all((panel, curve) in scores for _, panel, curve in terms):
             continue
+        sides = [scores[panel, curve] for _, panel, curve in terms]
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
         beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
-        sides = [scores[p, c] for _, p, c in terms]
         enough = all(len(x) >= _FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
         p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
         raw[key] = Comparison(middle, low, high, p_value)
@@ -115,7 +110,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
     for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):
         least = max(least, min(1.0, raw[key].p * (len(raw) - i)))
         corrected[key] = dataclasses.replace(raw[key], p=least)
-    return corrected
+    return {key: corrected[key] for key in raw}
 
 
 def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
@@ -126,6 +121,20 @@ def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> st
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
     shares = [100 * math.expm1(float(x)) for x in (middle, low, high)]
     return "{:+.0f}% [{:.0f}, {:.0f}]".format(*shares)
+
+
+def positive(scores: Scores, panels: Iterable[str], *curves: str) -> list[str]:
+    """Return the panels where all returns of the curves are above 0.
+
+    A ratio of returns has a meaning there alone.
+    """
+    return [p for p in panels if all((scores[p, curve] > 0).all() for curve in curves)]
+
+
+def counted(verdicts: Sequence[str]) -> str:
+    """Return how often there is each verdict, in words."""
+    words = [word for word in _VERDICTS if word in verdicts]
+    return ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
 
 
 def number(value: float) -> str:
@@ -139,17 +148,23 @@ def in_words(middle: float, low: float, high: float) -> str:
 
 
 def interval(scores: np.ndarray) -> str:
-    """Interquartile mean and 95% interval of (seeds,); of few seeds the mean alone."""
+    """Return interquartile mean and 95% interval of (seeds,); of few seeds the mean."""
     middle = float(interquartile_mean(scores))
     if len(scores) < _FEWEST_SEEDS:
         return number(middle)
     return in_words(middle, *map(float, bootstrap_interval(scores)))
 
 
-def markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a table in Markdown."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+
+def point_in_words(point: Mapping[str, Any]) -> str:
+    """Return changed settings as "name value, name value"."""
+    words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
+    return ", ".join(f"{name} {words(value)}" for name, value in point.items())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,34 +173,28 @@ class Results:
 
     curve: Curve
     point: Mapping[str, Any]
-    runs: tuple[Run, ...]
-    records: tuple[Record, ...]
+    records: Mapping[Run, Record]
 
     @property
     def complete(self) -> bool:
         """Whether the runs of all seeds are stored."""
-        return len(self.runs) == self.curve.seeds
+        return len(self.records) == self.curve.seeds
 
     @property
     def seeds(self) -> str:
-        """How many, in words."""
-        return f"{len(self.runs)}" + (
-            "" if self.complete else f" of {self.curve.seeds}"
-        )
-
-    def part(self, begin: float, end: float) -> np.ndarray:
-        """Mean return over a part of training, (seeds,)."""
-        return np.array([record.part(begin, end) for record in self.records])
+        """How many seeds there are, in words."""
+        of = "" if self.complete else f" of {self.curve.seeds}"
+        return f"{len(self.records)}{of}"
 
     @property
     def final(self) -> np.ndarray:
-        """Final return, (seeds,)."""
-        return np.array([record.final for record in self.records])
+        """The final returns, (seeds,)."""
+        return np.array([record.final for record in self.records.values()])
 
     def provenance(self) -> str:
         """Return physics, versions, devices and commits of the seeds, in words."""
         seeds_of: dict[str, list[int]] = {}
-        for run, record in zip(self.runs, self.records, strict=True):
+        for run, record in self.records.items():
             by = record.provenance
             jax = (by["versions"] or {}).get("jax")
             source = f"collected at {by.get('collected_at') or '?'}"
@@ -202,21 +211,26 @@ class Results:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """Increasing numbers in words: 0 to 4, 7."""
+    """Return increasing numbers in words: 0 to 4, 7."""
     steps = [i for i in range(1, len(numbers)) if numbers[i] > numbers[i - 1] + 1]
     runs = [numbers[i:j] for i, j in itertools.pairwise([0, *steps, len(numbers)])]
     return ", ".join(f"{x[0]} to {x[-1]}" if len(x) > 1 else f"{x[0]}" for x in runs)
 
 
 class Page:
-    """What there is of a figure, and the slots of its page.
+    """The page of a figure; `SLOTS` names the methods that slots of its note may name.
 
     Args:
-      name: of the figure.
-      store: of its runs.
-      searched: of the searches' runs; default the same.
-      figure: a figure to use instead; default the one of that name, which has a note.
+      name: name of the figure.
+      store: store of its runs.
+      searched: store of the searches' runs; default the same.
+      figure: a figure without a note to use instead of the one of that name.
     """
+
+    SLOTS = (
+        *("table", "compared", "differences", "tally", "added", "best"),
+        *("geometry", "geometry_tally", "searches", "effects"),
+    )
 
     def __init__(
         self,
@@ -225,114 +239,91 @@ class Page:
         searched: Store | None = None,
         figure: Figure | None = None,
     ):
-        self.name, self.store, self.figure = name, store, figure or FIGURES[name]
+        self.name, self.figure = name, figure or FIGURES[name]
+        self.searched = searched or store
         self.note = "{{table}}" if figure else (NOTES / f"{name}.md").read_text()
-        self.results: dict[str, dict[str, Results]] = {}
-        self.missing = 0
-        for panel, curves in self.figure.panels.items():
-            for label, curve in curves.items():
-                runs = [run for run in curve.runs(searched or store) if run in store]
-                self.missing += curve.seeds - len(runs)
-                if runs:
-                    point = curve.point(searched or store) or {}
-                    records = tuple(store[run] for run in runs)
-                    results = Results(curve, point, tuple(runs), records)
-                    self.results.setdefault(panel, {})[label] = results
+        self.results: dict[tuple[str, str], Results] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
-        for panel, label, results in self._complete():
-            self.scores[panel, label] = results.final
-            if self.figure.early is not None:
-                share = self.figure.early / results.curve.total_steps
-                self.scores[panel, f"{label} early"] = results.part(0.0, share)
+        for panel, label, curve in self.figure.curves():
+            runs = [run for run in curve.runs(self.searched) if run in store]
+            if not runs:
+                continue
+            point = curve.point(self.searched) or {}
+            results = Results(curve, point, {run: store[run] for run in runs})
+            self.results[panel, label] = results
+            if results.complete:
+                self.scores[panel, label] = results.final
+                if self.figure.early is not None:
+                    share = self.figure.early / curve.total_steps
+                    early = [x.part(0.0, share) for x in results.records.values()]
+                    self.scores[panel, f"{label} early"] = np.array(early)
         self.comparisons = compare(self.scores, self.figure.compared())
 
-    def _complete(self) -> list[tuple[str, str, Results]]:
-        return [
-            (panel, label, results)
-            for panel, curves in self.results.items()
-            for label, results in curves.items()
-            if results.complete
-        ]
-
     def table(self) -> str:
-        """Final returns: a row for each panel and curve."""
-        favourite = self.figure.favourite if self.figure.over is None else None
+        """Return the final returns: a row for each panel and curve."""
+        favourite = self.figure.favourite
         head = ["task", "agent", "seeds", "final return"]
         head += [f"{favourite} ahead by", f"{favourite} is"] if favourite else []
         rows = []
-        for panel, curves in self.results.items():
-            for label, results in curves.items():
-                cells = [panel, label, results.seeds, interval(results.final)]
-                if favourite:
-                    against = self.comparisons.get((panel, favourite, label))
-                    cells += [str(against), against.verdict] if against else ["", ""]
-                rows.append(cells)
+        for (panel, label), results in self.results.items():
+            cells = [panel, label, results.seeds, interval(results.final)]
+            if favourite:
+                rival = str(self.figure.rival(panel, label))
+                against = self.comparisons.get((panel, rival, label))
+                cells += [str(against), against.verdict] if against else ["", ""]
+            rows.append(cells)
         return markdown_table(head, rows)
 
-    def final(self, panel: str, curve: str) -> str:
-        """Return the final return of a curve as text."""
-        return interval(self.scores[panel, curve])
-
-    def compared(self, *key: str) -> str:
+    def compared(self, panel: str, ours: str, other: str) -> str:
         """Return a comparison in words."""
-        panel, ours, other, comparison = *key[:3], self.comparisons[key]
+        comparison = self.comparisons[panel, ours, other]
         words = {"not clear": "is not clearly different from"}
         phrase = words.get(comparison.verdict, f"is {comparison.verdict} than")
         return f"{ours} {phrase} {other} on {panel} ({comparison})"
 
-    def comparisons_list(self) -> str:
-        """Return every comparison of the page, in a line each."""
+    def differences(self) -> str:
+        """Return every comparison of the page, each in a line."""
         lines = []
-        for key in self.figure.compared():
-            if comparison := self.comparisons.get(key):
-                panel, ours, other, *less = key
-                more = f", less that of {less[0]}" if less else ""
-                words = f"{panel}, {ours} - {other}{more}"
-                lines.append(f"- {words}: {comparison}, {comparison.verdict}.")
+        for (panel, ours, other, *less), comparison in self.comparisons.items():
+            more = f", less that of {less[0]}" if less else ""
+            difference = f"{comparison}, {comparison.verdict}"
+            lines.append(f"- {panel}, {ours} - {other}{more}: {difference}.")
         return "\n".join(lines)
 
     def tally(self, *panels: str, scores: Scores | None = None) -> str:
-        """On how many panels the favourite is better than each other, and by how much.
+        """Return on how many panels the favourite is better than each other curve.
 
         Args:
-          *panels: which; default all.
-          scores: to compare, as a family of their own; default the page's.
+          *panels: the panels; default all.
+          scores: the scores to compare, as a family of their own; default the page's.
         """
-        favourite, panels = (
-            str(self.figure.favourite),
-            panels or tuple(self.figure.panels),
-        )
-        comparisons = self.comparisons
+        comparisons, lines = self.comparisons, []
         if scores is not None:
             comparisons = compare(scores, self.figure.compared())
-        scores = scores or self.scores
-        lines = []
+        scores, panels = scores or self.scores, panels or tuple(self.figure.panels)
         for other in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
-            complete = [p for p in panels if (p, favourite, other) in comparisons]
-            verdicts = [
-                comparisons[panel, favourite, other].verdict for panel in complete
-            ]
-            if not verdicts:
+            with_other = [p for p in panels if other in self.figure.panels[p]]
+            ours = str(self.figure.rival(with_other[0], other))
+            complete = [p for p in panels if (p, ours, other) in comparisons]
+            if not complete:
                 continue
-            words = [x for x in ("better", "not clear", "worse") if x in verdicts]
-            counts = ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
-            line = f"- {favourite} against {other}: {counts} of {len(complete)}"
-            # A ratio has no meaning where a seed learned nothing or lost.
-            both = lambda panel: (scores[panel, favourite], scores[panel, other])  # noqa: B023
-            positive = [
-                p for p in complete if all((side > 0).all() for side in both(p))
-            ]
-            if len(positive) > 1:
-                which = f"the {len(positive)} where every seed's return is above 0"
-                which = "all of them" if len(positive) == len(complete) else which
-                line += f"; over {which} {together(scores, positive, favourite, other)}"
+            verdicts = [comparisons[p, ours, other].verdict for p in complete]
+            line = f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
+            above = positive(scores, complete, ours, other)
+            if len(above) > 1:
+                which = f"the {len(above)} where every seed's return is above 0"
+                which = "all of them" if len(above) == len(complete) else which
+                line += f"; over {which} {together(scores, above, ours, other)}"
             lines.append(f"{line}.")
         return "\n".join(lines)
 
     def added(self, *panels: str) -> str:
         """Return the tally of only the seeds after the tenth."""
-        curves = [x for x in self._complete() if x[0] in panels and len(x[2].runs) > 10]
-        later = {(panel, label): results.final[10:] for panel, label, results in curves}
+        later = {
+            key: scores[10:]
+            for key, scores in self.scores.items()
+            if key[0] in panels and len(scores) > 10
+        }
         return self.tally(*panels, scores=later)
 
     def best_value(self, panel: str) -> str:
@@ -341,134 +332,133 @@ class Page:
         return max(self.figure.panels[panel], key=mean)
 
     def verdict(self, panel: str, ours: str, other: str) -> str:
-        """Return the comparison of two curves of a panel, in either order."""
+        """Return the verdict on two curves of a panel, in either order."""
         if comparison := self.comparisons.get((panel, ours, other)):
             return comparison.verdict
         verdict = self.comparisons[panel, other, ours].verdict
         return {"better": "worse", "worse": "better"}.get(verdict, verdict)
 
     def best(self) -> str:
-        """The best value of each panel, and whether it is better than each other."""
+        """Return each panel's best value, and whether it is better than each other."""
         lines = []
         for panel, curves in self.figure.panels.items():
             if all((panel, label) in self.scores for label in curves):
                 best, labels = self.best_value(panel), list(curves)
-                where = (
-                    "at an end" if best in (labels[0], labels[-1]) else "in the middle"
-                )
+                end = best in (labels[0], labels[-1])
                 verdicts = ", ".join(
                     f"{label} ({self.verdict(panel, best, label)})"
-                    for label in curves
+                    for label in labels
                     if label != best
                 )
+                where = "at an end" if end else "in the middle"
                 lines.append(
                     f"- {panel}: {best} has most, {where}; against {verdicts}."
                 )
         return "\n".join(lines)
 
-    def settings(self) -> str:
-        """What each curve was trained with, beyond the appendix's values."""
-        rows = []
-        for panel, curves in self.results.items():
-            for label, results in curves.items():
-                point = search.point_in_words(results.point)
-                if results.runs[0].config.normalize_rewards:
-                    point += ", rewards normalized"
-                rows.append([panel, label, point, results.provenance()])
-        return markdown_table(
-            ["task", "agent", "hyperparameters", "trained with"], rows
-        )
-
     def geometry(self) -> str:
-        """Starting ages drawn and not, for each agent and number of environments."""
-        rows = [
-            [
-                panel,
-                agent,
-                str(count),
-                *(self.final(panel, name) for name in names),
-                str(comparison),
-                comparison.verdict,
-            ]
-            for panel in self.results
-            for agent in PAIR
-            for count in GEOMETRY_NUM_ENVS
-            for names in [[geometry_curve(agent, drawn, count) for drawn in AGES]]
-            if (comparison := self.comparisons.get((panel, *names)))
-        ]
+        """Return final returns with drawn ages and without, for each cell."""
+        rows = []
+        for (panel, *names), comparison in self.comparisons.items():
+            cells = [panel, *names[0].split("-")[:2]]
+            cells += [interval(self.scores[panel, name]) for name in names]
+            rows.append([*cells, str(comparison), comparison.verdict])
         head = ["task", "agent", "environments", "ages drawn", "not drawn"]
         head += ["difference", "drawn is"]
         return markdown_table(head, rows) if rows else "No cell is complete yet."
 
     def geometry_tally(self) -> str:
-        """For each number of environments, on how many cells drawn ages are better."""
+        """Return for each number of environments how often drawn ages are better."""
+        keys_of: dict[str, list[tuple[str, ...]]] = {}
+        for key in self.comparisons:
+            keys_of.setdefault(key[1].split("-")[1], []).append(key)
         lines = []
-        for count in GEOMETRY_NUM_ENVS:
-            pairs = {
-                agent: [geometry_curve(agent, drawn, count) for drawn in AGES]
-                for agent in PAIR
-            }
-            cells = [
-                self.comparisons[panel, drawn, not_drawn].verdict
-                for panel in self.results
-                for drawn, not_drawn in pairs.values()
-                if (panel, drawn, not_drawn) in self.comparisons
-            ]
-            words = [x for x in ("better", "not clear", "worse") if x in cells]
-            counts = ", ".join(f"{word} on {cells.count(word)}" for word in words)
-            over_all = [
-                f"{agent} {together(self.scores, panels, *pair)}"
-                for agent, pair in pairs.items()
-                for panels in [
-                    [
-                        panel
-                        for panel in self.results
-                        if all((self.scores[panel, x] > 0).all() for x in pair)
-                    ]
-                ]
-            ]
-            many = "environment" if count == 1 else "environments"
+        for count, keys in keys_of.items():
+            ratios = []
+            for names in dict.fromkeys(key[1:] for key in keys):
+                panels = [key[0] for key in keys if key[1:] == names]
+                ratio = together(
+                    self.scores, positive(self.scores, panels, *names), *names
+                )
+                ratios.append(f"{names[0].split('-')[0]} {ratio}")
+            verdicts = [self.comparisons[key].verdict for key in keys]
+            many = "environment" if count == "1" else "environments"
             lines.append(
-                f"- {count} {many}: drawn is {counts} of {len(cells)} cells; over the "
-                f"tasks where every seed's return is above 0, {', '.join(over_all)}."
+                f"- {count} {many}: drawn is {counted(verdicts)} of {len(keys)} cells; "
+                "over the tasks where every seed's return is above 0, "
+                f"{', '.join(ratios)}."
             )
         return "\n".join(lines)
 
+    def searches(self) -> str:
+        """Return the results of the figure's searches."""
+        head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
+        rows = []
+        for name, search in self.figure.searches.items():
+            stages, best = search.stages(self.searched), search.best(self.searched)
+            sizes = [f"{len(stage.points)} x {len(stage.seeds)}" for stage in stages]
+            cells = ["not complete", *[""] * 4]
+            scores = search.scores(stages[0], self.searched) if stages else None
+            if best is not None and scores is not None:
+                first = means(scores)
+                cells = [point_in_words(best[0]), f"{best[1].mean():.0f}"]
+                cells += [f"{len(best[1])}", f"{np.median(first):.0f}"]
+                cells += [f"{first.min():.0f}"]
+            rows.append([name, *sizes, *[""] * (2 - len(sizes)), *cells])
+        return markdown_table(head.split("|"), rows)
+
+    def effects(self) -> str:
+        """Return the mean first-stage score of PPO+GASIL's points with each value.
+
+        Every value met every value of the other hyperparameters equally often, so a
+        mean does not depend on them. What two values do together is not shown.
+        """
+        space, rows = SPACES["ppo+gasil"], []
+        for label, search in self.figure.searches.items():
+            stage = search.first(self.searched)
+            if search.space != space or stage is None:
+                continue
+            if (scores := search.scores(stage, self.searched)) is not None:
+                cells = [label]
+                for name in space:
+                    values = sorted(by_value(name, stage.points, means(scores)).items())
+                    cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in values))
+                rows.append(cells)
+        return markdown_table(["task", *space], rows)
+
+    def settings(self) -> str:
+        """Return what each curve was trained with, beyond the appendix's values."""
+        rows = []
+        for names, results in self.results.items():
+            point = point_in_words(results.point)
+            if next(iter(results.records)).config.normalize_rewards:
+                point += ", rewards normalized"
+            rows.append([*names, point, results.provenance()])
+        head = ["task", "agent", "hyperparameters", "trained with"]
+        return markdown_table(head, rows)
+
     def value(self, slot: str, *arguments: str) -> str:
-        """What stands in a slot.
+        """Return what stands in a slot.
 
         Raises:
-          InputError: there is no such slot, or nothing to stand in it.
+          InputError: if there is no such slot, or nothing to stand in it.
         """
-        slots: dict[str, Callable[..., str]] = {
-            "table": self.table,
-            "final": self.final,
-            "compared": self.compared,
-            "comparisons": self.comparisons_list,
-            "tally": self.tally,
-            "added": self.added,
-            "best": self.best,
-            "geometry": self.geometry,
-            "geometry_tally": self.geometry_tally,
-            "searches": lambda: search.table(self.figure.searches, self.store),
-            "effects": lambda: search.effects(self.figure.searches, self.store),
-        }
-        try:
-            return slots[slot](*arguments)
-        except (KeyError, TypeError):
-            raise InputError(
-                f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
-                f"one of {', '.join(slots)}, of complete curves"
-            ) from None
+        if slot in self.SLOTS:
+            # Curves that are not complete, or wrong arguments, are reported below.
+            with contextlib.suppress(KeyError, TypeError):
+                return getattr(self, slot)(*arguments)
+        raise InputError(
+            f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
+            f"one of {', '.join(self.SLOTS)}, of complete curves"
+        )
 
     @property
     def in_step(self) -> bool:
         """Whether environments of locomotion were reset together in some runs."""
-        runs = [x.runs[0] for curves in self.results.values() for x in curves.values()]
-        for each in self.figure.searches.values():
-            runs += [
-                x[0] for stage in each.stages(self.store)[:1] for x in each.runs(stage)
-            ]
+        runs = [run for results in self.results.values() for run in results.records]
+        for search in self.figure.searches.values():
+            for stage in search.stages(self.searched)[:1]:
+                runs += [seeds[0] for seeds in search.runs(stage)]
         return any(
             run.env != "point_mass" and not run.config.stagger_episodes for run in runs
         )
@@ -483,12 +473,10 @@ class Page:
         note = [fill(self.note, self.value).strip()]
         picture = [f"![{self.name}]({self.name}.png)"] if self.results else []
         parts += [*picture, *note] if self.figure.claim else [*note, *picture]
-        if self.missing:
-            curves = [
-                x for panel in self.figure.panels.values() for x in panel.values()
-            ]
-            total = sum(curve.seeds for curve in curves)
-            parts.append(f"Not trained yet: {self.missing} of {total} runs.")
+        total = sum(curve.seeds for _, _, curve in self.figure.curves())
+        stored = [len(results.records) for results in self.results.values()]
+        if missing := total - sum(stored):
+            parts.append(f"Not trained yet: {missing} of {total} runs.")
         if self.results:
             parts += [_READING.format(len(self.comparisons)), "## Settings"]
             parts.append(self.settings())
@@ -508,36 +496,19 @@ def fill(note: str, value: Callable[..., str]) -> str:
     return re.sub(r"{{(.+?)}}", lambda x: value(*shlex.split(x[1])), note)
 
 
-def _colors(curves: Sequence[str]) -> dict[str, Any]:
-    """Return a color for each label: fixed for agents, dark to light for values."""
-    import matplotlib
-
-    if set(curves) & set(AGENTS):
-        return dict(
-            zip(dict.fromkeys([*AGENTS, *curves]), plotting.COLORS, strict=False)
-        )
-    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
-    return dict(zip(curves, shades, strict=True))
-
-
-def _draw(page: Page) -> Any:
-    """Return a matplotlib figure with axes for each panel."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    count = len(page.results)
-    # Four in a square: no panel is alone in its row.
+def _draw(page: Page) -> matplotlib.figure.Figure:
+    """Return a plot with axes for each panel."""
+    panels = list(dict.fromkeys(panel for panel, _ in page.results))
+    count = len(panels)
+    # Four panels are drawn in a square, so that none is alone in its row.
     columns = min({4: 2}.get(count, 4 if count > 6 else 3), count)
     rows = math.ceil(count / columns)
     size = (3.6 * columns, 2.8 * rows)
-    figure, grid = plt.subplots(
-        rows, columns, figsize=size, layout="constrained", squeeze=False
-    )
+    figure = matplotlib.figure.Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
-    for axes, panel in zip(grid.flat, page.results, strict=False):
+    for axes, panel in zip(grid.flat, panels, strict=False):
         (_draw_over if page.figure.over else _draw_curves)(page, panel, axes)
         axes.set_title(panel)
         if axes.get_lines():
@@ -548,13 +519,23 @@ def _draw(page: Page) -> Any:
 
 
 def _draw_curves(page: Page, panel: str, axes: Any) -> None:
-    """Learning curves: interquartile mean and 95% interval over seeds."""
-    color_of = _colors(list(page.figure.panels[panel]))
-    for label, results in page.results[panel].items():
-        # As coarse as the coarsest record.
-        steps = min((record.env_steps for record in results.records), key=len)
+    """Draw learning curves: interquartile mean and 95% interval over seeds."""
+    # Fixed colors for agents, dark to light ones for values.
+    curves = list(page.figure.panels[panel])
+    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
+    color_of = dict(zip(curves, shades, strict=True))
+    if set(curves) & set(AGENTS):
+        names = list(dict.fromkeys([*AGENTS, *curves]))
+        names = curves if len(names) > len(plotting.COLORS) else names
+        color_of |= dict(zip(names, plotting.COLORS, strict=False))
+    for label in curves:
+        if (panel, label) not in page.results:
+            continue
+        records = list(page.results[panel, label].records.values())
+        # Returns are compared at the steps of the record with the fewest rows.
+        steps = min((record.env_steps for record in records), key=len)
         returns = np.array(
-            [np.interp(steps, x.env_steps, x.episode_return) for x in results.records]
+            [np.interp(steps, x.env_steps, x.episode_return) for x in records]
         )
         finite = np.isfinite(returns).all(axis=0)
         if finite.any():
@@ -567,40 +548,48 @@ def _draw_curves(page: Page, panel: str, axes: Any) -> None:
 
 
 def _draw_over(page: Page, panel: str, axes: Any) -> None:
-    """Final returns over the number of environments: a line for each agent and ages."""
-    lines = [(agent, drawn) for agent in PAIR for drawn in AGES]
-    for i, (agent, drawn) in enumerate(lines):
-        names = {n: geometry_curve(agent, drawn, n) for n in GEOMETRY_NUM_ENVS}
-        complete = [n for n in names if (panel, names[n]) in page.scores]
+    """Draw final returns over a setting: a line for the curves that differ in it."""
+    curves = page.figure.panels[panel]
+    lines: dict[str, dict[Any, str]] = {}
+    for name in curves:
+        line, value = page.figure.point_of(panel, name)
+        lines.setdefault(line, {})[value] = name
+    values = sorted({value for points in lines.values() for value in points})
+    agents = list(dict.fromkeys(curve.agent for curve in curves.values()))
+    drawn: list[str] = []
+    for i, (line, points) in enumerate(lines.items()):
+        complete = [x for x in points if (panel, points[x]) in page.scores]
+        agent = next(curves[name].agent for name in points.values())
+        style = ("-", "--", ":", "-.")[drawn.count(agent) % 4]
+        drawn.append(agent)
         if not complete:
             continue
-        scores = [page.scores[panel, names[n]] for n in complete]
+        scores = [page.scores[panel, points[x]] for x in complete]
         middle = np.array([interquartile_mean(x) for x in scores])
         low, high = np.array([bootstrap_interval(x) for x in scores]).T
-        # Shifted sideways, so that no interval hides another.
-        steps = np.array(complete) * 1.06 ** (i - 1.5)
         axes.errorbar(
-            steps,
+            # Shifted sideways, so that no interval hides another.
+            np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
             middle,
             [middle - low, high - middle],
-            color=plotting.COLORS[PAIR.index(agent)],
-            linestyle="-" if drawn else "--",
+            color=plotting.COLORS[agents.index(agent) % len(plotting.COLORS)],
+            linestyle=style,
             **{"marker": "o", "markersize": 3, "capsize": 2},
-            label=f"{agent}, ages {AGES[drawn].replace('-', ' ')}",
+            label=line,
         )
-    axes.set(xlabel="environments", xscale="log", xlim=(0.7, 180.0))
-    axes.set_xticks(GEOMETRY_NUM_ENVS, [str(n) for n in GEOMETRY_NUM_ENVS])
+    _, label = page.figure.over or ("", "")
+    limits = (0.7 * values[0], 1.4 * values[-1])
+    axes.set(xlabel=label, xscale="log", xlim=limits)
+    axes.set_xticks(values, list(map(str, values)))
     axes.minorticks_off()
 
 
-def save_png(figure: Any, path: pathlib.Path, dpi: int = 80) -> None:
-    """Write a small PNG, of 256 colors, and close the figure."""
-    import matplotlib.pyplot as plt
-    from PIL import Image
-
+def save_png(
+    figure: matplotlib.figure.Figure, path: pathlib.Path, dpi: int = 80
+) -> None:
+    """Write a small PNG, of 256 colors."""
     with io.BytesIO() as buffer:
         figure.savefig(buffer, format="png", dpi=dpi)
-        plt.close(figure)
         image = Image.open(buffer).convert("RGB").quantize(256)
     path.parent.mkdir(parents=True, exist_ok=True)
     with output_file.whole(path) as partial:

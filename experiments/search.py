@@ -6,6 +6,7 @@ seeds of their own. The spaces are the ranges of the paper's appendix.
 """
 
 import dataclasses
+import functools
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -19,20 +20,21 @@ Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
 
 AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
-#: Those of the figures that compare two.
+#: The agents of the figures that compare two.
 PAIR = ("ppo", "ppo+gasil")
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
-#: The reward is given every so many steps where it is delayed (paper, section 5.4).
+#: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
 #: Noise on walker2d's observations in its search: the middle of the paper's three.
 NOISE = 0.1
-#: Environments a seed. More where physics is slow: a GPU is fast only with thousands.
+#: Environments per seed: more where physics is slow, because a GPU is fast only with
+#: thousands of environments.
 NUM_ENVS, NUM_ENVS_OF = 32, {"ant": 64, "humanoid": 64}
 #: The runs of these figures and searches had all environments reset together.
 STAGGER_EPISODES, ALGORITHM_VERSION = False, 1
 
 _RATES = (3e-4, 1e-4, 5e-5, 3e-5)
-# PPO's search shows what the lower two cost in 1M steps.
+# PPO's search shows how much the lower two rates cost in 1M steps.
 _RATE, _HIGHER = {"learning_rate": _RATES}, {"learning_rate": _RATES[:2]}
 _COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
 #: What each agent's search draws from.
@@ -63,11 +65,11 @@ _OTHER_SPACES: Mapping[tuple[str, str], Space] = {
 #: Steps of a run in a search where they are not 1M; humanoid's figure has three times
 #: as many.
 STEPS = {"point_mass": 500_000, "humanoid": 333_000}
-# In the first stage so many runs; in the second so many points and seeds.
+# Runs of the first stage; points of the second stage, and their seeds.
 _RUNS, _RUNS_OF = 32, {"ant": 16, "humanoid": 16}
 _BEST, _SEEDS, _SEEDS_OF = 4, 4, {"ant": 2, "humanoid": 2}
 _FIRST_SEED, _SECOND_SEED = 1000, 2000
-#: Points that have so many seeds are not tried again.
+#: With this number of seeds in the first stage there is no second stage.
 _ENOUGH_SEEDS = 8
 # Multiplication by 1, 2 and 3 in the field of four elements; its sum is exclusive or.
 _TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
@@ -153,19 +155,17 @@ class Search:
 
     def runs(self, stage: Stage) -> list[list[Run]]:
         """Return the runs of a stage, a list for each point."""
+        run = functools.partial(
+            Run,
+            self.env,
+            reward_delay=self.reward_delay,
+            obs_noise=self.obs_noise,
+            algorithm_version=ALGORITHM_VERSION,
+        )
         return [
-            [self.run(self.config(point), seed) for seed in stage.seeds]
+            [run(self.config(point), seed) for seed in stage.seeds]
             for point in stage.points
         ]
-
-    def run(self, config: Config, seed: int, **changes: Any) -> Run:
-        """Return a run on the search's task."""
-        fields = {
-            "reward_delay": self.reward_delay,
-            "obs_noise": self.obs_noise,
-            "algorithm_version": ALGORITHM_VERSION,
-        }
-        return Run(self.env, config, seed, **{**fields, **changes})
 
     def scores(self, stage: Stage, store: Store) -> np.ndarray | None:
         """Return the mean return over the last fifth of training, (points, seeds).
@@ -187,11 +187,10 @@ class Search:
             scores = None if before is None else self.after.scores(before, store)
             if before is None or scores is None:
                 return None
-            space = {
-                name: values if name in self.free else (best,)
-                for name, values in self.after.space.items()
-                for best in [_best_value(name, before.points, _means(scores))]
-            }
+            space = dict(self.after.space)
+            for name in set(space) - set(self.free):
+                of_values = by_value(name, before.points, means(scores))
+                space[name] = (max(of_values, key=lambda x: of_values[x]),)
             points, seeds = every_point(space), 2
         return Stage(points, range(_FIRST_SEED, _FIRST_SEED + seeds))
 
@@ -203,7 +202,7 @@ class Search:
         scores = self.scores(first, store)
         if len(first.seeds) >= _ENOUGH_SEEDS or scores is None:
             return [first]
-        order = np.argsort(-_means(scores), kind="stable")[:_BEST]
+        order = np.argsort(-means(scores), kind="stable")[:_BEST]
         seeds = range(_SECOND_SEED, _SECOND_SEED + _SEEDS_OF.get(self.env, _SEEDS))
         return [first, Stage(tuple(first.points[i] for i in order), seeds)]
 
@@ -217,7 +216,7 @@ class Search:
         if len(stages) > 1:
             among = [stages[0].points.index(point) for point in points]
             all_scores = np.hstack([all_scores[among], scores[-1]])
-        chosen = int(_means(all_scores).argmax())
+        chosen = int(means(all_scores).argmax())
         return points[chosen], all_scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
@@ -226,69 +225,16 @@ class Search:
         return None if best is None else best[0]
 
 
-def _means(scores: np.ndarray) -> np.ndarray:
+def means(scores: np.ndarray) -> np.ndarray:
     """Return the mean over seeds, (points,); -inf if a seed ended no episode."""
     means = scores.mean(axis=1)
     return np.where(np.isfinite(means), means, -np.inf)
 
 
-def _by_value(
-    name: str, points: Sequence[Point], means: np.ndarray
-) -> dict[Any, float]:
+def by_value(name: str, points: Sequence[Point], means: np.ndarray) -> dict[Any, float]:
     """Return the mean over the points with each value of a hyperparameter."""
     values = np.array([point[name] for point in points])
     return {
         value: float(means[values == value].mean())
         for value in dict.fromkeys(point[name] for point in points)
     }
-
-
-def _best_value(name: str, points: Sequence[Point], means: np.ndarray) -> Any:
-    by_value = _by_value(name, points, means)
-    return max(by_value, key=lambda value: by_value[value])
-
-
-def point_in_words(point: Point) -> str:
-    """Return a point as "name value, name value"."""
-    words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
-    return ", ".join(f"{name} {words(value)}" for name, value in point.items())
-
-
-def table(searches: Mapping[str, Search], store: Store) -> str:
-    """Return the results of searches as Markdown."""
-    head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
-    lines = [f"| {' | '.join(head.split('|'))} |", "|---" * 8 + "|"]
-    for name, search in searches.items():
-        best, stages = search.best(store), search.stages(store)
-        sizes = [f"{len(stage.points)} x {len(stage.seeds)}" for stage in stages]
-        cells = [name, *sizes, *[""] * (2 - len(sizes))]
-        scores = search.scores(stages[0], store) if stages else None
-        if best is None or scores is None:
-            cells += ["not complete", *[""] * 4]
-        else:
-            cells += [point_in_words(best[0]), f"{best[1].mean():.0f}"]
-            cells += [str(len(best[1])), f"{np.median(_means(scores)):.0f}"]
-            cells += [f"{_means(scores).min():.0f}"]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def effects(searches: Mapping[str, Search], store: Store) -> str:
-    """The mean first-stage score of PPO+GASIL's points that have each value: Markdown.
-
-    Every value met every value of the others equally often, so that a mean is of no
-    other's doing; what two do together is not told apart.
-    """
-    names = list(SPACES["ppo+gasil"])
-    lines = [f"| task | {' | '.join(names)} |", "|---|" + "---|" * len(names)]
-    for label, search in searches.items():
-        stage = search.first(store)
-        if search.space != SPACES["ppo+gasil"] or stage is None:
-            continue
-        if (scores := search.scores(stage, store)) is not None:
-            cells = [label]
-            for name in names:
-                by_value = sorted(_by_value(name, stage.points, _means(scores)).items())
-                cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in by_value))
-            lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)

@@ -24,7 +24,7 @@ from gasil_jax.host import output_file, run_folder
 #: their environments in step, and were converted from an earlier format of results.
 ALGORITHM_VERSION = 2
 
-_DEFAULTS = Hyperparameters()
+_DEFAULTS, _NONE = Hyperparameters(), np.empty(0)
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 
@@ -89,18 +89,18 @@ class Record:
       env_steps: environment steps at the end of each part.
       episode_return: mean return of the episodes that ended in the part; NaN if none.
       episode_length: mean length of these episodes; NaN if it was not recorded.
-      evaluation_return: mean return of evaluations; NaN if there were none.
-      final_evaluation: mean return of an evaluation after training; NaN if none.
       provenance: physics, device, versions, the commit of the code, and whether the
         checkout was clean.
+      evaluation_steps: environment steps before each evaluation, (evaluations,).
+      evaluation_return: mean return of the policy's mean action in the evaluation.
     """
 
     env_steps: np.ndarray
     episode_return: np.ndarray
     episode_length: np.ndarray
-    evaluation_return: np.ndarray
-    final_evaluation: float
     provenance: Mapping[str, Any]
+    evaluation_steps: np.ndarray = dataclasses.field(default_factory=lambda: _NONE)
+    evaluation_return: np.ndarray = dataclasses.field(default_factory=lambda: _NONE)
 
     def part(self, begin: float, end: float) -> float:
         """Return the mean return between two fractions of training.
@@ -129,65 +129,81 @@ class Record:
         return float(ended[-1]) if np.isnan(last) and len(ended) else last
 
 
-_ROWS = ("env_steps", "episode_return", "episode_length", "evaluation_return")
+#: Fields of a record, by the array of a file that holds their lengths.
+_TABLES = {
+    "rows": ("env_steps", "episode_return", "episode_length"),
+    "evaluations": ("evaluation_steps", "evaluation_return"),
+}
 
 
-def _rounded(values: Iterable[float]) -> np.ndarray:
+def _rounded(name: str, values: np.ndarray) -> np.ndarray:
     """Round to six significant digits, which float32 keeps; seeds differ far more."""
+    if name.endswith("_steps"):
+        return values.astype(np.uint32)
     return np.array([float(f"{value:.6g}") for value in values], np.float32)
 
 
 def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     """Write a file of runs; its bytes do not depend on the order of the runs."""
     runs = sorted(records, key=lambda run: (run.experiment, run.seed))
-    texts = {run: json.dumps(records[run].provenance, sort_keys=True) for run in runs}
+    provenance = {x: json.dumps(records[x].provenance, sort_keys=True) for x in runs}
     experiments = sorted({run.experiment for run in runs})
-    provenances = sorted(set(texts.values()))
-    number = {
-        text: i for these in (experiments, provenances) for i, text in enumerate(these)
-    }
-    rows = {
-        name: np.concatenate([getattr(records[run], name) for run in runs])
-        for name in _ROWS
-    }
+    provenances = sorted(set(provenance.values()))
     index = {
         "experiments": list(map(json.loads, experiments)),
         "provenances": list(map(json.loads, provenances)),
     }
     arrays = {
         "index": np.array(json.dumps(index, sort_keys=True)),
-        "experiment": np.array([number[run.experiment] for run in runs]),
-        "provenance": np.array([number[texts[run]] for run in runs]),
+        "experiment": np.array([experiments.index(run.experiment) for run in runs]),
+        "provenance": np.array([provenances.index(provenance[run]) for run in runs]),
         "seed": np.array([run.seed for run in runs], np.uint32),
-        "rows": np.array([len(records[run].env_steps) for run in runs]),
-        "final_evaluation": _rounded(records[run].final_evaluation for run in runs),
-        "env_steps": rows["env_steps"].astype(np.uint32),
-        **{name: _rounded(rows[name]) for name in _ROWS[1:]},
     }
+    for lengths, names in _TABLES.items():
+        for name in names:
+            columns = [getattr(records[run], name) for run in runs]
+            arrays[lengths] = np.array(list(map(len, columns)))
+            arrays[name] = _rounded(name, np.concatenate(columns))
     with output_file.whole(path) as partial:
         np.savez_compressed(partial, allow_pickle=False, **arrays)
+
+
+def _with_evaluations(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the arrays of an older file, which has one evaluation of a run or none."""
+    evaluated = np.isfinite(arrays["final_evaluation"])
+    return {
+        **arrays,
+        "evaluations": evaluated.astype(int),
+        "evaluation_steps": arrays["env_steps"][np.cumsum(arrays["rows"]) - 1][
+            evaluated
+        ],
+        "evaluation_return": arrays["final_evaluation"][evaluated],
+    }
 
 
 def read(path: pathlib.Path) -> dict[Run, Record]:
     """Return the runs of a file.
 
     Raises:
-      InputError: it is damaged, or has settings that the package does not.
+      InputError: if it is damaged, or has settings that the package does not have.
     """
     records = {}
     try:
         arrays = npz.read(path)
+        if "evaluations" not in arrays:
+            arrays = _with_evaluations(arrays)
         index = json.loads(str(arrays["index"]))
         experiments = list(map(_experiment, index["experiments"]))
-        ends = np.cumsum(arrays["rows"])
+        columns = {
+            name: np.split(arrays[name].astype(float), np.cumsum(arrays[lengths])[:-1])
+            for lengths, names in _TABLES.items()
+            for name in names
+        }
         for i, seed in enumerate(arrays["seed"]):
-            span = slice(ends[i] - arrays["rows"][i], ends[i])
             run = Run(seed=int(seed), **experiments[arrays["experiment"][i]])
-            records[run] = Record(
-                **{name: arrays[name][span].astype(float) for name in _ROWS},
-                final_evaluation=float(arrays["final_evaluation"][i]),
-                provenance=index["provenances"][arrays["provenance"][i]],
-            )
+            provenance = index["provenances"][arrays["provenance"][i]]
+            values = {name: column[i] for name, column in columns.items()}
+            records[run] = Record(provenance=provenance, **values)
     except (ValueError, KeyError, TypeError, IndexError) as error:
         raise InputError(f"{path} is not a file of runs: {error}") from None
     return records
@@ -216,18 +232,14 @@ class Store:
     def __getitem__(self, run: Run) -> Record:
         return self._of(run.env)[run]
 
-    def refresh(self) -> None:
-        """Read the files again, to which other processes may have added runs."""
-        self._records.clear()
-
     def missing(self, runs: Iterable[Run]) -> list[Run]:
         """Return the runs that are not stored, each once."""
         return [run for run in dict.fromkeys(runs) if run not in self]
 
     def add(self, records: Mapping[Run, Record]) -> int:
-        """Add runs; one that is here already stays as it is. Returns how many are new.
+        """Add the runs that are not stored yet, and return how many these are.
 
-        Processes may add side by side: a file is locked, read anew, and written whole.
+        Several processes may add runs at once: a file is locked, read and written.
         """
         added = 0
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -244,14 +256,14 @@ class Store:
 
 
 def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
-    """Add the runs of another store; returns how many are new, and how many there are.
+    """Add the runs of another store, and return how many are new and how many it has.
 
     Args:
-      source: its folder, or the folder of results that it is in.
-      target: keeps what it has already.
+      source: folder of the other store, or of the results that it is in.
+      target: the store that the runs are added to; what it has stays as it is.
 
     Raises:
-      InputError: there are no runs.
+      InputError: if there are no runs in the folder.
     """
     folder = source / "runs" if (source / "runs").is_dir() else source
     paths = sorted(folder.glob("[!.]*.npz"))

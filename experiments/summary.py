@@ -7,7 +7,7 @@ is a rule on the comparisons of its figure's page.
 import pathlib
 import re
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from experiments import report
 from experiments.figures import FIGURES, NORMALIZED, name_of
@@ -18,25 +18,33 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
-_COMPARISONS = {DELAY: "delayed_mujoco", 1: "mujoco"}
+#: A figure and one of its panels, by the name of a row in a table.
+_Rows = Mapping[str, tuple[str, str]]
+
+
+def _rows(tasks: Sequence[str]) -> _Rows:
+    """Return the tasks with rewards as they are, delayed ones first."""
+    delayed = {f"{env}, delayed": ("delayed_mujoco", env) for env in tasks}
+    return delayed | {env: ("mujoco", env) for env in tasks}
 
 
 class Summary:
     """The page of all claims and the README's blocks, from one store."""
 
+    #: The methods that slots may name; others name a figure and one of its slots.
+    SLOTS = ("claims", "tuned", "as_they_are", "figures")
+
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
 
-    def _ahead(self, figure: str, panels: Sequence[str], all_of_them: bool) -> str:
-        """Holds if PPO+GASIL is better than every other agent on most or all tasks."""
-        compared = self.pages[figure].comparisons
+    def _ahead(self, figure: str, panels: Sequence[str], needed: int) -> str:
+        """Holds if PPO+GASIL is better than each other agent on so many tasks."""
+        compared = self.pages[figure].comparisons.items()
         verdicts = {
-            panel: [x.verdict for key, x in compared.items() if key[0] == panel]
-            for panel in panels
+            p: {x.verdict for key, x in compared if key[0] == p} for p in panels
         }
-        better = [p for p, x in verdicts.items() if x and set(x) == {"better"}]
-        worse = [p for p, x in verdicts.items() if "worse" in x]
-        needed = len(panels) if all_of_them else len(panels) // 2 + 1
+        better = [panel for panel in panels if verdicts[panel] == {"better"}]
+        worse = [panel for panel in panels if "worse" in verdicts[panel]]
         word = "holds" if len(better) >= needed else "holds in part"
         words = f"{word if better else 'does not hold'}: better than all three on "
         words += f"{len(better)} of {len(panels)} tasks"
@@ -45,9 +53,10 @@ class Summary:
 
     def _point_mass(self) -> str:
         """Holds if PPO+GASIL is worse early and better at the end."""
-        page = self.pages["point_mass"]
-        early = page.verdict("point_mass", "ppo+gasil early", "ppo early")
-        late = page.verdict("point_mass", "ppo+gasil", "ppo")
+        early, late = (
+            self.pages["point_mass"].verdict("point_mass", f"ppo+gasil{x}", f"ppo{x}")
+            for x in (" early", "")
+        )
         word = "holds" if (early, late) == ("worse", "better") else "does not hold"
         layout = "in a layout that was chosen for it"
         return f"{word}: {early} early, {late} at the end, {layout}"
@@ -67,24 +76,22 @@ class Summary:
         """Holds if the best value is better than both of these in most panels."""
         page = self.pages["hyperparameters"]
         panels = [panel for panel in page.figure.panels if panel.startswith(name)]
-        counts = {
-            end: sum(
-                page.verdict(panel, page.best_value(panel), end) == "better"
-                for panel in panels
-                if page.best_value(panel) != end
+        best = {panel: page.best_value(panel) for panel in panels}
+        counts = [
+            sum(
+                x != end and page.verdict(p, x, end) == "better"
+                for p, x in best.items()
             )
             for end in (few, many)
-        }
-        word = "holds in part" if any(counts.values()) else "not clear"
-        word = "holds" if min(counts.values()) > len(panels) / 2 else word
-        words = " and ".join(f"than {end} in {count}" for end, count in counts.items())
+        ]
+        word = "holds in part" if any(counts) else "not clear"
+        word = "holds" if min(counts) > len(panels) / 2 else word
+        words = f"than {few} in {counts[0]} and than {many} in {counts[1]}"
         return f"{word}: the best value is better {words} of {len(panels)} panels"
 
     def claims(self) -> str:
         """Return a table with each claim of the paper and our measurements."""
-        dense, delayed = (
-            [name_of(x, delay) for x in NORMALIZED] for delay in (1, DELAY)
-        )
+        dense, delayed = ([name_of(x, d) for x in NORMALIZED] for d in (1, DELAY))
         normalized = "The same, with normalized rewards"
         rows = [
             (
@@ -95,14 +102,14 @@ class Summary:
             (
                 "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most "
                 "tasks",
-                self._ahead("mujoco", TASKS, False),
+                self._ahead("mujoco", TASKS, needed=4),
             ),
-            (normalized, self._ahead("normalized_rewards", dense, False)),
+            (normalized, self._ahead("normalized_rewards", dense, needed=3)),
             (
                 "Delayed rewards: it is ahead of them by a large margin on all tasks",
-                self._ahead("delayed_mujoco", TASKS, True),
+                self._ahead("delayed_mujoco", TASKS, needed=6),
             ),
-            (normalized, self._ahead("normalized_rewards", delayed, True)),
+            (normalized, self._ahead("normalized_rewards", delayed, needed=4)),
             ("Noise: the gap to PPO is larger with it", self._noise()),
             (
                 "Discriminator updates: too few (1) and too many (20) do poorly",
@@ -115,54 +122,46 @@ class Summary:
         ]
         return report.markdown_table(["The paper's claim", "Here"], rows)
 
-    def _table(self, rows: Mapping[str, tuple[str, str]]) -> str:
-        """Agents on tasks: name of a row -> figure and panel."""
+    def _table(self, rows: _Rows) -> str:
+        """Return the final returns of all agents."""
         table = []
         for name, (figure, panel) in rows.items():
-            of = self.pages[figure].results.get(panel, {})
-            final = lambda x: (
-                report.interval(x.final) + ("" if x.complete else f" ({x.seeds} seeds)")
-            )
-            cells = [final(of[agent]) if agent in of else "" for agent in AGENTS]
+            cells = []
+            for x in (self.pages[figure].results.get((panel, y)) for y in AGENTS):
+                seeds = "" if x is None or x.complete else f" ({x.seeds} seeds)"
+                cells.append(f"{report.interval(x.final)}{seeds}" if x else "")
             table.append([name, *cells])
         return report.markdown_table(["", *map(str.upper, AGENTS)], table)
 
     def as_they_are(self) -> str:
-        """Rewards as they are, where there are normalized ones too."""
-        each = [(env, delay) for delay in _COMPARISONS for env in NORMALIZED]
-        return self._table({_row(*x): (_COMPARISONS[x[1]], x[0]) for x in each})
+        """Return the results with rewards as they are of tasks with others too."""
+        return self._table(_rows(NORMALIZED))
 
     def tuned(self) -> str:
-        """Every agent with its tuned preset."""
-        each = [(env, delay) for delay in _COMPARISONS for env in NORMALIZED]
-        rows = {_row(*x): ("normalized_rewards", name_of(*x)) for x in each}
-        others = [(env, delay) for delay in _COMPARISONS for env in TASKS[4:]]
-        rows |= {_row(*x): (_COMPARISONS[x[1]], x[0]) for x in others}
-        return self._table(rows)
+        """Return the results of every agent with its tuned preset."""
+        rows = {
+            name: ("normalized_rewards", name.replace(", ", "-"))
+            for name in _rows(NORMALIZED)
+        }
+        return self._table({**rows, **_rows(TASKS[len(NORMALIZED) :])})
 
     def figures(self) -> str:
-        """Links to the pages of all figures."""
+        """Return links to the pages of all figures."""
         return "\n".join(f"- [{x.figure.title}]({n}.md)" for n, x in self.pages.items())
 
     def value(self, name: str, *arguments: str) -> str:
-        """What stands in a slot: one of these, or a figure's name and its slot.
+        """Return what stands in a slot: one of these, or a figure's name and its slot.
 
         Raises:
-          InputError: there is no such slot.
+          InputError: if there is no such slot.
         """
-        own: dict[str, Callable[[], str]] = {
-            "claims": self.claims,
-            "tuned": self.tuned,
-            "as_they_are": self.as_they_are,
-            "figures": self.figures,
-        }
-        if name in own and not arguments:
-            return own[name]()
+        if name in self.SLOTS and not arguments:
+            return getattr(self, name)()
         if name in self.pages and arguments:
             return self.pages[name].value(*arguments)
         raise InputError(
             f"slot is {shlex.join([name, *arguments])}: it must be one of "
-            f"{', '.join(own)}, or a figure and its slot"
+            f"{', '.join(self.SLOTS)}, or a figure and its slot"
         )
 
     def text(self) -> str:
@@ -181,12 +180,7 @@ class Summary:
 
     def write(self) -> None:
         """Write the page of all claims and the README's blocks."""
-        texts = {RESULTS / "README.md": self.text()}
-        texts[README] = self.fill_blocks(README.read_text())
-        for path, text in texts.items():
+        text = self.fill_blocks(README.read_text())
+        for path, content in ((RESULTS / "README.md", self.text()), (README, text)):
             with output_file.whole(path) as partial:
-                partial.write_text(text)
-
-
-def _row(env: str, delay: int) -> str:
-    return env if delay == 1 else f"{env}, delayed"
+                partial.write_text(content)

@@ -95,6 +95,8 @@ class Hyperparameters(struct.PyTreeNode):
     max_grad_norm: float = _number(0.5, 0.0, excludes_low=True)
     """Largest global norm of a gradient; the policy's and the value's gradients are
     clipped separately."""
+    initial_deviation: float = _number(1.0, 0.0, excludes_low=True)
+    """Standard deviation of the untrained policy's actions."""
     alpha: float = _number(0.1, 0.0)
     """Scale of the discriminator's reward (paper, section 4.3)."""
     discriminator_learning_rate: float = _number(1e-4, 0.0, excludes_low=True)
@@ -105,6 +107,10 @@ class Hyperparameters(struct.PyTreeNode):
     """Weight of the entropy of the discriminator's output."""
     buffer_steps: int = _count(1000)
     """Capacity of the good-trajectory buffer, in steps."""
+    imitation_weight: float = _number(0.7, 0.0, 1.0)
+    """Largest share of imitation in the policy's advantage, in ppo+gasil-adaptive."""
+    decomposition_learning_rate: float = _number(1e-3, 0.0, excludes_low=True)
+    """Adam's step size for the network that decomposes rewards."""
     behavior_cloning_coefficient: float = _number(0.1, 0.0)
     """Weight of the cloning loss of PPO+BC."""
     sil_coefficient: float = _number(0.1, 0.0)
@@ -132,6 +138,11 @@ class Config:
     """Steps in one gradient step of PPO."""
     hidden_sizes: tuple[int, ...] = _count((64, 64))
     """Widths of the tanh layers, in the policy and in the value."""
+    bonus: str = "softplus"
+    """Form of the discriminator's reward: "softplus", -log D, is the paper's."""
+    imitation_rule: str = "both"
+    """What the share of imitation in the policy's advantage follows, in the agent
+    ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for none of them."""
     discriminator_minibatch_size: int = _count(128)
     """Steps of the policy, and equally many good steps, in one gradient step of the
     discriminator."""
@@ -161,6 +172,18 @@ class Config:
     discounted sum (as in OpenAI baselines' ppo2). Alpha is then in that unit, not in
     the environment's. It has no effect on the agents gasil and gail, which do not use
     the environment's reward."""
+    decompose_rewards: bool = False
+    """Whether PPO sees, instead of a reward that arrives late, a reward for each step
+    that a network learns from the sums that are paid (see reward_decomposition)."""
+    decomposition_updates: int = _count(20)
+    """Gradient steps of the network that decomposes rewards in an iteration."""
+    decomposition_minibatch_size: int = _count(64)
+    """Windows between two payouts in one gradient step of that network."""
+    decomposition_window_steps: int = _count(32)
+    """Steps that represent a window in a gradient step of that network: all of a
+    window that has no more, and as many drawn at random of a longer one."""
+    decomposition_hidden_sizes: tuple[int, ...] = _count((100, 100))
+    """Widths of the tanh layers of that network."""
     stagger_episodes: bool = True
     """Whether each environment's first episode begins at a random age, so that a batch
     holds steps from all parts of an episode. Otherwise environments whose episodes
@@ -232,7 +255,7 @@ def validate(config: Config, agents: Sequence[str]) -> None:
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))
     _validate_sizes(config)
-    for name in ("normalize_rewards", "stagger_episodes"):
+    for name in ("normalize_rewards", "decompose_rewards", "stagger_episodes"):
         if not isinstance(value := getattr(config, name), bool):
             raise _refusal(name, value, "True or False")
     if not isinstance(config.expert, str | None):

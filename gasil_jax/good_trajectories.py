@@ -128,15 +128,20 @@ def record(
     """
     chex.assert_equal_shape_prefix([observation, action, reward, ended], 2)
     num_steps = observation.shape[0]
-    write = lambda ring, new: jax.lax.dynamic_update_slice_in_dim(
-        ring, jnp.swapaxes(new, 0, 1), history.cursor, axis=1
-    )
+    cursor = history.cursor
     return History(
-        observation=write(history.observation, observation),
-        action=write(history.action, action),
-        reward=write(history.reward, reward),
-        ended=write(history.ended, ended),
-        cursor=(history.cursor + num_steps) % history.observation.shape[1],
+        observation=write(history.observation, observation, cursor),
+        action=write(history.action, action, cursor),
+        reward=write(history.reward, reward, cursor),
+        ended=write(history.ended, ended, cursor),
+        cursor=(cursor + num_steps) % history.observation.shape[1],
+    )
+
+
+def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
+    """Return a ring (N, H, ...) with a batch (time, N, ...) written at `cursor`."""
+    return jax.lax.dynamic_update_slice_in_dim(
+        ring, jnp.swapaxes(new, 0, 1), cursor, axis=1
     )
 
 

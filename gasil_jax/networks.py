@@ -91,6 +91,20 @@ class Discriminator(nn.Module):
         return MLP(self.hidden_sizes, 1)(x)[..., 0]
 
 
+class StepReward(nn.Module):
+    """The reward of a step, for `reward_decomposition`; it starts near 0."""
+
+    hidden_sizes: Sequence[int]
+
+    @nn.compact
+    def __call__(
+        self, observation: jax.Array, action: jax.Array, next_observation: jax.Array
+    ) -> jax.Array:
+        """(..., obs), (..., action), (..., obs) -> (...)."""
+        x = jnp.concatenate([observation, action, next_observation], axis=-1)
+        return MLP(self.hidden_sizes, 1, 0.01)(x)[..., 0]
+
+
 def gaussian_log_prob(
     mean: jax.Array, log_std: jax.Array, action: jax.Array
 ) -> jax.Array:

@@ -5,8 +5,8 @@ any leaf of `Hyperparameters`, shard it over devices, call it from other JAX cod
 """
 
 import math
-from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -18,13 +18,17 @@ from gasil_jax import (
     learner,
     normalization,
     ppo,
+    reward_decomposition,
     reward_normalization,
     rollout,
     schedules,
 )
 from gasil_jax.config import Config, Hyperparameters, validate
+from gasil_jax.errors import unknown
 from gasil_jax.imitation import AGENTS
-from gasil_jax.imitation.interface import Context
+from gasil_jax.imitation.adaptive import RULES
+from gasil_jax.imitation.adversarial import BONUSES
+from gasil_jax.imitation.interface import Context, Imitation
 from gasil_jax.networks import Policy, Value
 from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
@@ -38,6 +42,7 @@ class TrainState(struct.PyTreeNode):
     Attributes:
       actor_critic: policy and values, with their optimizers' states.
       normalizer: of observations.
+      reward_decomposition: of rewards; None where they are not decomposed.
       reward_normalizer: of rewards; None where they are not normalized.
       environments: the running episodes, (env, ...).
       history: the last steps of each environment, (env, steps, ...).
@@ -50,6 +55,7 @@ class TrainState(struct.PyTreeNode):
 
     actor_critic: ActorCritic
     normalizer: normalization.Normalizer
+    reward_decomposition: reward_decomposition.Decomposition | None
     reward_normalizer: reward_normalization.RewardNormalizer | None
     environments: rollout.EnvironmentStates
     history: good_trajectories.History
@@ -78,14 +84,26 @@ def init(
     hyperparameters = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32), hyperparameters
     )
-    key, policy_key, value_key, env_key, imitation_key = jax.random.split(key, 5)
+    key, policy_key, value_key, env_key, imitation_key, decomposition_key = (
+        jax.random.split(key, 6)
+    )
     sizes = (env.observation_size, env.action_size)
     episode_steps = max_episode_steps(env, config)
+    history = good_trajectories.init_history(
+        config.num_envs, config.num_steps, episode_steps, *sizes
+    )
     return TrainState(
         actor_critic=_init_actor_critic(
             env, config, hyperparameters, policy_key, value_key
         ),
         normalizer=normalization.init(env.observation_size),
+        reward_decomposition=(
+            reward_decomposition.init(
+                decomposition_key, config, history, env.action_size
+            )
+            if config.decompose_rewards
+            else None
+        ),
         reward_normalizer=(
             reward_normalization.init(config.num_envs)
             if config.normalize_rewards
@@ -97,9 +115,7 @@ def init(
             config.num_envs,
             age_limit=episode_steps if config.stagger_episodes else None,
         ),
-        history=good_trajectories.init_history(
-            config.num_envs, config.num_steps, episode_steps, *sizes
-        ),
+        history=history,
         # The configuration's own number decides the shape, a member's how much of it
         # is filled.
         good_trajectories=good_trajectories.init(
@@ -127,10 +143,12 @@ def _init_actor_critic(
     policy, value = _networks(env, config)
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(hyperparameters)
-    streams = len(AGENTS[config.agent].stream_weights(hyperparameters))
-    value_keys = [value_key, *jax.random.split(value_key, streams)[1:]]
+    num_streams = AGENTS[config.agent].num_streams
+    value_keys = [value_key, *jax.random.split(value_key, num_streams)[1:]]
+    policy_params = policy.init(policy_key, observation)
+    policy_params["params"]["log_std"] += jnp.log(hyperparameters.initial_deviation)
     return ActorCritic(
-        policy=learner.init(policy.init(policy_key, observation), transform),
+        policy=learner.init(policy_params, transform),
         values=tuple(
             learner.init(value.init(key, observation), transform) for key in value_keys
         ),
@@ -147,8 +165,9 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     agent = AGENTS[config.agent]
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
-    key, act_key, imitate_key, ppo_key, policy_key = jax.random.split(state.key, 5)
-
+    key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(
+        state.key, 6
+    )
     # Sample policy trajectories.
     environments, batch = sample_trajectories(
         env, config, state, act_key, policy=policy, gamma=hyperparameters.gamma
@@ -158,31 +177,28 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         state.history, state.good_trajectories, batch, hyperparameters.buffer_steps
     )
     # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
-    reward_normalizer, reward_scale, batch = scale_rewards(
-        state.reward_normalizer, batch, hyperparameters.gamma
+    rewards, reward_metrics = learner_rewards(
+        env, config, state, batch, history, decompose_key, hyperparameters
     )
     # Sample good trajectories, update the discriminator by equation 8, and shape the
     # reward with it (section 4.3): what the agent imitates with does so.
     context = Context(
-        rollout=batch,
-        history=history,
+        rollout=rewards.batch,
+        history=rewards.history,
         good_trajectories=buffer,
         normalizer=state.normalizer,
-        reward_scale=reward_scale,
+        reward_scale=rewards.scale,
         hyperparameters=hyperparameters,
         config=config,
         policy=policy,
         value=value,
     )
-    imitation, rewards, imitation_metrics = agent.update_and_reward(
+    imitation, streams, imitation_metrics = agent.update_and_reward(
         state.imitation, context, imitate_key
     )
     # Update the policy.
-    experience, explained_variance = advantages(
-        state.actor_critic,
-        rewards,
-        context,
-        stream_weights=agent.stream_weights(hyperparameters),
+    experience, advantage_metrics = advantages(
+        state.actor_critic, streams, context, agent=agent, imitation=imitation
     )
     actor_critic, ppo_metrics = ppo.update(
         state.actor_critic,
@@ -196,23 +212,17 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     imitation, actor_critic, policy_metrics = agent.update_policy(
         imitation, actor_critic, context, policy_key
     )
-    healthy, (actor_critic, imitation) = keep_if_finite(
-        (actor_critic, imitation), (state.actor_critic, state.imitation)
+    healthy, learned = keep_if_finite(
+        (actor_critic, imitation, rewards.decomposition),
+        (state.actor_critic, state.imitation, state.reward_decomposition),
     )
-    metrics: Metrics = {
-        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
-        **rollout_metrics(batch, buffer),
-        "skipped_updates": ~healthy,
-        "explained_variance": explained_variance,
-        "learning_rate": jnp.asarray(hyperparameters.learning_rate),
-        **({} if reward_normalizer is None else {"reward_scale": reward_scale}),
-        **ppo_metrics,
-    }
+    actor_critic, imitation, decomposition = learned
     state = state.replace(
         actor_critic=actor_critic,
         # Only now: within an iteration the policy that acts is the one that learns.
         normalizer=normalization.update(state.normalizer, batch.observation),
-        reward_normalizer=reward_normalizer,
+        reward_decomposition=decomposition,
+        reward_normalizer=rewards.normalizer,
         environments=environments,
         history=history,
         good_trajectories=buffer,
@@ -221,7 +231,18 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         iteration=state.iteration + 1,
     )
     return state, merge_metrics(
-        config.agent, metrics, imitation_metrics, policy_metrics
+        config.agent,
+        {
+            "env_steps": (state.iteration - 1).astype(jnp.float32) * config.batch_steps,
+            **rollout_metrics(batch, buffer),
+            "skipped_updates": ~healthy,
+            "learning_rate": jnp.asarray(hyperparameters.learning_rate),
+            **reward_metrics,
+            **ppo_metrics,
+        },
+        advantage_metrics,
+        imitation_metrics,
+        policy_metrics,
     )
 
 
@@ -289,25 +310,72 @@ def remember(
     return history, good_trajectories.insert(buffer, history, episodes, buffer_steps)
 
 
-def scale_rewards(
-    normalizer: reward_normalization.RewardNormalizer | None,
-    batch: Rollout,
-    gamma: jax.Array | float,
-) -> tuple[reward_normalization.RewardNormalizer | None, jax.Array, Rollout]:
-    """Normalize a batch's rewards, where there is a normalizer.
+class Rewards(NamedTuple):
+    """The rewards that PPO and the agent learn from, and the state behind them.
 
-    Returns:
-      the normalizer with the batch in it, what rewards were divided by, (), and the
-      batch with its rewards in that unit.
+    Attributes:
+      batch: with these rewards, (time, env, ...).
+      history: with these rewards, but not normalized.
+      scale: (), the number that the batch's rewards were divided by.
+      decomposition: after the batch; None where rewards are not decomposed.
+      normalizer: after the batch; None where rewards are not normalized.
     """
-    if normalizer is None:
-        return None, jnp.float32(1.0), batch
-    normalizer = reward_normalization.update(
-        normalizer, batch.reward, batch.ended, gamma
-    )
-    reward = reward_normalization.normalize(normalizer, batch.reward)
-    scale = reward_normalization.scale(normalizer)
-    return normalizer, scale, batch.replace(reward=reward)
+
+    batch: Rollout
+    history: good_trajectories.History
+    scale: jax.Array
+    decomposition: reward_decomposition.Decomposition | None
+    normalizer: reward_normalization.RewardNormalizer | None
+
+
+def learner_rewards(
+    env: Any,
+    config: Config,
+    state: TrainState,
+    batch: Rollout,
+    history: good_trajectories.History,
+    key: jax.Array,
+    hyperparameters: Hyperparameters,
+) -> tuple[Rewards, Metrics]:
+    """Decompose and normalize a batch's rewards, as far as the config says so.
+
+    Args:
+      env: gives the range of actions.
+      config: what is done.
+      state: before the batch.
+      batch: with the environment's own rewards.
+      history: with the batch in it.
+      key: consumed.
+      hyperparameters: their values in this iteration.
+    """
+    decomposition = None
+    metrics: Metrics = {}
+    if state.reward_decomposition is not None:
+        decomposition, batch, metrics = reward_decomposition.decompose(
+            state.reward_decomposition,
+            batch,
+            history,
+            state.normalizer,
+            key,
+            config=config,
+            hyperparameters=hyperparameters,
+            action_range=rollout.action_range(env),
+        )
+        # What is not a number in the history marks an episode without a return.
+        unknown = jnp.isnan(history.reward)
+        history = history.replace(
+            reward=jnp.where(unknown, jnp.nan, decomposition.reward)
+        )
+    normalizer, scale = None, jnp.float32(1.0)
+    if state.reward_normalizer is not None:
+        normalizer = reward_normalization.update(
+            state.reward_normalizer, batch.reward, batch.ended, hyperparameters.gamma
+        )
+        reward = reward_normalization.normalize(normalizer, batch.reward)
+        scale = reward_normalization.scale(normalizer)
+        batch = batch.replace(reward=reward)
+        metrics = {**metrics, "reward_scale": scale}
+    return Rewards(batch, history, scale, decomposition, normalizer), metrics
 
 
 def advantages(
@@ -315,19 +383,21 @@ def advantages(
     rewards: jax.Array,
     context: Context,
     *,
-    stream_weights: Sequence[jax.Array | float],
-) -> tuple[ppo.Batch, jax.Array]:
-    """What PPO learns from: the weighted sum of each stream's standardized advantage.
+    agent: Imitation,
+    imitation: Any,
+) -> tuple[ppo.Batch, Metrics]:
+    """Return what PPO learns from: the agent's mix of its streams' advantages.
 
     Args:
       actor_critic: with a value for each stream.
       rewards: float32 (time, env) of one stream, or (time, env, stream).
       context: of the iteration.
-      stream_weights: (stream) of them, () each.
+      agent: mixes the standardized advantages.
+      imitation: the agent's state.
 
     Returns:
-      the batch, (steps, ...), and the share of the returns' variance that the values
-      explain, (), the mean over streams.
+      the batch, (steps, ...), and metrics: the share of the returns' variance that
+      the values explain, (), the mean over streams, and those of the mix.
     """
     batch = context.rollout
     if rewards.ndim == 2:
@@ -344,10 +414,7 @@ def advantages(
         hyperparameters=context.hyperparameters,
     )
     returns = advantage + values
-    standardized = ppo.standardize(advantage)
-    mixed = sum(
-        weight * standardized[..., i] for i, weight in enumerate(stream_weights)
-    )
+    mixed, metrics = agent.mix(imitation, ppo.standardize(advantage), context)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     residual = jnp.var(returns - values, axis=(0, 1))
     explained = 1.0 - residual / (jnp.var(returns, axis=(0, 1)) + 1e-8)
@@ -355,9 +422,9 @@ def advantages(
         observation=flat(observation),
         action=flat(batch.action),
         log_prob=flat(batch.log_prob),
-        advantage=flat(jnp.asarray(mixed)),
+        advantage=flat(mixed),
         returns=flat(returns),
-    ), jnp.mean(explained)
+    ), {"explained_variance": jnp.mean(explained), **metrics}
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
@@ -422,6 +489,9 @@ def check(env: Any, config: Config) -> None:
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
     validate(config, tuple(AGENTS))
+    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
+        if (value := getattr(config, name)) not in allowed:
+            raise ValueError(unknown(name, value, tuple(allowed)))
     limit = getattr(env, "episode_length", math.inf)
     if (config.max_episode_steps or 0) > limit:
         raise ValueError(

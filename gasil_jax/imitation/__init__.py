@@ -4,15 +4,24 @@ An agent is PPO plus one `Imitation`. To add an agent, write a file that defines
 add it to `AGENTS`.
 """
 
-from gasil_jax.imitation import adversarial, behavior_cloning, none, self_imitation
+from gasil_jax.imitation import (
+    adaptive,
+    adversarial,
+    behavior_cloning,
+    constant_bonus,
+    none,
+    self_imitation,
+)
 from gasil_jax.imitation.interface import Imitation
 
 AGENTS: dict[str, Imitation] = {
     "ppo": none.PPO,
+    "ppo+bonus": constant_bonus.PPO_BONUS,
     "ppo+bc": behavior_cloning.PPO_BC,
     "ppo+sil": self_imitation.PPO_SIL,
     "gasil": adversarial.GASIL,
     "ppo+gasil": adversarial.PPO_GASIL,
+    "ppo+gasil-adaptive": adaptive.PPO_GASIL_ADAPTIVE,
     "gail": adversarial.GAIL,
 }
 

@@ -14,7 +14,7 @@ While the buffer is empty, D does not train and the bonus is 0. GAIL is the same
 with a fixed set of expert pairs instead of the buffer.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -29,9 +29,44 @@ from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
 
 
-def bonus(logit: jax.Array, alpha: jax.Array | float) -> jax.Array:
-    """Return -alpha log D (paper, section 4.3) from the logit of D: (...) -> (...)."""
-    return alpha * jax.nn.softplus(-logit)
+def softplus_bonus(logit: jax.Array) -> jax.Array:
+    """Return -log D (paper, section 4.3): never negative, so it pays for staying up."""
+    return jax.nn.softplus(-logit)
+
+
+def logit_bonus(logit: jax.Array) -> jax.Array:
+    """Return log(1 - D) - log D (AIRL, Fu et al. 2018): of both signs.
+
+    It is 0 where D cannot tell, and so neither pays for staying up nor for ending.
+    """
+    return -logit
+
+
+def dail_bonus(logit: jax.Array) -> jax.Array:
+    """Return sigmoid(x) (tanh(x) + 1) / 2 of x = -logit (DAIL, arXiv:2510.00922).
+
+    It is between 0 and 1, so it pays for staying up, but less for pairs that are
+    clearly the policy's own.
+    """
+    return 0.5 * jax.nn.sigmoid(-logit) * (jnp.tanh(-logit) + 1.0)
+
+
+def centered_bonus(logit: jax.Array) -> jax.Array:
+    """Return -log D minus its mean over the batch: of both signs.
+
+    A step like all others gets 0, so on the whole it does not pay for staying up.
+    """
+    softplus = softplus_bonus(logit)
+    return softplus - jnp.mean(softplus)
+
+
+#: The forms of the bonus, functions of the logit of D on a batch, (time, env).
+BONUSES: Mapping[str, Callable[[jax.Array], jax.Array]] = {
+    "softplus": softplus_bonus,
+    "logit": logit_bonus,
+    "dail": dail_bonus,
+    "centered": centered_bonus,
+}
 
 
 def loss(
@@ -74,9 +109,10 @@ def _optimizer() -> optax.GradientTransformation:
     return optax.flatten(optax.scale_by_adam())
 
 
-def _init(
+def init(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> Learner:
+    """Return an untrained discriminator. The key is consumed."""
     params = _network(config).init(
         key, jnp.zeros(observation_size), jnp.zeros(action_size)
     )
@@ -110,7 +146,7 @@ def _sample_expert(
     return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
 
 
-_GOOD_TRAJECTORIES = Source(
+GOOD_TRAJECTORIES = Source(
     _sample_good, lambda context: context.good_trajectories.size > 0
 )
 _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
@@ -176,6 +212,29 @@ def _train_discriminator(
     return choose(ready, trained, state), metrics
 
 
+def update_and_score(
+    state: Learner, context: Context, key: jax.Array, source: Source = GOOD_TRAJECTORIES
+) -> tuple[Learner, jax.Array, Metrics]:
+    """Train the discriminator, and give each step of the batch its bonus.
+
+    Args:
+      state: the discriminator.
+      context: of the iteration.
+      key: consumed.
+      source: what the policy imitates.
+
+    Returns:
+      The discriminator, the bonus without alpha, float32 (time, env), 0 where there is
+      nothing to imitate yet, and metrics.
+    """
+    state, metrics = _train_discriminator(state, source, context, key)
+    rollout = context.rollout
+    observation = normalization.normalize(context.normalizer, rollout.observation)
+    logit = _network(context.config).apply(state.params, observation, rollout.action)
+    form = BONUSES[context.config.bonus]
+    return state, jnp.where(source.is_ready(context), form(logit), 0.0), metrics
+
+
 def _update_and_reward(
     source: Source,
     combine: Callable[[jax.Array, jax.Array], jax.Array],
@@ -183,19 +242,11 @@ def _update_and_reward(
     def update_and_reward(
         state: Learner, context: Context, key: jax.Array
     ) -> tuple[Learner, jax.Array, Metrics]:
-        state, metrics = _train_discriminator(state, source, context, key)
-        rollout = context.rollout
-        observation = normalization.normalize(context.normalizer, rollout.observation)
-        logit = _network(context.config).apply(
-            state.params, observation, rollout.action
-        )
-        shaped = jnp.where(
-            source.is_ready(context),
-            bonus(logit, context.hyperparameters.alpha),
-            0.0,
-        )
+        state, bonus, metrics = update_and_score(state, context, key, source)
+        shaped = context.hyperparameters.alpha * bonus
         metrics["bonus"] = jnp.mean(shaped)
-        return state, combine(rollout.reward, shaped), metrics
+        metrics["bonus_deviation"] = jnp.std(shaped)
+        return state, combine(context.rollout.reward, shaped), metrics
 
     return update_and_reward
 
@@ -207,32 +258,34 @@ def _check_expert(config: Config, observation_size: int, action_size: int) -> No
 _reward_and_bonus = lambda reward, bonus: reward + bonus
 _bonus_alone = lambda reward, bonus: bonus
 
-_FIELDS = (
-    "alpha",
+#: What every discriminator uses.
+FIELDS = (
+    "bonus",
     "discriminator_learning_rate",
     "discriminator_entropy_coefficient",
     "discriminator_updates",
     "discriminator_minibatch_size",
 )
+_FIELDS = ("alpha", *FIELDS)
 _FIELDS_OF_BUFFER = (*_FIELDS, "buffer_steps")
 
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(
-    _init,
-    _update_and_reward(_GOOD_TRAJECTORIES, _reward_and_bonus),
+    init,
+    _update_and_reward(GOOD_TRAJECTORIES, _reward_and_bonus),
     leave_policy,
     fields=_FIELDS_OF_BUFFER,
 )
 #: -alpha log D alone (Algorithm 1).
 GASIL = Imitation(
-    _init,
-    _update_and_reward(_GOOD_TRAJECTORIES, _bonus_alone),
+    init,
+    _update_and_reward(GOOD_TRAJECTORIES, _bonus_alone),
     leave_policy,
     fields=_FIELDS_OF_BUFFER,
 )
 #: -alpha log D alone, D against expert trajectories (section 3.2).
 GAIL = Imitation(
-    _init,
+    init,
     _update_and_reward(_EXPERT, _bonus_alone),
     leave_policy,
     _check_expert,

@@ -59,9 +59,11 @@ def check_without_expert(
         )
 
 
-def one_stream(hyperparameters: Hyperparameters) -> tuple[float, ...]:
-    """Return the weight of a single reward stream: the default `stream_weights`."""
-    return (1.0,)
+def one_advantage(
+    state: Any, advantages: jax.Array, context: Context
+) -> tuple[jax.Array, Metrics]:
+    """Return the advantage of the only reward stream: the default `mix`."""
+    return advantages[..., 0], {}
 
 
 class Imitation(NamedTuple):
@@ -80,8 +82,10 @@ class Imitation(NamedTuple):
       fields: names of the fields of `Config` and `Hyperparameters` that the method
         uses, besides those that PPO uses. A sweep over a field that the agent does
         not use is refused. None if the method does not say.
-      stream_weights: hyperparameters -> the weight of each reward stream's standardized
-        advantage in the policy's advantage; default one stream of weight 1.
+      num_streams: number of reward streams.
+      mix: (state, advantages, context) -> advantage, metrics. Combines the standardized
+        advantages of the streams, (time, env, stream), to that of the policy,
+        (time, env); default the only one.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -93,7 +97,8 @@ class Imitation(NamedTuple):
     ]
     check: Callable[[Config, int, int], None] = check_without_expert
     fields: tuple[str, ...] | None = None
-    stream_weights: Callable[[Hyperparameters], tuple[Any, ...]] = one_stream
+    num_streams: int = 1
+    mix: Callable[[Any, jax.Array, Context], tuple[jax.Array, Metrics]] = one_advantage
 
 
 def leave_policy(

@@ -34,13 +34,3 @@ def test_entropy_is_the_bernoulli_entropy():
     without = adversarial.loss(half, half, 0.0)[0]
     with_entropy = adversarial.loss(half, half, 1.0)[0]
     np.testing.assert_allclose(without - with_entropy, entropy, rtol=1e-5)
-
-
-def test_bonus_is_minus_alpha_log_d_and_pays_more_for_good_pairs():
-    logit = jnp.array([-4.0, 0.0, 4.0, 200.0, -200.0])
-    result = adversarial.bonus(logit, 0.5)
-    expected = -0.5 * np.log(1 / (1 + np.exp(-np.array([-4.0, 0.0, 4.0]))))
-    np.testing.assert_allclose(result[:3], expected, rtol=1e-5)
-    # A low logit means: not from the policy, like the buffer.
-    assert result[0] > result[1] > result[2]
-    assert np.all(np.isfinite(result))

@@ -189,8 +189,10 @@ def test_two_streams_of_the_same_reward_are_that_reward():
         reward = context.rollout.reward
         return state, jnp.stack([reward, -3.0 * reward], axis=-1), {}
 
-    weights = lambda hyperparameters: (1.0, 0.0)
-    two = AGENTS["ppo"]._replace(update_and_reward=twice, stream_weights=weights)
+    first_alone = lambda state, advantages, context: (advantages[..., 0], {})
+    two = AGENTS["ppo"]._replace(
+        update_and_reward=twice, num_streams=2, mix=first_alone
+    )
     env = gasil_jax.make_env("point_mass")
     AGENTS["two streams"] = two
     try:

@@ -3,53 +3,41 @@
 import csv
 import dataclasses
 
-import jax
 import numpy as np
-import pytest
 
-from experiments import point_mass_layouts, point_mass_moments
+import gasil_jax
+from experiments import __main__, point_mass_layouts, point_mass_moments
 from experiments.store import RESULTS
 
 
-@pytest.mark.parametrize("number", [0, 1])
-def test_a_traced_layout_is_the_layout_itself(number):
-    layout = point_mass_layouts.draw(number)
-    plain = point_mass_layouts.PointMass(layout)
-    target = plain.objects[0]
-
-    def walk(env, key):
-        def step(state, _):
-            action = jax.numpy.clip(9.0 * (target - state.obs[:2]), -1, 1)
-            state = env.step(state, action)
-            return state, state
-
-        return jax.lax.scan(step, env.reset(key), length=50)[1]
-
-    key = jax.random.key(3)
-    expected = walk(plain, key)
-    traced = jax.jit(lambda x: walk(point_mass_layouts.TracedPointMass(x), key))(
-        point_mass_layouts.arrays(layout)
-    )
-    np.testing.assert_allclose(traced.reward, expected.reward, atol=1e-5)
-    assert (expected.reward > 1.0).any()  # Something is collected.
-    seen = expected.obs.shape[-1]
-    assert seen < traced.obs.shape[-1]
-    np.testing.assert_allclose(traced.obs[:, :seen], expected.obs, atol=1e-5)
-    assert (traced.obs[:, seen:] == 1).all()  # What is not there is never collected.
+def test_a_layout_is_an_environment():
+    env = gasil_jax.make_env("experiments.point_mass_layouts:layout_3")
+    assert env.unwrapped.layout == point_mass_layouts.draw(3)
 
 
-def test_the_point_mass_has_the_layout_that_was_found():
-    """In the published runs on new seeds number 65 has the clearest lead."""
-    path = RESULTS / "point_mass_layouts" / "65-117.csv"
-    with path.open(newline="") as file:
-        (_, line), *_ = point_mass_layouts.rank(list(csv.DictReader(file)))
-    assert line.startswith("layout 65: ")
+def test_the_point_mass_has_the_layout_that_was_found(capsys):
+    """In the published runs number 65 has the clearest lead, on new seeds too."""
+    assert __main__.main(["point_mass_layouts", "--count", "1"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == 4 and all("layout 65: PPO" in line for line in lines[1::2])
     drawn, layout = point_mass_layouts.draw(65), point_mass_layouts.Layout()
     for field in dataclasses.fields(layout):
         one, other = getattr(drawn, field.name), getattr(layout, field.name)
         if field.name in ("blue", "green", "orange"):
             one, other = set(one), set(other)
         assert one == other, field.name
+
+
+def test_new_seeds_were_given_to_layouts_with_a_clear_lead():
+    folder = RESULTS / "point_mass_layouts"
+    first, second = (
+        list(csv.DictReader((folder / name).open(newline="")))
+        for name in ("0-127.csv", "65-117.csv")
+    )
+    assert {int(row["layout"]) for row in first} == set(range(128))
+    best = [line.split(":")[0] for _, line in point_mass_layouts.rank(first)[:18]]
+    assert set(best) >= {f"layout {row['layout']}" for row in second}
+    assert not {row["seed"] for row in first} & {row["seed"] for row in second}
 
 
 def test_the_layout_with_the_clearest_lead_is_first():
@@ -72,6 +60,21 @@ def test_moments_of_the_point_mass_are_drawn(tmp_path, monkeypatch):
     columns = {"ppo+gasil": point_mass_moments._COLUMNS["ppo+gasil"]}
     monkeypatch.setattr(point_mass_moments, "_COLUMNS", columns)
     arguments = ["--total-steps", "6144", "--out", str(tmp_path)]
-    assert point_mass_moments.main(arguments) == 0
-    picture = (tmp_path / "point_mass_moments.png").read_bytes()
-    assert picture.startswith(b"\x89PNG")
+    assert __main__.main(["point_mass_moments", *arguments]) == 0
+    for name in ("layout", "moments"):
+        picture = (tmp_path / f"point_mass_{name}.png").read_bytes()
+        assert picture.startswith(b"\x89PNG")
+
+
+def test_the_states_at_moments_are_those_of_training():
+    env = gasil_jax.make_env("point_mass")
+    config = gasil_jax.Config(
+        agent="ppo", total_steps=8 * 256, batch_steps=256, num_envs=4, num_epochs=1
+    )
+    states = point_mass_moments.states_at(env, config, (0.0, 0.5, 1.0))
+    assert [int(state.iteration) for state in states] == [1, 4, 8]
+    final, _ = gasil_jax.make_train(env, config)(gasil_jax.train.jax.random.key(0))
+    one, other = (
+        x.actor_critic.policy.params["params"]["log_std"] for x in (states[-1], final)
+    )
+    np.testing.assert_allclose(one, other, rtol=1e-4)

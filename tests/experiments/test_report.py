@@ -5,11 +5,11 @@ import re
 
 import numpy as np
 import pytest
+from test_figures import DELAYS
 
 from experiments import report, summary
-from experiments.figures import FIGURES, Curve, Figure, difference
+from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
 from experiments.report import Page, compare
-from experiments.search import Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax.errors import InputError
 
@@ -92,9 +92,7 @@ FIGURE = Figure(
     "Claim.",
     {
         panel: {
-            name: Curve(
-                Search(env, "ppo"), seeds=6, preset=True, changes={"alpha": alpha}
-            )
+            name: Curve(env, "ppo", seeds=6, changes={"alpha": alpha})
             for name, alpha in (("ours", 0.5), ("other", 0.6))
         }
         for panel, env in (("one", "hopper"), ("two", "swimmer"))
@@ -118,7 +116,7 @@ def page(tmp_path):
         for curve, mean in zip(FIGURE.panels[panel].values(), means, strict=True):
             for i, run in enumerate(curve.runs(store)):
                 values = np.full(10, mean + i)
-                store.add({run: Record(np.arange(1, 11), values, nan, nan, 0.0, by)})
+                store.add({run: Record(np.arange(1, 11), values, nan, by)})
     return Page("mujoco", store, figure=FIGURE)
 
 
@@ -132,7 +130,8 @@ def test_a_table_and_a_tally(page):
     assert page.tally("two") == "- ours against other: not clear on 1 of 1."
     words = "ours is better than other on one (100 ["
     assert page.value("compared", "one", "ours", "other").startswith(words)
-    assert report.fill("so {{final two ours}}.", page.value).startswith("so 7.5 [")
+    words = f"so {page.tally('two')}."
+    assert report.fill("so {{tally two}}.", page.value) == words
     assert "commit c, changed" in page.settings()
 
 
@@ -140,12 +139,12 @@ def test_what_lacks_seeds_is_not_compared(page, tmp_path):
     curve = dataclasses.replace(FIGURE.panels["one"]["ours"], seeds=7)
     panels = {**FIGURE.panels, "one": {**FIGURE.panels["one"], "ours": curve}}
     lacking = dataclasses.replace(FIGURE, panels=panels)
-    page = Page("mujoco", page.store, figure=lacking)
+    page = Page("mujoco", page.searched, figure=lacking)
     assert "| one | ours | 6 of 7 |" in page.table()
     assert ("one", "ours", "other") not in page.comparisons
     assert "Not trained yet: 1 of 25 runs." in page.text()
-    with pytest.raises(InputError, match="final one ours in mujoco"):
-        page.value("final", "one", "ours")
+    with pytest.raises(InputError, match="compared one ours other in mujoco"):
+        page.value("compared", "one", "ours", "other")
     with pytest.raises(InputError, match="slot is nonsense"):
         page.value("nonsense")
 
@@ -159,7 +158,7 @@ def test_a_page_is_written_with_its_plot(page, tmp_path):
 def test_lock_step_is_told_as_long_as_runs_have_it(page):
     assert report.IN_STEP not in page.text()
     changes = {"stagger_episodes": False}
-    store = page.store
+    store = page.searched
     for curves in FIGURE.panels.values():
         for curve in curves.values():
             run = dataclasses.replace(curve, changes=changes).runs(store)[0]
@@ -189,7 +188,7 @@ def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
         drawn = curve.changes["stagger_episodes"] and curve.changes["num_envs"] == 128
         for run in curve.runs(store):
             values = np.full(10, rng.normal(90.0 if drawn else 30.0, 1.0))
-            records[run] = Record(np.arange(1, 11), values, nan, nan, 0.0, by)
+            records[run] = Record(np.arange(1, 11), values, nan, by)
     store.add(records)
     page = Page("batch_geometry", store)
     rows = page.geometry().splitlines()[2:]
@@ -199,6 +198,35 @@ def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
         assert verdict.startswith("better" if count == "128" else "not clear")
     page.write(tmp_path)
     assert (tmp_path / "batch_geometry.png").stat().st_size > 5000
+
+
+def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
+    store, nan = Store(tmp_path / "runs"), np.full(10, np.nan)
+    by = {"physics": "mjx", "device": None, "versions": None, "commit": "c"}
+    records = {}
+    for i, (_, _, curve) in enumerate(DELAYS.curves()):
+        for run in curve.runs(store):
+            values = np.full(10, 100.0 + i % 2 * run.reward_delay + run.seed)
+            records[run] = Record(np.arange(1, 11), values, nan, by | {"clean": True})
+    store.add(records)
+    page = Page("delays", store, figure=DELAYS)
+    assert "| hopper | ppo-1000 | 10 | 104 [102, 107] | 1000 [" in page.table()
+    tally = page.tally().splitlines()
+    assert len(tally) == 4
+    assert tally[0].startswith("- ppo+gasil-1 against ppo-1: not clear on 2 of 2;")
+    assert tally[3].startswith("- ppo+gasil-1000 against ppo-1000: better on 2 of 2;")
+    page.write(tmp_path)
+    assert (tmp_path / "delays.png").stat().st_size > 3000
+
+
+@pytest.mark.parametrize("count", [3, 9])
+def test_every_arm_has_a_color(page, tmp_path, count):
+    arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
+    panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
+    figure = Figure("Arms", "", panels, favourite="ppo")
+    drawn = report._draw(Page("mujoco", page.searched, figure=figure))
+    colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
+    assert len(set(colors)) == len(colors) == count + 1
 
 
 @pytest.mark.parametrize("name", FIGURES)

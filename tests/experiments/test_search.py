@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from experiments import search as searches
+from experiments.figures import Figure
+from experiments.report import Page
 from experiments.search import AGENTS, DELAY, PAIR, SPACES, TASKS, Search
 from experiments.store import RESULTS, Record, Store
 
@@ -20,7 +22,7 @@ def fill(store, search, stage, scores):
             values = np.array([0.0] * 8 + [score] * 2)
             nan = np.full(10, np.nan)
             steps = np.arange(1, 11) * 100
-            records[run] = Record(steps, values, nan, nan, 0.0, {"physics": "mjx"})
+            records[run] = Record(steps, values, nan, {"physics": "mjx"})
     store.add(records)
 
 
@@ -50,7 +52,9 @@ def test_the_best_points_are_compared_again(tmp_path, five):
     point, scores = five.best(store)
     assert point == {"learning_rate": 2e-4}
     assert scores.tolist() == [8.0] * 2 + [7.0] * 4
-    table = searches.table({"hopper ppo": five}, store)
+    table = Page(
+        "x", store, figure=Figure("", "", searches={"hopper ppo": five})
+    ).searches()
     assert (
         "| hopper ppo | 5 x 2 | 4 x 4 | learning_rate 0.0002 | 7 | 6 | 7 | 1 |" in table
     )
@@ -89,9 +93,11 @@ def test_the_effect_of_a_hyperparameter_is_the_mean_of_its_points(tmp_path):
     store, search = Store(tmp_path), Search("hopper", "ppo+gasil", DELAY)
     stage = search.first(store)
     others = {"sil": Search("hopper", "ppo+sil", DELAY)}
-    assert len(searches.effects(others | {"hopper": search}, store).splitlines()) == 2
+    figure = Figure("", "", searches=others | {"hopper": search})
+    effects = Page("x", store, figure=figure).effects
+    assert len(effects().splitlines()) == 2
     fill(store, search, stage, range(16))
-    head, _, row = searches.effects(others | {"hopper": search}, store).splitlines()
+    head, _, row = effects().splitlines()
     cells = dict(zip(head.split(" | "), row.split(" | "), strict=True))
     for name, values in SPACES["ppo+gasil"].items():
         (cell,) = (x for label, x in cells.items() if label.strip("| ") == name)

@@ -19,7 +19,7 @@ def run(seed=0, env="hopper", **changes):
 def record(value=1.0, rows=3, **more):
     nan = np.full(rows, np.nan)
     steps = np.arange(1, rows + 1) * 2048
-    return Record(steps, np.full(rows, value), nan, nan, float("nan"), more)
+    return Record(steps, np.full(rows, value), nan, more)
 
 
 def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
@@ -65,7 +65,14 @@ def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
             100.0 / 3 + seed, rows=3 + seed, physics="mjx"
         )
         for seed in range(3)
-    } | {run(alpha=0.3): record(np.nan, physics="mujoco", commit=None)}
+    } | {
+        run(alpha=0.3): record(np.nan, physics="mujoco", commit=None),
+        run(alpha=0.4): dataclasses.replace(
+            record(),
+            evaluation_steps=np.array([4096, 6144]),
+            evaluation_return=np.array([10.0 / 3, 7.0]),
+        ),
+    }
     one, other = tmp_path / "one.npz", tmp_path / "other.npz"
     write(one, records)
     write(other, dict(reversed(records.items())))
@@ -77,7 +84,10 @@ def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
         assert now.provenance == before.provenance
         np.testing.assert_array_equal(now.env_steps, before.env_steps)
         np.testing.assert_allclose(now.episode_return, before.episode_return, 5e-6)
-        assert np.isnan(now.final_evaluation)
+        assert now.evaluation_steps.tolist() == before.evaluation_steps.tolist()
+        np.testing.assert_allclose(
+            now.evaluation_return, before.evaluation_return, 5e-6
+        )
     # What was read is written as it was.
     write(other, back)
     assert one.read_bytes() == other.read_bytes()
@@ -109,6 +119,19 @@ def test_a_setting_that_the_package_has_not_is_told(tmp_path, monkeypatch):
     monkeypatch.undo()
     with pytest.raises(InputError, match="num_epoks"):
         read(path)
+
+
+def test_files_without_evaluations_are_read():
+    """Older files have an evaluation after training, or none."""
+    evaluated = {
+        path.stem: sum(len(x.evaluation_return) for x in read(path).values())
+        for path in (RESULTS / "runs").glob("*.npz")
+    }
+    assert evaluated.pop("halfcheetah") == 640 and evaluated.pop("swimmer") == 320
+    assert set(evaluated.values()) == {0}
+    for kept in read(RESULTS / "runs" / "swimmer.npz").values():
+        assert list(kept.evaluation_steps) in ([], [kept.env_steps[-1]])
+        assert np.isfinite(kept.evaluation_return).all()
 
 
 def test_a_run_that_is_there_stays(tmp_path):
@@ -149,7 +172,7 @@ def test_runs_are_added_side_by_side(tmp_path):
 def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
     ends = np.array([11, 20, 31, 40, 51, 60, 71, 80, 91, 100])
     nan = np.full(10, np.nan)
-    kept = Record(ends, np.arange(10.0), nan, nan, 0.0, {})
+    kept = Record(ends, np.arange(10.0), nan, {})
     assert kept.part(0.9, 1.0) == 9.0  # Though the ninth row ends after 90.
     assert kept.part(0.0, 0.2) == 0.5
     assert kept.part(0.0, 0.01) == 0.0

@@ -1,0 +1,164 @@
+"""GASIL that imitates as far as it helps: adaptive mixing of two advantages.
+
+The environment's reward and the discriminator's bonus are two streams, each with its
+own value. With A_r and A_b their advantages, each standardized over the batch, the
+policy's is
+
+    (1 - w) A_r + w A_b,
+
+so that no unit of the reward must be tuned against one of the bonus: there is no alpha.
+The weight w is `imitation_weight` times two factors between 0 and 1:
+
+- the agreement max(0, corr(A_r, A_b)) over the batch: imitate as far as what imitation
+  favours is also what the reward favours;
+- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean discounted returns of
+  the buffer and of the policy's latest episodes: imitate as far as the past was better.
+
+`Config.imitation_rule` names the factors that are used. While the buffer is empty, w
+is 0.
+"""
+
+from collections.abc import Callable, Mapping
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from gasil_jax import good_trajectories, reward_normalization
+from gasil_jax.config import Config
+from gasil_jax.imitation import adversarial
+from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
+from gasil_jax.learner import Learner
+from gasil_jax.rollout import Rollout
+
+# Weight of the past in the mean of the policy's returns, for each new episode.
+_MEMORY = 0.9
+# Share of the buffer's return by which it must be better for the gap to be 1.
+_WIDE_GAP = 0.25
+
+#: Factors of the imitation's weight: functions of agreement and gap, () each.
+RULES: Mapping[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
+    "both": lambda agreement, gap: agreement * gap,
+    "agreement": lambda agreement, gap: agreement,
+    "gap": lambda agreement, gap: gap,
+    "fixed": lambda agreement, gap: jnp.float32(1.0),
+}
+
+
+class Adaptive(struct.PyTreeNode):
+    """The state of the agent.
+
+    Attributes:
+      discriminator: D.
+      bonus_normalizer: of the bonus, so that its value learns in the same unit as that
+        of a normalized reward.
+      policy_return: float32 (), moving mean of the discounted returns of the policy's
+        latest episodes; 0 before the first.
+      has_episodes: bool (), whether there was one.
+    """
+
+    discriminator: Learner
+    bonus_normalizer: reward_normalization.RewardNormalizer
+    policy_return: jax.Array
+    has_episodes: jax.Array
+
+
+def _init(
+    key: jax.Array, config: Config, observation_size: int, action_size: int
+) -> Adaptive:
+    return Adaptive(
+        discriminator=adversarial.init(key, config, observation_size, action_size),
+        bonus_normalizer=reward_normalization.init(config.num_envs),
+        policy_return=jnp.float32(0.0),
+        has_episodes=jnp.bool_(False),
+    )
+
+
+def follow_return(
+    policy_return: jax.Array, has_episodes: jax.Array, batch: Rollout
+) -> tuple[jax.Array, jax.Array]:
+    """Return the moving mean of discounted returns with a batch's episodes in it.
+
+    Args:
+      policy_return: float32 (), the mean before the batch.
+      has_episodes: bool (), whether there were episodes before the batch.
+      batch: of the environment's own rewards; episodes that were cut short or have a
+        faulty step do not count.
+
+    Returns:
+      The mean, and whether there are episodes now.
+    """
+    counted = batch.completed & jnp.isfinite(batch.discounted_return)
+    count = jnp.sum(counted)
+    mean = jnp.sum(jnp.where(counted, batch.discounted_return, 0.0)) / jnp.maximum(
+        count, 1
+    )
+    past = jnp.where(has_episodes, _MEMORY**count, 0.0)
+    moved = past * policy_return + (1.0 - past) * mean
+    return jnp.where(count > 0, moved, policy_return), has_episodes | (count > 0)
+
+
+def _update_and_reward(
+    state: Adaptive, context: Context, key: jax.Array
+) -> tuple[Adaptive, jax.Array, Metrics]:
+    discriminator, bonus, metrics = adversarial.update_and_score(
+        state.discriminator, context, key
+    )
+    batch = context.rollout
+    normalizer = reward_normalization.update(
+        state.bonus_normalizer, bonus, batch.ended, context.hyperparameters.gamma
+    )
+    policy_return, has_episodes = follow_return(
+        state.policy_return, state.has_episodes, batch
+    )
+    metrics["bonus"] = jnp.mean(bonus)
+    metrics["bonus_deviation"] = jnp.std(bonus)
+    normalized = reward_normalization.normalize(normalizer, bonus)
+    streams = jnp.stack([batch.reward, normalized], axis=-1)
+    state = Adaptive(discriminator, normalizer, policy_return, has_episodes)
+    return state, streams, metrics
+
+
+def correlation(advantages: jax.Array) -> jax.Array:
+    """Return the correlation of two standardized advantages (time, env, 2), ()."""
+    return jnp.mean(advantages[..., 0] * advantages[..., 1])
+
+
+def gap(good_return: jax.Array, policy_return: jax.Array) -> jax.Array:
+    """Return how much better the buffer is than the policy, from 0 to 1, ()."""
+    spread = _WIDE_GAP * jnp.abs(good_return) + 1e-8
+    return jnp.clip((good_return - policy_return) / spread, 0.0, 1.0)
+
+
+def mix(advantages: jax.Array, weight: jax.Array | float) -> jax.Array:
+    """Return (1 - w) A_r + w A_b of advantages (time, env, 2): (time, env)."""
+    return (1.0 - weight) * advantages[..., 0] + weight * advantages[..., 1]
+
+
+def _mix(
+    state: Adaptive, advantages: jax.Array, context: Context
+) -> tuple[jax.Array, Metrics]:
+    correlated = correlation(advantages)
+    buffer = context.good_trajectories
+    good_return = good_trajectories.mean_return(buffer)
+    behind = gap(good_return, state.policy_return)
+    factor = RULES[context.config.imitation_rule](jnp.maximum(correlated, 0.0), behind)
+    weight = context.hyperparameters.imitation_weight * factor
+    weight = jnp.where(buffer.size > 0, weight, 0.0)
+    metrics = {
+        "imitation_weight": weight,
+        "advantage_correlation": correlated,
+        "return_gap": behind,
+    }
+    return mix(advantages, weight), metrics
+
+
+#: Decomposed rewards (`Config.decompose_rewards`) belong to its preset.
+PPO_GASIL_ADAPTIVE = Imitation(
+    _init,
+    _update_and_reward,
+    leave_policy,
+    fields=("imitation_weight", "imitation_rule", *adversarial.FIELDS, "buffer_steps"),
+    num_streams=2,
+    mix=_mix,
+)

@@ -1,0 +1,379 @@
+"""Decompose a delayed reward into a reward for each step.
+
+A window is the steps between two payouts: it ends where the reward is not zero or the
+episode ends. Windows are known from rewards alone, so this works in any environment. A
+network g of (observation, action, next observation) gives each step a reward such that
+the mean over a window is the mean of what the window paid, by gradient steps on
+
+    (mean_window g - (payout / length - m) / s)^2
+
+with m and s the running mean and standard deviation of payout / length. A window that
+is longer than `Config.decomposition_window_steps` is represented by as many of its
+steps, drawn at random, as in randomized return decomposition (Ren et al. 2022,
+arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
+
+PPO then sees m + s g instead of the environment's reward. What a window paid beyond
+the sum of that is shared evenly by its steps: so a window's sum is what it paid, before
+the network has learned anything the payout is spread evenly, and where every step pays
+the reward is the environment's own.
+"""
+
+from typing import Any, NamedTuple
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from gasil_jax import good_trajectories, learner, normalization
+from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.good_trajectories import History
+from gasil_jax.learner import Learner
+from gasil_jax.networks import StepReward
+from gasil_jax.normalization import Normalizer
+from gasil_jax.rollout import Rollout
+
+Metrics = dict[str, jax.Array]
+
+# Shape letters: N environments, H steps of history per environment, T steps of a batch
+# per environment, W windows of a minibatch, S steps that represent a window.
+
+
+class Decomposition(struct.PyTreeNode):
+    """What decomposing rewards needs from one iteration to the next.
+
+    Attributes:
+      network: g, a learner of `networks.StepReward`.
+      rates: moments of payout / length of all windows so far; a normalizer with
+        obs = 1.
+      next_observation: float32 (N, H, obs), beside the history's observations.
+      reward: float32 (N, H), the decomposed rewards of the history's steps.
+      open_reward: float32 (N,), sum of the decomposed rewards of the running window.
+      open_steps: float32 (N,), number of steps of the running window.
+      recorded_steps: int32 (), number of steps per environment that were ever
+        recorded, at most H.
+    """
+
+    network: Learner
+    rates: Normalizer
+    next_observation: jax.Array
+    reward: jax.Array
+    open_reward: jax.Array
+    open_steps: jax.Array
+    recorded_steps: jax.Array
+
+
+class Windows(NamedTuple):
+    """The windows that end in a stretch of steps; every field is (N, steps).
+
+    Attributes:
+      ends: bool, whether a complete window ends with this step.
+      payout: float32, what the window paid.
+      length: int32, number of steps of the window up to this one.
+    """
+
+    ends: jax.Array
+    payout: jax.Array
+    length: jax.Array
+
+
+def _network(config: Config) -> Any:
+    # Typed as Any because Flax declares that `apply` may also return variables.
+    return StepReward(config.decomposition_hidden_sizes)
+
+
+def _optimizer() -> optax.GradientTransformation:
+    # One vector of parameters is faster, see `ppo.optimizer`.
+    return optax.flatten(optax.scale_by_adam())
+
+
+def init(
+    key: jax.Array, config: Config, history: History, action_size: int
+) -> Decomposition:
+    """Return a decomposition that has seen no windows. The key is consumed.
+
+    Args:
+      key: key for the network's parameters.
+      config: sizes of the network.
+      history: the empty history beside which it records.
+      action_size: number of actions.
+    """
+    num_envs, steps, observation_size = history.observation.shape
+    observation = jnp.zeros(observation_size)
+    params = _network(config).init(
+        key, observation, jnp.zeros(action_size), observation
+    )
+    return Decomposition(
+        network=learner.init(params, _optimizer()),
+        rates=normalization.init(1),
+        next_observation=jnp.zeros((num_envs, steps, observation_size), jnp.float32),
+        reward=jnp.zeros((num_envs, steps), jnp.float32),
+        open_reward=jnp.zeros(num_envs, jnp.float32),
+        open_steps=jnp.zeros(num_envs, jnp.float32),
+        recorded_steps=jnp.int32(0),
+    )
+
+
+def pays(reward: jax.Array, ended: jax.Array) -> jax.Array:
+    """Return whether a window ends with a step, bool, the shape of both arguments."""
+    return (reward != 0) | ended
+
+
+def windows(history: History, recorded_steps: jax.Array) -> Windows:
+    """Return the complete windows of a history, (N, H), in time order.
+
+    A window whose first step is no longer in the history, and one whose payout is not
+    finite, is left out.
+
+    Args:
+      history: the history, with NaN rewards where a payout is not known.
+      recorded_steps: int32 (), how many of the history's steps were ever recorded.
+    """
+    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
+    reward, ended = in_time(history.reward), in_time(history.ended)
+    steps = reward.shape[1]
+    index = jnp.arange(steps, dtype=jnp.int32)
+    recorded = index >= steps - recorded_steps
+    last = pays(reward, ended) | ~recorded
+    latest = jax.lax.cummax(jnp.where(last, index, -1), axis=1)
+    before = jnp.pad(latest[:, :-1], ((0, 0), (1, 0)), constant_values=-1)
+    return Windows(
+        ends=last & recorded & (before >= 0) & jnp.isfinite(reward),
+        payout=reward,
+        length=index - before,
+    )
+
+
+def window_sums(
+    reward: jax.Array, ends: jax.Array, open_reward: jax.Array, open_steps: jax.Array
+) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
+    """Return each running window's sum and length up to every step of a batch.
+
+    Args:
+      reward: float32 (T, N).
+      ends: bool (T, N), whether a window ends with this step.
+      open_reward: float32 (N,), sum of the windows that run when the batch begins.
+      open_steps: float32 (N,), their number of steps.
+
+    Returns:
+      Sum and length up to and with this step, float32 (T, N) each, and both, (N,) each,
+      of the windows that run when the batch ends.
+    """
+    chex.assert_equal_shape([reward, ends])
+
+    def step(running: Any, now: Any) -> Any:
+        reward, ends = now
+        total, length = running[0] + reward, running[1] + 1.0
+        reset = lambda x: jnp.where(ends, 0.0, x)
+        return (reset(total), reset(length)), (total, length)
+
+    running, (total, length) = jax.lax.scan(
+        step, (open_reward, open_steps), (reward, ends)
+    )
+    return total, length, running
+
+
+def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
+    """Give every step of a batch what its window's last step has, 0 if it has none.
+
+    Args:
+      rest: float32 (T, N), read where a window ends.
+      ends: bool (T, N), whether a window ends with this step.
+    """
+
+    def backward(share: jax.Array, now: Any) -> Any:
+        rest, ends = now
+        share = jnp.where(ends, rest, share)
+        return share, share
+
+    return jax.lax.scan(backward, jnp.zeros_like(rest[0]), (rest, ends), reverse=True)[
+        1
+    ]
+
+
+def fit(predicted: jax.Array, actual: jax.Array, valid: jax.Array) -> Metrics:
+    """Return how well windows are explained; NaN where there are fewer than two.
+
+    Args:
+      predicted: float32 (T, N), mean of the network's rewards over a window.
+      actual: float32 (T, N), mean of what it paid.
+      valid: bool (T, N), where a window counts.
+
+    Returns:
+      "decomposition_fit", the share of the variance that is explained (R2), and
+      "decomposition_error", the root of the mean squared error of a step, both ().
+    """
+    count = jnp.sum(valid)
+    mean = lambda x: jnp.sum(jnp.where(valid, x, 0.0)) / count
+    error = mean((predicted - actual) ** 2)
+    variance = mean((actual - mean(actual)) ** 2)
+    return {
+        "decomposition_fit": jnp.where(count > 1, 1.0 - error / variance, jnp.nan),
+        "decomposition_error": jnp.sqrt(error),
+    }
+
+
+def decompose(
+    decomposition: Decomposition,
+    batch: Rollout,
+    history: History,
+    normalizer: Normalizer,
+    key: jax.Array,
+    *,
+    config: Config,
+    hyperparameters: Hyperparameters,
+    action_range: tuple[Any, Any],
+) -> tuple[Decomposition, Rollout, Metrics]:
+    """Learn from the windows that were completed, and decompose a batch's rewards.
+
+    Args:
+      decomposition: the state before the batch.
+      batch: (T, N, ...), with the environment's rewards.
+      history: the history after `record` of the batch.
+      normalizer: of observations.
+      key: random key; consumed.
+      config: number and size of the gradient steps.
+      hyperparameters: give the step size.
+      action_range: the lowest and the highest action that the environment sees.
+
+    Returns:
+      The state after the batch, the batch with decomposed rewards, and metrics. The
+      windows of "decomposition_fit" had not been trained on when they were predicted.
+    """
+    network = _network(config)
+    low, high = action_range
+
+    def predict(
+        params: Any, observation: Any, action: jax.Array, next_observation: jax.Array
+    ) -> jax.Array:
+        normalize = lambda x: normalization.normalize(normalizer, x)
+        return network.apply(
+            params,
+            normalize(observation),
+            jnp.clip(action, low, high),
+            normalize(next_observation),
+        )
+
+    def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
+        mean, scale = normalization.moments(rates)
+        output = predict(
+            params, batch.observation, batch.action, batch.next_observation
+        )
+        return mean[0] + scale[0] * output
+
+    # Score the predictions of the windows that ended in the batch, then learn of them.
+    ends = pays(batch.reward, batch.ended)
+    scored = ends & ~batch.faulty
+    running = (decomposition.open_reward, decomposition.open_steps)
+    before = step_rewards(decomposition.network.params, decomposition.rates)
+    total, length, _ = window_sums(before, ends, *running)
+    rate = batch.reward / length
+    metrics = fit(total / length, rate, scored)
+    rates = normalization.update(
+        decomposition.rates, jnp.where(scored, rate, jnp.nan)[..., None]
+    )
+    num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
+    cursor = (history.cursor - num_steps) % ring
+    next_observation = good_trajectories.write(
+        decomposition.next_observation, batch.next_observation, cursor
+    )
+    recorded_steps = jnp.minimum(decomposition.recorded_steps + num_steps, ring)
+    trained = _train(
+        decomposition.network,
+        history,
+        windows(history, recorded_steps),
+        next_observation,
+        rates,
+        key,
+        predict=predict,
+        config=config,
+        step_size=hyperparameters.decomposition_learning_rate,
+    )
+    # What the network leaves unexplained of a window is shared by its steps.
+    reward = step_rewards(trained.params, rates)
+    total, length, running = window_sums(reward, ends, *running)
+    rest = jnp.where(scored, (batch.reward - total) / length, 0.0)
+    reward = reward + share_evenly(rest, ends)
+    reward = jnp.where(ends & (length == 1), batch.reward, reward)
+    reward = jnp.where(batch.faulty, 0.0, reward)
+    decomposition = decomposition.replace(
+        network=trained,
+        rates=rates,
+        next_observation=next_observation,
+        reward=good_trajectories.write(decomposition.reward, reward, cursor),
+        open_reward=running[0],
+        open_steps=running[1],
+        recorded_steps=recorded_steps,
+    )
+    return decomposition, batch.replace(reward=reward), metrics
+
+
+def _train(
+    network: Learner,
+    history: History,
+    complete: Windows,
+    next_observation: jax.Array,
+    rates: Normalizer,
+    key: jax.Array,
+    *,
+    predict: Any,
+    config: Config,
+    step_size: jax.Array | float,
+) -> Learner:
+    """Take gradient steps on windows drawn from the history, if there are any."""
+    num_windows = config.decomposition_minibatch_size
+    num_rows = config.decomposition_window_steps
+    steps = complete.ends.shape[1]
+    mean, scale = normalization.moments(rates)
+    counts = jnp.cumsum(complete.ends.ravel())
+
+    def objective(params: Any, rows: Any, weight: jax.Array, target: jax.Array) -> Any:
+        predicted = jnp.sum(weight * predict(params, *rows), axis=1)
+        return jnp.mean((predicted - target) ** 2)
+
+    def step(network: Learner, key: jax.Array) -> Any:
+        window_key, step_key = jax.random.split(key)
+        rank = jax.random.uniform(window_key, (num_windows,)) * counts[-1]
+        index = jnp.searchsorted(counts, jnp.floor(rank).astype(jnp.int32), "right")
+        env, end = jnp.divmod(jnp.minimum(index, counts.size - 1), steps)
+        length = complete.length[env, end]
+        offset, weight = represent(step_key, length, num_rows)
+        position = (history.cursor + end[:, None] - offset) % steps
+        rows = tuple(
+            ring[env[:, None], position]
+            for ring in (history.observation, history.action, next_observation)
+        )
+        target = (complete.payout[env, end] / length - mean[0]) / scale[0]
+        gradient = jax.grad(objective)(network.params, rows, weight, target)
+        return learner.descend(network, gradient, _optimizer(), step_size), None
+
+    trained, _ = jax.lax.scan(
+        step, network, jax.random.split(key, config.decomposition_updates)
+    )
+    return jax.tree.map(
+        lambda new, old: jnp.where(counts[-1] > 0, new, old), trained, network
+    )
+
+
+def represent(
+    key: jax.Array, length: jax.Array, num_steps: int
+) -> tuple[jax.Array, jax.Array]:
+    """Return the steps that stand for each window, and their weights in its mean.
+
+    Args:
+      key: random key; consumed.
+      length: int32 (W,), number of steps of each window.
+      num_steps: S. A window that has no more is represented by all of its steps, a
+        longer one by S of them, drawn with replacement.
+
+    Returns:
+      int32 (W, S), the steps' distance from the window's last one, and float32 (W, S).
+    """
+    length = length[:, None]
+    every = jnp.arange(num_steps, dtype=jnp.int32)[None]
+    drawn = jax.random.uniform(key, (length.shape[0], num_steps)) * length
+    fits = length <= num_steps
+    offset = jnp.where(fits, every, drawn.astype(jnp.int32))
+    weight = jnp.where(fits, (every < length) / length, 1.0 / num_steps)
+    return jnp.clip(offset, 0, length - 1), weight

@@ -1,0 +1,132 @@
+"""PPO+GASIL with adaptive imitation, the bonus's forms, and the control."""
+
+import functools
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_train import SMALL, trainer
+
+import gasil_jax
+from gasil_jax.imitation import adaptive, adversarial
+
+AGENT = "ppo+gasil-adaptive"
+ENV = gasil_jax.make_env("point_mass")
+
+
+def test_mix_and_correlation_are_their_formulas():
+    rng = np.random.default_rng(0)
+    first, second = rng.normal(size=(2, 50, 4))
+    second += 0.7 * first
+    standard = lambda x: (x - x.mean()) / x.std()
+    first, second = standard(first), standard(second)
+    both = jnp.stack([jnp.array(first), jnp.array(second)], axis=-1)
+    expected = np.corrcoef(first.ravel(), second.ravel())[0, 1]
+    assert 0.3 < expected < 0.9
+    np.testing.assert_allclose(adaptive.correlation(both), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        adaptive.mix(both, 0.3), 0.7 * first + 0.3 * second, rtol=1e-4, atol=1e-5
+    )
+
+
+@pytest.mark.parametrize(
+    ("good", "policy", "expected"),
+    [(100.0, 90.0, 0.4), (100.0, 60.0, 1.0), (100.0, 110.0, 0.0), (-8.0, -9.0, 0.5)],
+)
+def test_the_gap_is_in_units_of_a_quarter_of_the_buffers_return(good, policy, expected):
+    result = adaptive.gap(jnp.float32(good), jnp.float32(policy))
+    np.testing.assert_allclose(result, expected, rtol=1e-5)
+
+
+def test_the_policys_return_follows_its_latest_whole_episodes():
+    rng = np.random.default_rng(0)
+    followed, has_episodes, twin = jnp.float32(0.0), jnp.bool_(False), None
+    for _ in range(6):
+        returns = rng.normal(size=(5, 3))
+        completed = rng.random((5, 3)) < 0.2
+        returns[rng.random((5, 3)) < 0.2] = np.nan  # of faulty episodes
+        batch = SimpleNamespace(
+            completed=jnp.array(completed), discounted_return=jnp.array(returns)
+        )
+        followed, has_episodes = adaptive.follow_return(followed, has_episodes, batch)
+        counted = returns[completed & np.isfinite(returns)]
+        if len(counted):
+            past = 0.0 if twin is None else 0.9 ** len(counted)
+            twin = past * (twin or 0.0) + (1 - past) * counted.mean()
+        if twin is not None:
+            np.testing.assert_allclose(followed, twin, rtol=1e-4)
+    assert has_episodes and twin is not None
+
+
+def test_without_weight_it_is_ppo():
+    config = SMALL.replace(agent=AGENT, imitation_weight=0.0)
+    state, _ = jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
+    plain, _ = trainer("ppo")(jax.random.key(0))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
+    jax.tree.map(close, state.actor_critic.policy, plain.actor_critic.policy)
+
+
+@pytest.mark.parametrize("rule", adaptive.RULES)
+def test_a_rule_is_the_product_of_the_factors_in_its_name(rule):
+    train = gasil_jax.make_train(ENV, SMALL.replace(agent=AGENT, imitation_rule=rule))
+    _, metrics = jax.jit(train)(jax.random.key(0))
+    expected = 0.7
+    if rule in ("agreement", "both"):
+        expected *= np.maximum(metrics["advantage_correlation"], 0.0)
+    if rule in ("gap", "both"):
+        expected *= metrics["return_gap"]
+    np.testing.assert_allclose(metrics["imitation_weight"], expected, rtol=1e-6)
+    assert np.all(np.abs(metrics["advantage_correlation"]) <= 1.0)
+
+
+def twin(name, logit):
+    """The bonus from D itself, in double precision."""
+    d = 1 / (1 + np.exp(-logit))
+    ratio = np.log(1 - d) - np.log(d)
+    return {
+        "softplus": -np.log(d),
+        "logit": ratio,
+        "dail": 0.5 * (1 - d) * (np.tanh(ratio) + 1),
+        "centered": -np.log(d) - np.mean(-np.log(d)),
+    }[name]
+
+
+@pytest.mark.parametrize("name", adversarial.BONUSES)
+def test_a_form_of_the_bonus_is_its_formula_and_pays_more_for_good_pairs(name):
+    logit = np.linspace(-6.0, 6.0, 25)
+    result = adversarial.BONUSES[name](jnp.asarray(logit, jnp.float32))
+    np.testing.assert_allclose(result, twin(name, logit), rtol=1e-3, atol=1e-5)
+    # A low logit means: not from the policy, like the buffer.
+    assert np.all(np.diff(result) < 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "pays"),
+    [("softplus", True), ("dail", True), ("logit", False), ("centered", False)],
+)
+def test_which_bonus_pays_for_staying_up(name, pays):
+    """Where D tells nothing apart: is a step more worth something?"""
+    clueless = adversarial.BONUSES[name](jnp.zeros(8))
+    assert np.all(clueless > 0.2) if pays else np.all(clueless == 0.0)
+
+
+def test_the_control_is_paid_for_every_step():
+    train = jax.jit(
+        gasil_jax.make_train(ENV, SMALL.replace(agent="ppo+bonus", alpha=0.0))
+    )
+    without, _ = train(jax.random.key(0))
+    plain, _ = trainer("ppo")(jax.random.key(0))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
+    jax.tree.map(close, without.actor_critic, plain.actor_critic)
+    paid, _ = train(jax.random.key(0), SMALL.hyperparameters.replace(alpha=1.0))
+    value = lambda state: jax.tree.leaves(state.actor_critic.values[0].params)[0]
+    assert not np.allclose(value(paid), value(without))
+
+
+def test_a_form_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match=r"bonus 'softmax' is unknown: .*'softplus'"):
+        gasil_jax.make_train(ENV, SMALL.replace(bonus="softmax"))
+    with pytest.raises(ValueError, match=r"imitation_rule 'bot' is unknown: .*'both'"):
+        gasil_jax.make_train(ENV, SMALL.replace(imitation_rule="bot"))

@@ -1,0 +1,269 @@
+"""Decomposition of delayed rewards against plain loops, and its use in training."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import State
+from test_train import SMALL
+
+import gasil_jax
+from gasil_jax import good_trajectories, normalization, reward_decomposition
+from gasil_jax.imitation import AGENTS
+from gasil_jax.rollout import Rollout
+
+NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT = 3, 8, 20, 2, 1
+CONFIG = gasil_jax.Config(
+    num_envs=NUM_ENVS,
+    batch_steps=NUM_ENVS * NUM_STEPS,
+    decompose_rewards=True,
+    decomposition_window_steps=4,
+    decomposition_minibatch_size=32,
+    decomposition_hidden_sizes=(16,),
+)
+
+
+def random_batches(seed, num_batches, delay=5):
+    """Batches of episodes whose true reward is a function of the step.
+
+    It is paid every `delay` steps and at an episode's end.
+    """
+    rng = np.random.default_rng(seed)
+    held, age = np.zeros(NUM_ENVS), np.zeros(NUM_ENVS, int)
+    for _ in range(num_batches):
+        shape = (NUM_STEPS, NUM_ENVS)
+        observation = rng.normal(size=(*shape, OBS)).astype(np.float32)
+        action = rng.normal(size=(*shape, ACT)).astype(np.float32)
+        true = observation[..., 0] + 0.5 * np.clip(action[..., 0], -1, 1) + 1.0
+        ended = rng.random(shape) < 0.1
+        faulty = ended & (rng.random(shape) < 0.2)
+        paid = np.zeros(shape, np.float32)
+        for t in range(NUM_STEPS):
+            held, age = held + true[t], age + 1
+            ended[t] |= age >= LIMIT
+            now = ended[t] | (age % delay == 0)
+            paid[t] = np.where(now & ~faulty[t], held, 0.0)
+            held, age = np.where(now, 0.0, held), np.where(ended[t], 0, age)
+        zeros = np.zeros(shape, np.float32)
+        yield Rollout(
+            observation=observation,
+            next_observation=rng.normal(size=(*shape, OBS)).astype(np.float32),
+            action=action,
+            log_prob=zeros,
+            reward=paid,
+            terminated=ended,
+            truncated=np.zeros(shape, bool),
+            episode_return=zeros,
+            discounted_return=zeros,
+            episode_length=np.zeros(shape, np.int32),
+            faulty=faulty,
+            cut_short=ended & ~faulty & (rng.random(shape) < 0.2),
+        )
+
+
+@functools.cache
+def decompose_once():
+    def step(decomposition, history, batch, key):
+        history = good_trajectories.record(
+            history,
+            batch.observation,
+            batch.action,
+            jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
+            batch.ended,
+        )
+        decomposition, batch, metrics = reward_decomposition.decompose(
+            decomposition,
+            batch,
+            history,
+            normalization.init(OBS),
+            key,
+            config=CONFIG,
+            hyperparameters=CONFIG.hyperparameters,
+            action_range=(-1.0, 1.0),
+        )
+        return decomposition, history, batch.reward, metrics
+
+    return jax.jit(step)
+
+
+def decompose_all(batches):
+    history = good_trajectories.init_history(NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT)
+    decomposition = reward_decomposition.init(jax.random.key(0), CONFIG, history, ACT)
+    for i, batch in enumerate(batches):
+        decomposition, history, reward, metrics = decompose_once()(
+            decomposition, history, batch, jax.random.key(i)
+        )
+        yield decomposition, history, np.asarray(reward), metrics
+
+
+def test_windows_of_the_history_are_those_of_a_plain_loop():
+    batches = list(random_batches(0, 9))
+    steps = []
+    for batch, (decomposition, history, _, _) in zip(
+        batches, decompose_all(batches), strict=True
+    ):
+        unknown = batch.faulty | batch.cut_short
+        payout = np.where(unknown, np.nan, batch.reward)
+        steps += zip(payout, batch.ended, strict=True)
+        ring = history.reward.shape[1]
+        # All complete windows, those that began before the history left out.
+        expected = {}
+        for env in range(NUM_ENVS):
+            begin = 0
+            for t, (payout, ended) in enumerate(steps):
+                if payout[env] != 0 or ended[env]:
+                    begins_inside = begin > len(steps) - ring or len(steps) < ring
+                    if np.isfinite(payout[env]) and begins_inside:
+                        position = ring - len(steps) + t
+                        expected[env, position] = (payout[env], t + 1 - begin)
+                    begin = t + 1
+        result = reward_decomposition.windows(history, decomposition.recorded_steps)
+        ends = np.nonzero(np.asarray(result.ends))
+        assert set(zip(*ends, strict=True)) == set(expected)
+        for place, (payout, length) in expected.items():
+            assert result.length[place] == length
+            assert result.payout[place] == np.float32(payout)
+
+
+def test_a_window_is_given_what_it_paid_and_predictions_are_scored():
+    """Against a plain loop over the network's own rewards."""
+    batches = list(random_batches(1, 6))
+    open_steps = [[] for _ in range(NUM_ENVS)]
+    for batch, (_, _, reward, _) in zip(batches, decompose_all(batches), strict=True):
+        for env in range(NUM_ENVS):
+            begins_here, running = True, []
+            begins_here = not open_steps[env]
+            for t in range(NUM_STEPS):
+                running.append(reward[t, env])
+                paid = batch.reward[t, env]
+                if paid == 0 and not batch.ended[t, env]:
+                    continue
+                # A window that began in an earlier batch lacks its share of that.
+                if begins_here and not batch.faulty[t, env]:
+                    np.testing.assert_allclose(sum(running), paid, rtol=1e-4, atol=1e-5)
+                if len(running) == 1 and begins_here:
+                    assert reward[t, env] == paid
+                begins_here, running = True, []
+            open_steps[env] = running
+    np.testing.assert_array_equal(reward[batch.faulty], 0.0)
+
+
+def test_fit_is_r_squared_of_the_windows_that_count():
+    rng = np.random.default_rng(0)
+    predicted, actual = rng.normal(size=(2, 7, 3)).astype(np.float32)
+    valid = rng.random((7, 3)) < 0.5
+    metrics = reward_decomposition.fit(predicted, actual, valid)
+    p, a = predicted[valid], actual[valid]
+    np.testing.assert_allclose(
+        metrics["decomposition_fit"],
+        1 - np.mean((p - a) ** 2) / np.var(a),
+        rtol=1e-4,
+    )
+    np.testing.assert_allclose(
+        metrics["decomposition_error"], np.sqrt(np.mean((p - a) ** 2)), rtol=1e-4
+    )
+    none = reward_decomposition.fit(predicted, actual, np.zeros_like(valid))
+    assert np.isnan(none["decomposition_fit"])
+
+
+def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():
+    length = jnp.array([1, 4, 9])
+    keys = jax.random.split(jax.random.key(0), 200)
+    offset, weight = jax.vmap(
+        lambda key: reward_decomposition.represent(key, length, 4)
+    )(keys)
+    np.testing.assert_allclose(weight.sum(axis=-1), 1.0, rtol=1e-6)
+    assert (weight[:, 0] > 0).sum() == 200  # one step of it
+    np.testing.assert_array_equal(offset[:, 1], np.tile(np.arange(4), (200, 1)))
+    assert set(np.unique(offset[:, 2])) == set(range(9))
+    # Drawn evenly: the mean of 800 numbers from 0 to 8.
+    assert abs(float(offset[:, 2].mean()) - 4.0) < 0.5
+
+
+@pytest.mark.parametrize("delay", [2, 12])  # Shorter and longer than the rows of one.
+def test_it_learns_the_reward_behind_the_payouts(delay):
+    batches = list(random_batches(2, 150, delay))
+    errors, fits = [], []
+    for batch, (_, _, reward, metrics) in zip(
+        batches, decompose_all(batches), strict=True
+    ):
+        true = batch.observation[..., 0] + 0.5 * np.clip(batch.action[..., 0], -1, 1)
+        errors.append(np.mean((reward - true - 1.0)[~batch.faulty] ** 2))
+        fits.append(float(metrics["decomposition_fit"]))
+    # The variance of the true reward of a step is about 1.1.
+    assert np.mean(errors[:3]) > 0.4
+    assert np.mean(errors[-30:]) < (0.1 if delay == 2 else 0.4)
+    if delay == 2:
+        assert np.nanmean(fits[-30:]) > 0.9
+
+
+class Line:
+    """Stay near 0; every step has a reward that is not 0."""
+
+    observation_size = 1
+    action_size = 1
+    episode_length = 20
+
+    def reset(self, rng):
+        position = jax.random.uniform(rng, (1,))
+        return State(position, position, jnp.float32(0), jnp.float32(0))
+
+    def step(self, state, action):
+        position = state.pipeline_state + 0.1 * action
+        reward = -1.0 - position[0] ** 2
+        return state.replace(pipeline_state=position, obs=position, reward=reward)
+
+
+def test_where_every_step_pays_it_changes_nothing():
+    config = SMALL.replace(agent="ppo")
+    run = lambda config: jax.jit(gasil_jax.make_train(Line(), config))(
+        jax.random.key(0)
+    )
+    (plain, _), (state, metrics) = (
+        run(config),
+        run(config.replace(decompose_rewards=True)),
+    )
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
+    jax.tree.map(close, state.actor_critic, plain.actor_critic)
+    assert np.all(np.isfinite(metrics["decomposition_fit"]))
+
+
+def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
+    env = gasil_jax.make_env("point_mass", reward_delay=50)
+    config = gasil_jax.Config(agent="ppo", total_steps=30 * 2048)
+    keys = jax.vmap(jax.random.key)(jnp.arange(2))
+
+    def late(**changes):
+        train = gasil_jax.make_train(env, config.replace(**changes))
+        metrics = jax.jit(jax.vmap(train))(keys)[1]
+        return np.asarray(metrics["episode_return"])[:, -5:].mean()
+
+    assert late(decompose_rewards=True) > late() + 2.0
+
+
+def test_agents_and_ppo_see_decomposed_rewards_and_the_buffer_the_environments():
+    env = gasil_jax.make_env("point_mass", reward_delay=50)
+    config = SMALL.replace(agent="ppo", decompose_rewards=True)
+    seen = {}
+
+    def look(state, context, key):
+        seen.update(batch=context.rollout.reward, history=context.history.reward)
+        return state, context.rollout.reward, dict(zip("ab", map(paid, seen.values())))
+
+    paid = lambda reward: jnp.mean(reward != 0.0)
+    AGENTS["look"] = AGENTS["ppo"]._replace(update_and_reward=look)
+    try:
+        train = gasil_jax.make_train(env, config.replace(agent="look"))
+        state, metrics = jax.jit(train)(jax.random.key(0))
+    finally:
+        del AGENTS["look"]
+    # Of 50 steps one pays, of the decomposed rewards all do; half of the history is
+    # not recorded yet.
+    assert metrics["a"][-1] > 0.9 and metrics["b"][-1] > 0.45
+    # First episodes that were cut short have no return: NaN, and harmless.
+    assert np.isnan(state.history.reward).any()
+    assert np.all(metrics["skipped_updates"] == 0)
+    assert jnp.nanmean(state.history.reward != 0.0) < 0.1
+    assert state.good_trajectories.size > 0
