@@ -250,16 +250,17 @@ def validate(config: Config, agents: Sequence[str]) -> None:
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
-    if not isinstance(config.agent, str):
-        raise _refusal("agent", config.agent, f"one of {', '.join(agents)}")
+    for field in dataclasses.fields(Config):
+        value = getattr(config, field.name)
+        if isinstance(field.default, bool) and not isinstance(value, bool):
+            raise _refusal(field.name, value, "True or False")
+        if isinstance(field.default, str) and not isinstance(value, str):
+            raise _refusal(field.name, value, "a text")
+    if not isinstance(config.expert, str | None):
+        raise _refusal("expert", config.expert, "a text or None")
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))
     _validate_sizes(config)
-    for name in ("normalize_rewards", "decompose_rewards", "stagger_episodes"):
-        if not isinstance(value := getattr(config, name), bool):
-            raise _refusal(name, value, "True or False")
-    if not isinstance(config.expert, str | None):
-        raise _refusal("expert", config.expert, "a text or None")
     for name in ("num_envs", "minibatch_size"):
         _validate_divides(name, getattr(config, name), config.batch_steps)
     for name in ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule"):
@@ -274,7 +275,9 @@ def validate(config: Config, agents: Sequence[str]) -> None:
 
 
 def _refusal(name: str, value: Any, allowed: object) -> ValueError:
-    return ValueError(f"{name} is {value!r}: it must be {allowed}")
+    # NumPy's numbers have a longer form.
+    shown = value if isinstance(value, numbers.Number) else repr(value)
+    return ValueError(f"{name} is {shown}: it must be {allowed}")
 
 
 def _validate_number(

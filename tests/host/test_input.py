@@ -28,8 +28,8 @@ def names(kind):
     return [
         f.name
         for f in dataclasses.fields(kind)
-        if f.name not in ("agent", "expert", "hyperparameters", "physics", "solver")
-        and f.name != "integrator"
+        if not isinstance(f.default, str)
+        and f.name not in ("expert", "hyperparameters")
     ]
 
 
