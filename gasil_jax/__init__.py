@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from gasil_jax.train import iterate as iterate
     from gasil_jax.train import make_train as make_train
 
+__version__ = "0.1.0"
+
 #: The module that defines each public name.
 _MODULES = {
     "Config": "config",

@@ -248,41 +248,67 @@ def ranges(kind: type) -> Mapping[str, Range]:
     }
 
 
+#: Counts and shapes are int32.
+_LARGEST_COUNT = 2**31 - 1
+#: All other numbers are float32.
+_LARGEST_FLOAT = 3.4e38
+
+
 def validate(config: Config, agents: Sequence[str]) -> None:
     """Check that every value of a config is allowed.
 
     Args:
-      config: the config to check. Hyperparameters that are JAX arrays are skipped,
-        because they may be traced.
+      config: the config to check. Hyperparameters that are arrays are skipped, because
+        they may be traced.
       agents: names of the registered agents.
 
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
+    for field in dataclasses.fields(Config):
+        value = getattr(config, field.name)
+        if isinstance(field.default, bool) and not isinstance(value, bool):
+            raise _refusal(field.name, value, "True or False")
+        if isinstance(field.default, str) and not isinstance(value, str):
+            raise _refusal(field.name, value, "a text")
+    if not isinstance(config.expert, str | None):
+        raise _refusal("expert", config.expert, "a text or None")
     if config.agent not in agents:
         raise ValueError(unknown("agent", config.agent, agents))
     _validate_sizes(config)
-    switches = (
-        "normalize_rewards",
-        "decompose_rewards",
-        "stagger_episodes",
-        "discriminator_normalizes_actions",
-        "buffer_discounts",
-        "sample_by_return",
-    )
-    for name in switches:
-        if not isinstance(value := getattr(config, name), bool):
-            raise ValueError(f"{name} is {value!r}: it must be True or False")
     for name in ("num_envs", "minibatch_size"):
         _validate_divides(name, getattr(config, name), config.batch_steps)
     for name in ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule"):
-        _validate_schedule(name, getattr(config, name))
+        _validate_schedule(name, getattr(config, name), config.total_steps)
+    if not isinstance(config.hyperparameters, Hyperparameters):
+        raise _refusal("hyperparameters", config.hyperparameters, "Hyperparameters")
     for name, allowed in ranges(Hyperparameters).items():
         value = getattr(config.hyperparameters, name)
-        if isinstance(value, str):
-            raise ValueError(f"{name} is {value!r}: it must be a number")
-        if isinstance(value, numbers.Real) and value not in allowed:
-            raise ValueError(f"{name} is {value}: it must be {allowed}")
+        is_array = hasattr(value, "shape") and not isinstance(value, numbers.Number)
+        if not is_array:
+            _validate_number(name, value, allowed)
+
+
+def _refusal(name: str, value: Any, allowed: object) -> ValueError:
+    # NumPy's numbers have a longer form.
+    shown = value if isinstance(value, numbers.Number) else repr(value)
+    return ValueError(f"{name} is {shown}: it must be {allowed}")
+
+
+def _validate_number(
+    name: str, value: Any, allowed: Range, most: float = _LARGEST_COUNT
+) -> None:
+    if isinstance(value, str):
+        raise _refusal(name, value, "a number")
+    try:
+        is_allowed = value in allowed
+    except OverflowError:  # a whole number that is too large for a float
+        is_allowed = False
+    if not is_allowed:
+        raise _refusal(name, value, allowed)
+    most = most if allowed.whole else _LARGEST_FLOAT
+    if value > most:
+        raise _refusal(name, value, f"{allowed}, at most {most:g}")
 
 
 def _validate_sizes(config: Config) -> None:
@@ -290,11 +316,17 @@ def _validate_sizes(config: Config) -> None:
         value = getattr(config, name)
         if value is None and name in ("max_episode_steps", "buffer_episodes"):
             continue
-        is_list = name.endswith("_sizes")
-        if is_list and not isinstance(value, tuple):
-            raise ValueError(f"{name} is {value!r}: it must be a tuple of sizes")
-        if any(number not in allowed for number in (value if is_list else (value,))):
-            raise ValueError(f"{name} is {value}: it must be {allowed}")
+        if name.endswith("_sizes"):
+            if not isinstance(value, tuple):
+                raise _refusal(name, value, "a tuple of sizes")
+            for size in value:
+                _validate_number(name, size, allowed)
+        elif name != "total_steps":
+            _validate_number(name, value, allowed)
+    # The iterations are counted.
+    most = _LARGEST_COUNT * config.batch_steps
+    allowed = ranges(Config)["total_steps"]
+    _validate_number("total_steps", config.total_steps, allowed, most)
 
 
 def _validate_divides(name: str, size: int, batch_steps: int) -> None:
@@ -310,17 +342,35 @@ def _validate_divides(name: str, size: int, batch_steps: int) -> None:
     )
 
 
-def _validate_schedule(name: str, points: Schedule) -> None:
+def _validate_schedule(name: str, points: Any, total_steps: int) -> None:
     if callable(points):
+        _validate_function(name, points, total_steps)
         return
-    if not all(isinstance(point, tuple) and len(point) == 2 for point in points):
-        raise ValueError(f"{name} is {points}: it must be (steps, factor) points")
-    steps = [point[0] for point in points]
-    factors = [point[1] for point in points]
-    if steps != sorted(set(steps)) or any(
-        not (math.isfinite(number) and number >= 0) for number in steps + factors
+    pairs = "(steps, factor) points"
+    if not isinstance(points, tuple) or not all(
+        isinstance(point, tuple) and len(point) == 2 for point in points
     ):
-        raise ValueError(
-            f"{name} is {points}: it must be (steps, factor) points, all 0 or "
-            "more, steps increasing"
-        )
+        raise _refusal(name, points, pairs)
+    for number in (number for point in points for number in point):
+        _validate_number(name, number, Range(0.0))
+    steps = [point[0] for point in points]
+    if steps != sorted(set(steps)):
+        raise _refusal(name, points, f"{pairs}, steps increasing")
+
+
+def _validate_function(
+    name: str, function: Callable[[Any], Any], total_steps: int
+) -> None:
+    """Check the factors that a schedule gives at the start and the end of training."""
+    import jax
+
+    for step in (0, total_steps):
+        try:
+            factor = function(jax.numpy.float32(step))
+            if isinstance(factor, jax.core.Tracer):
+                return
+            number = float(factor)
+        except Exception as error:
+            why = f"{type(error).__name__}: {error}".partition("\n")[0]
+            raise ValueError(f"{name} gives no number at step {step}: {why}") from None
+        _validate_number(f"{name}({step})", number, Range(0.0))

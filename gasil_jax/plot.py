@@ -4,7 +4,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import tyro
@@ -38,6 +38,7 @@ class Curves(NamedTuple):
     """The curves of one run.
 
     Attributes:
+      env: the environment's name.
       label: label in the legend.
       env_steps: (points,).
       returns: (seeds, points), mean return of the episodes since the previous point.
@@ -46,14 +47,12 @@ class Curves(NamedTuple):
         evaluations) each; None if there are none.
     """
 
+    env: str
     label: str
     env_steps: np.ndarray
     returns: np.ndarray
     final: np.ndarray
     evaluations: Mapping[str, np.ndarray] | None
-
-
-_POINTS = 50
 
 
 def read(folder: pathlib.Path, label: str | None = None) -> Curves:
@@ -68,28 +67,27 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
             f"run is {folder}, a sweep: its plot is sweep.png, and its curves are in "
             "curves.npz"
         )
-    path, evaluations = folder / "evaluations.csv", None
+    read_table = lambda name, column: metrics_files.read_metrics(
+        folder / name, ("seed",), described["seeds"], (column,)
+    )
+    evaluations, path = None, folder / "evaluations.csv"
     # The file may still be empty.
     if path.is_file() and path.stat().st_size:
-        evaluations = metrics_files.read_metrics(path, ("seed",), described["seeds"])
+        evaluations = read_table("evaluations.csv", "mean")
     path = folder / "metrics.csv"
-    try:
-        metrics = metrics_files.read_metrics(path, ("seed",), described["seeds"])
-        steps, returns = metrics["env_steps"][0], metrics["episode_return"]
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise InputError(f"{path} has no curves to draw ({error})") from None
-    count = min(_POINTS, len(steps))
-    # Training is divided into this many equal parts.
-    parts = np.array_split(np.arange(len(steps)), count)
-    mean = lambda x: np.array([row[np.isfinite(row)].mean() for row in x])
-    complete = [p for p in parts if np.isfinite(returns[:, p]).any(axis=1).all()]
-    if not complete:
+    if not (path.is_file() and path.stat().st_size):
+        raise InputError(f"{path} has no curves to draw yet")
+    metrics = read_table("metrics.csv", "episode_return")
+    steps, returns = metrics["env_steps"][0], metrics["episode_return"]
+    env_steps, means = plotting.in_parts(steps, returns)
+    if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
     default = f"{described['env']}, {described['config'].agent}"
     return Curves(
+        env=described["env"],
         label=label or default,
-        env_steps=np.array([steps[p[-1]] for p in complete]),
-        returns=np.stack([mean(returns[:, p]) for p in complete], axis=1),
+        env_steps=env_steps,
+        returns=means,
         final=final_returns(returns),
         evaluations=evaluations,
     )
@@ -98,34 +96,55 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
     """Write the figure: interquartile means over seeds, with 95% intervals.
 
-    The left panel shows returns over environment steps, with evaluations dashed. The
-    middle panel shows final returns, with a dot for each seed. The right panel shows
-    the share of seeds above each final return.
+    Each environment has a row of three panels. The left one shows returns over
+    environment steps, with evaluations dashed; the middle one final returns, with a dot
+    for each seed; the right one the share of seeds above each final return.
     """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (curves, bars, profile) = plt.subplots(
-        1, 3, figsize=(13.0, 4.0), layout="constrained", width_ratios=(3, 2, 2)
+    envs = list(dict.fromkeys(run.env for run in runs))
+    figure, grid = plt.subplots(
+        len(envs),
+        3,
+        figsize=(13.0, 0.4 + 3.8 * len(envs)),
+        layout="constrained",
+        width_ratios=(3, 2, 2),
+        squeeze=False,
     )
+    for row, env in zip(grid, envs, strict=True):
+        _draw_row(row, [run for run in runs if run.env == env])
+        for axes in row:
+            axes.set_title(env)
+    more = "; dots: the final return of each seed"
+    plotting.write_caption(figure, [len(run.final) for run in runs], more)
+    plotting.save(figure, path, dpi=150)
+
+
+def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
+    """Draw the runs of one environment in its three panels."""
+    curves, bars, profile = row
     every = np.concatenate([run.final for run in runs])
+    # Matplotlib would read formulas between dollars. The title names the environment.
+    labels = [run.label.removeprefix(f"{run.env}, ") for run in runs]
+    labels = [label.replace("$", r"\$") for label in labels]
     margin = 0.05 * (np.ptp(every) or 1.0)
     levels = np.linspace(every.min() - margin, every.max() + margin, 200)
     for number, run in enumerate(runs):
         color = COLORS[number % len(COLORS)]
         style = _STYLES[number // len(COLORS) % len(_STYLES)]
-        low, high = statistics.bootstrap_interval(run.returns)
-        middle = statistics.interquartile_mean(run.returns, axis=0)
-        curves.fill_between(run.env_steps, low, high, color=color, alpha=0.2, lw=0)
-        curves.plot(run.env_steps, middle, style, color=color, label=run.label)
-        if run.evaluations is not None:
-            steps = run.evaluations["env_steps"][0]
-            middle = statistics.interquartile_mean(run.evaluations["mean"], axis=0)
-            label = f"{run.label}, evaluations"
-            curves.plot(steps, middle, "--", color=color, lw=1, label=label)
-
+        plotting.draw_returns(
+            curves,
+            run.env_steps,
+            run.returns,
+            run.evaluations,
+            color=color,
+            label=labels[number],
+            evaluated=f"{labels[number]}, evaluations",
+            style=style,
+        )
         low, high = statistics.bootstrap_interval(run.final)
         middle = statistics.interquartile_mean(run.final)
         bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
@@ -133,14 +152,16 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
         bars.plot(run.final, [number] * len(run.final), "o", color="0.3", ms=3)
 
         share = statistics.performance_profile(run.final, levels)
-        profile.plot(levels, share, style, color=color)
-    curves.set(xlabel="environment steps", ylabel="episode return")
-    curves.legend(frameon=False)
-    bars.set_yticks(range(len(runs)), [run.label for run in runs])
-    bars.invert_yaxis()
+        profile.plot(levels, share, style, color=color, label=labels[number])
+    if len(runs) > 1 or runs[0].evaluations is not None:
+        curves.legend(frameon=False)
+    if len(runs) > 1:
+        profile.legend(frameon=False)
+    bars.set_yticks(range(len(runs)), labels)
+    # The first is at the top, and no dot lies on the frame.
+    bars.set(ylim=(len(runs) - 0.5, -0.5), xlim=(levels[0], levels[-1]))
     bars.set(xlabel="final return")
     profile.set(xlabel="final return", ylabel="share of seeds above", ylim=(0, 1.03))
-    plotting.save(figure, path, dpi=150)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

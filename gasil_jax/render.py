@@ -4,6 +4,7 @@ MuJoCo draws locomotion off screen, or Brax's viewer plays it in a web page. The
 mass is drawn as the path of an episode.
 """
 
+import contextlib
 import copy
 import dataclasses
 import os
@@ -23,7 +24,7 @@ import jax
 import numpy as np
 import tyro
 
-from gasil_envs import wrappers
+from gasil_envs import pictures, wrappers
 from gasil_jax import policy, train
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, output_file
@@ -33,10 +34,8 @@ from gasil_jax.sweeps import saved_states
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
-
-
-class NoOpenGL(RuntimeError):
-    """There is no OpenGL for MuJoCo to draw with."""
+# Of a frame, in pixels: all frames are in memory at once.
+_LARGEST_SIZE = 4096
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,68 +93,25 @@ def episode(
     return states, total
 
 
-def locomotion_frames(
-    env: Any, states: Sequence[Any], size: tuple[int, int], fps: int = 25
+def frames_of(
+    env: Any, states: Sequence[Any], size: tuple[int, int], fps: float = 25.0
 ) -> tuple[list[np.ndarray], float]:
     """Return pictures (height, width, 3) uint8 of physics states, and frames/s.
 
+    Args:
+      env: the environment.
+      states: its physics states from an episode's start on.
+      size: width and height of a picture in pixels.
+      fps: largest number of frames/s, about; states in between are left out.
+
     Raises:
-      NoOpenGL: if MuJoCo finds no OpenGL.
+      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
     """
-    import mujoco
-
-    model = env.unwrapped.model
-    model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
-    model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
-    every = max(1, round(1.0 / (fps * env.unwrapped.dt)))
-    data = mujoco.MjData(model)
-    camera = 0 if model.ncam else -1
-    try:
-        renderer = mujoco.Renderer(model, size[1], size[0])
-    # The GL library's own errors are of many types.
-    except Exception as error:
-        raise NoOpenGL(
-            f"no OpenGL for MuJoCo to draw with ({error}): install libegl1 or "
-            "libosmesa6, and set MUJOCO_GL to egl or osmesa"
-        ) from None
-    frames = []
-    with renderer:
-        for state in states[::every]:
-            data.qpos[:], data.qvel[:] = state.physics.qpos, state.physics.qvel
-            mujoco.mj_forward(model, data)
-            renderer.update_scene(data, camera)
-            frames.append(renderer.render().copy())
-    return frames, 1.0 / (every * env.unwrapped.dt)
-
-
-def point_mass_frames(
-    env: Any, states: Sequence[Any], size: tuple[int, int]
-) -> tuple[list[np.ndarray], float]:
-    """Return pictures (height, width, 3) uint8 of the path so far, and frames/s."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    from gasil_jax.figures import plotting
-
-    positions = np.stack([state.position for state in states])
-    figure = plt.figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
-    canvas = FigureCanvasAgg(figure)
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    frames = []
-    for count in range(1, len(positions) + 1):
-        axes.clear()
-        taken = states[count - 1].collected
-        plotting.point_mass_layout(axes, env.unwrapped.layout, taken)
-        axes.plot(*positions[:count].T, color="0.3", linewidth=1)
-        axes.plot(*positions[count - 1], "o", color="black", markersize=6)
-        axes.set(xticks=[], yticks=[])
-        canvas.draw()
-        frames.append(np.asarray(canvas.buffer_rgba())[..., :3].copy())
-    plt.close(figure)
-    return frames, 10.0
+    with contextlib.closing(pictures.painter(env, size)) as painter:
+        every = max(1, round(1.0 / (fps * painter.seconds_per_step)))
+        counts = range(1, len(states) + 1, every)
+        frames = [painter.draw(states[:count]) for count in counts]
+    return frames, 1.0 / (every * painter.seconds_per_step)
 
 
 def locomotion_page(env: Any, states: Sequence[Any]) -> str:
@@ -200,8 +156,7 @@ def save(
     if path.suffix == _PAGE:
         path.write_text(locomotion_page(env, states))
         return len(states)
-    draw = locomotion_frames if environments.is_locomotion(env) else point_mass_frames
-    frames, fps = draw(env, states, size)
+    frames, fps = frames_of(env, states, size)
     write(frames, fps, path)
     return len(frames)
 
@@ -253,7 +208,13 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"out is {options.out}: an .mp4 needs the package imageio-ffmpeg (pip "
             'install "gasil_jax[render]"); a .gif or .png needs nothing'
         )
-    command_line.check_least(options, steps=1, width=1, height=1)
+    command_line.check_least(options, steps=1)
+    for name in ("width", "height"):
+        if not 1 <= getattr(options, name) <= _LARGEST_SIZE:
+            raise InputError(
+                f"{name} is {getattr(options, name)}: it must be from 1 to "
+                f"{_LARGEST_SIZE}"
+            )
     command_line.check_key(options.key)
     # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
@@ -280,7 +241,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             output_file.whole(options.out) as partial,
         ):
             num_frames = save(env, path, size, partial)
-    except NoOpenGL as error:
+    except pictures.NoOpenGL as error:
         raise OSError(str(error)) from error
     print(
         f"seed {seeds[0]}: return {total:.1f} in {len(path) - 1} steps, "

@@ -1,16 +1,21 @@
 """Train an agent: ``python -m gasil_jax.run --env walker2d --seeds 10``."""
 
-import json
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import final_returns
-from gasil_jax.host import command_line, driver, metrics_files, policy_file
+from gasil_jax.host import (
+    command_line,
+    driver,
+    json_reader,
+    metrics_files,
+    policy_file,
+)
 from gasil_jax.host.members import Batch
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_options import (
@@ -63,14 +68,14 @@ def _write_results(
     """Write the learning curve, the policies and the summary; return the summary."""
     config = options.config
     seeds = seeds_of(options)
-    metrics = metrics_files.read_metrics(
-        folder / "metrics.csv", ("seed",), options.seeds
+    read = lambda name, required: metrics_files.read_metrics(
+        folder / name, ("seed",), options.seeds, required
     )
+    metrics = read("metrics.csv", (*metrics_files.SUMMARIZED, "faulty_steps"))
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     evaluations = None
     if options.evaluate_every is not None:
-        path = folder / "evaluations.csv"
-        evaluations = metrics_files.read_metrics(path, ("seed",), options.seeds)
+        evaluations = read("evaluations.csv", ("mean",))
     plotting.learning_curve(
         folder / "learning_curve.png",
         steps,
@@ -134,12 +139,24 @@ def _by_seed_and_mean(
     return fields
 
 
+class _Trained(TypedDict):
+    """What summary.json says of the training."""
+
+    compile_seconds: float
+    train_seconds: float
+    env_steps_per_second: float
+    device: str
+    device_count: int
+    versions: dict[str, str | None]
+    evaluation_seconds: NotRequired[float]
+
+
 def _recorded(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
     """Return the same fields from the existing summary, or else as they are given."""
     try:
-        before = json.loads(path.read_text())
+        before = json_reader.read(path, _Trained)
         return {name: before[name] for name in trained}
-    except (OSError, ValueError, KeyError, TypeError):
+    except (OSError, ValueError, KeyError):
         return trained
 
 

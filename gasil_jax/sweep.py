@@ -1,4 +1,4 @@
-"""Sweeps: ``python -m gasil_jax.sweep --env hopper --seeds 5 --grid alpha=0.02,0.1``.
+"""Train a sweep: ``python -m gasil_jax.sweep --env hopper --grid alpha=0.02,0.1``.
 
 Points that differ only in `Hyperparameters` run in one compiled program, with seeds x
 points vmapped and sharded. Points that differ in a count (such as buffer size or

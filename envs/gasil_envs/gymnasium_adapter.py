@@ -5,9 +5,11 @@
     gymnasium.make("gasil_envs/walker2d", reward_delay=20)
     gymnasium.make_vec("gasil_envs/walker2d", num_envs=64)
 
-Physics runs under `jax.jit`; the batch is one `jax.vmap`.
+Physics runs under `jax.jit`; the batch is one `jax.vmap`. With a delayed reward an
+episode is also given the rest of its reward where ``max_episode_steps`` cuts it.
 """
 
+import inspect
 from typing import Any
 
 import gymnasium
@@ -16,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import TimeLimit
 
-from gasil_envs import registry, wrappers
+from gasil_envs import pictures, registry, wrappers
 
 _NAMESPACE = "gasil_envs"
 
@@ -42,19 +45,41 @@ class GymnasiumEnv(gymnasium.Env):
 
     Args:
       name: one of `gasil_envs.names()`.
-      **settings: fields of `gasil_envs.registry.Settings`.
+      render_mode: "rgb_array" to draw pictures with `render`; default none. MuJoCo
+        chooses its OpenGL by the variable MUJOCO_GL: egl needs no display.
+      width: width of a picture in pixels.
+      height: height of a picture in pixels.
+      **settings: arguments of `gasil_envs.make`.
 
-    The environment has its own step limit; an episode that reaches it is truncated.
+    The environment has its own step limit; an episode that reaches it is truncated. So
+    is one that reaches the limit of a `gymnasium.wrappers.TimeLimit` around it.
     """
 
-    metadata = {"render_modes": []}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
 
-    def __init__(self, name: str, render_mode: None = None, **settings: Any):
+    def __init__(
+        self,
+        name: str,
+        render_mode: str | None = None,
+        width: int = 480,
+        height: int = 360,
+        **settings: Any,
+    ):
         self._env = env = registry.make(name, **settings)
         self.observation_space, self.action_space = _spaces(env)
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode is {render_mode!r}: it must be 'rgb_array'")
         self.render_mode = render_mode
+        self._painter = None
+        if render_mode is not None:
+            self._painter = pictures.painter(env, (width, height))
+            fps = round(1.0 / self._painter.seconds_per_step)
+            self.metadata = {**self.metadata, "render_fps": fps}
         self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
         self._state: Any = None
+        self._steps, self._limit = 0, np.inf
+        # The physics states since the episode's start, which a picture may show.
+        self._episode: list[Any] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -62,6 +87,9 @@ class GymnasiumEnv(gymnasium.Env):
         """Start an episode and return its first observation, (obs,) float32."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
+        self._steps, self._limit = 0, self._limit_of_wrappers()
+        self._episode = []
+        self._remember()
         return np.asarray(self._state.obs), {}
 
     def step(
@@ -72,10 +100,44 @@ class GymnasiumEnv(gymnasium.Env):
         ``info["true_reward"]`` is the reward without delay.
         """
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        self._steps += 1
+        self._remember()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
-        info = {"true_reward": float(state.info.get("true_reward", state.reward))}
-        return np.asarray(state.obs), float(state.reward), terminated, truncated, info
+        reward = float(state.reward)
+        info = {"true_reward": float(state.info.get("true_reward", reward))}
+        if self._steps >= self._limit and not terminated:
+            # This is the last step, so that nothing may be held back; in an episode
+            # that the environment has ended, nothing is.
+            truncated, reward = True, reward + float(state.info.get("held_reward", 0.0))
+        return np.asarray(state.obs), reward, terminated, truncated, info
+
+    def render(self) -> np.ndarray | None:
+        """Return a picture, uint8 (height, width, 3); None without a render mode."""
+        return None if self._painter is None else self._painter.draw(self._episode)
+
+    def close(self) -> None:
+        """Free what draws the pictures."""
+        if self._painter is not None:
+            self._painter.close()
+
+    def _remember(self) -> None:
+        if self._painter is not None:
+            self._episode.append(self._state.pipeline_state)
+
+    def _limit_of_wrappers(self) -> float:
+        """Return the lowest limit of the `TimeLimit` wrappers that call `reset`.
+
+        `gymnasium.make` keeps its argument max_episode_steps from the environment and
+        wraps it; an environment does not know its wrappers, but these have called it.
+        """
+        limits, frame = [np.inf], inspect.currentframe()
+        while frame is not None:
+            caller = frame.f_locals.get("self")
+            if isinstance(caller, TimeLimit) and caller.unwrapped is self:
+                limits.append(caller._max_episode_steps)
+            frame = frame.f_back
+        return min(limits)
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -84,7 +146,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     Args:
       name: one of `gasil_envs.names()`.
       num_envs: number of environments.
-      **settings: fields of `gasil_envs.registry.Settings`.
+      **settings: arguments of `gasil_envs.make`.
     """
 
     metadata = {  # noqa: RUF012

@@ -28,7 +28,7 @@ class GymnaxEnv:
 
     Args:
       name: one of `gasil_envs.names()`.
-      **settings: fields of `gasil_envs.registry.Settings`.
+      **settings: arguments of `gasil_envs.make`.
     """
 
     default_params = Params()

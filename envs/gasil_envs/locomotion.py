@@ -230,6 +230,12 @@ class Locomotion(Env):
         self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
 
     @property
+    def ends_early(self) -> bool:
+        """Whether an episode can end before its step limit."""
+        bounds = (self.task.healthy_z, self.task.healthy_angle, self.task.healthy_state)
+        return any(bound != _EVERYTHING for bound in bounds)
+
+    @property
     def observation_size(self) -> int:
         """Length of the observation vector."""
         return self._observation_size[0]

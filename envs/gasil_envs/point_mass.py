@@ -61,6 +61,8 @@ class PointMass(Env):
     sum over collected objects minus ``actuation_cost * ||action||_2``.
     """
 
+    ends_early = False
+
     def __init__(self, layout: Layout | None = None):
         self.layout = layout = layout or Layout()
         # NumPy arrays become constants of the traced functions.

@@ -2,11 +2,15 @@
 
 import dataclasses
 import difflib
-import math
+import importlib.metadata
+import numbers
+import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
 import brax.envs
+import jax
+import jax.numpy as jnp
 from brax.envs import Env
 
 from gasil_envs import locomotion, own_environment, point_mass, wrappers
@@ -52,8 +56,10 @@ def _constructors() -> dict[str, Callable[[Settings], Env]]:
     }
 
 
-def _refuse_unknown(kind: str, name: str, allowed: Iterable[str]) -> None:
+def _refuse_unknown(kind: str, name: Any, allowed: Iterable[str]) -> None:
     allowed = tuple(allowed)
+    if not isinstance(name, str):
+        raise ValueError(f"{kind} is {name!r}: it must be one of {', '.join(allowed)}")
     if name in allowed:
         return
     nearest = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
@@ -79,14 +85,32 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     Raises:
       ValueError: if the name is unknown.
     """
-    if name.startswith(BRAX):
+    if isinstance(name, str) and name.startswith(BRAX):
         _refuse_unknown("env", name, [BRAX + x for x in brax.envs._envs])
-        return lambda settings: brax.envs.get_environment(name.removeprefix(BRAX))
-    if ":" in name:
+        return lambda settings: _build_of_brax(name)
+    if isinstance(name, str) and ":" in name:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
     _refuse_unknown("env", name, names())
     return _constructors()[name]
+
+
+def _build_of_brax(name: str) -> Env:
+    """Build an environment of Brax's and trace a step of it, without running it."""
+    try:
+        with warnings.catch_warnings():
+            # Brax warns that its physics is not maintained.
+            warnings.simplefilter("ignore", UserWarning)
+            env = brax.envs.get_environment(name.removeprefix(BRAX))
+            state = jax.eval_shape(env.reset, jax.random.key(0))
+            jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+    except Exception as error:
+        version = importlib.metadata.version("brax")
+        why = f"{type(error).__name__}: {error}".partition("\n")[0]
+        raise ValueError(
+            f"env {name!r} fails within Brax {version} itself: {why}"
+        ) from None
+    return env
 
 
 def check(name: str, settings: Settings) -> None:
@@ -106,10 +130,28 @@ def check(name: str, settings: Settings) -> None:
             f"physics is {settings.physics!r}"
         )
     delay, noise = settings.reward_delay, settings.obs_noise
-    if not isinstance(delay, int) or delay < 1:
-        raise ValueError(f"reward_delay is {delay}: it must be a whole number, from 1")
-    if not 0.0 <= noise < math.inf:
-        raise ValueError(f"obs_noise is {noise}: it must be finite and 0 or more")
+    # Steps are counted in int32.
+    if not isinstance(delay, int) or not 1 <= delay < 2**31:
+        raise ValueError(
+            f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
+            f"{2**31 - 1}"
+        )
+    # Numbers are float32.
+    if not isinstance(noise, numbers.Real) or not 0.0 <= noise <= 3.4e38:
+        raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
+
+
+def without_effect(name: str, settings: Settings) -> list[str]:
+    """Return the names of settings that are changed and that an environment ignores.
+
+    Args:
+      name: one of `names()`, or another name that `check` accepts.
+      settings: settings that `check` accepts.
+    """
+    if ":" in name or name in locomotion.TASKS:
+        return []
+    of_physics = ("physics", "solver", "integrator")
+    return [x for x in of_physics if getattr(settings, x) != getattr(Settings, x)]
 
 
 def prepare(settings: Settings, num_devices: int) -> None:
@@ -118,12 +160,14 @@ def prepare(settings: Settings, num_devices: int) -> None:
         native.reserve_threads(num_devices)
 
 
-def make(name: str, **settings: Any) -> Env:
+def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
       name: one of `names()`; "brax:" and a name in ``brax.envs``; or MODULE:NAME of
         your own class or function that builds an environment with Brax's interface.
+      max_episode_steps: number of steps after which an episode is truncated; default
+        the environment's own limit, or 1000 if it has none.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator.
 
@@ -134,9 +178,17 @@ def make(name: str, **settings: Any) -> Env:
     check(name, chosen)
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
+    if max_episode_steps is not None:
+        whole = isinstance(max_episode_steps, int)
+        if not (whole and 1 <= max_episode_steps <= limit):
+            raise ValueError(
+                f"max_episode_steps is {max_episode_steps!r}: it must be a whole "
+                f"number from 1 to {limit}, the environment's own limit"
+            )
+        limit = max_episode_steps
     env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, chosen.reward_delay)
     if chosen.obs_noise > 0:
-        env = wrappers.ObservationNoise(env, chosen.obs_noise)
+        env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
     return env

@@ -1,41 +1,93 @@
-"""Draw learning curves and the point mass' layout."""
+"""Draw learning curves."""
 
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from gasil_envs.pictures import point_mass_layout as point_mass_layout
+from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
 #: Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 
 
-def smooth(curve: np.ndarray, window: int) -> np.ndarray:
-    """Return the running mean over the last `window` entries: (..., n) -> (..., n).
+_POINTS = 50
 
-    NaN entries are left out; where all are NaN, so is the mean.
+
+def in_parts(
+    env_steps: np.ndarray, returns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean returns over equal parts of training, at most 50.
+
+    Parts in which not every seed has ended an episode are left out.
+
+    Args:
+      env_steps: (iterations,).
+      returns: (seeds, iterations), NaN where no episode ended.
+
+    Returns:
+      The steps at the end of each part, (parts,), and the means, (seeds, parts).
     """
-    finite = np.isfinite(curve)
-    pad = lambda x: np.concatenate([np.zeros((*x.shape[:-1], window)), x], axis=-1)
-    total = np.cumsum(pad(np.where(finite, curve, 0.0)), axis=-1)
-    count = np.cumsum(pad(finite.astype(float)), axis=-1)
-    total = total[..., window:] - total[..., :-window]
-    count = count[..., window:] - count[..., :-window]
-    return np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+    parts = np.array_split(np.arange(len(env_steps)), min(_POINTS, len(env_steps)))
+    complete = [x for x in parts if np.isfinite(returns[:, x]).any(axis=1).all()]
+    if not complete:
+        return env_steps[:0], returns[:, :0]
+    steps = np.array([env_steps[part[-1]] for part in complete])
+    means = [np.nanmean(returns[:, part], axis=1) for part in complete]
+    return steps, np.stack(means, axis=1)
 
 
-def draw_band(
+def draw_returns(
     axes: Any,
-    steps: np.ndarray,
-    mean: np.ndarray,
-    spread: np.ndarray,
+    env_steps: np.ndarray,
+    returns: np.ndarray,
+    evaluations: Mapping[str, np.ndarray] | None,
+    *,
     color: str,
-    label: str | None = None,
+    label: str = "training",
+    evaluated: str = "evaluations",
+    style: str = "-",
 ) -> None:
-    """Draw a curve with `spread` shaded on both sides of it; all arrays are (n,)."""
-    low, high = mean - spread, mean + spread
-    axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-    axes.plot(steps, mean, color=color, label=label)
+    """Draw the interquartile mean over seeds with its 95% interval.
+
+    Args:
+      axes: where to draw; steps are in millions.
+      env_steps: (points,).
+      returns: (seeds, points).
+      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
+        evaluations) each, whose interquartile mean is dashed; None if there are none.
+      color: color of the line, the interval and the evaluations.
+      label: label in the legend.
+      evaluated: label of the evaluations.
+      style: style of the line.
+    """
+    if len(env_steps):
+        low, high = bootstrap_interval(returns)
+        steps, middle = env_steps / 1e6, interquartile_mean(returns, axis=0)
+        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+        axes.plot(steps, middle, style, color=color, label=label)
+    if evaluations is not None:
+        steps = evaluations["env_steps"][0] / 1e6
+        middle = interquartile_mean(evaluations["mean"], axis=0)
+        axes.plot(steps, middle, "--", color=color, linewidth=1, label=evaluated)
+    axes.set(xlabel="million steps of a seed", ylabel="episode return")
+
+
+def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:
+    """Write below a figure what its lines and intervals are.
+
+    Args:
+      figure: the figure.
+      num_seeds: number of seeds of each line.
+      more: what else there is to say.
+    """
+    *others, largest = sorted(set(num_seeds))
+    seeds = f"{', '.join(map(str, others))}{' or ' if others else ''}{largest}"
+    seeds += " seed" if largest == 1 else " seeds"
+    text = f"interquartile mean over {seeds}, shaded its 95% interval{more}"
+    figure.supxlabel(text, fontsize="small", color="0.3")
 
 
 def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
@@ -47,28 +99,6 @@ def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
     plt.close(figure)
 
 
-def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
-    """Draw the point mass' box and objects; `collected` ones, (objects,), are pale."""
-    import matplotlib.pyplot as plt
-
-    kinds = (
-        (layout.blue, "#0072B2", layout.blue_reward),
-        (layout.green, "#009E73", layout.green_reward),
-        (layout.orange, "#E69F00", layout.orange_reward),
-    )
-    objects = [(x, y, c, r) for centres, c, r in kinds for x, y in centres]
-    for (x, y, color, reward), taken in zip(objects, collected, strict=True):
-        alpha = 0.12 if taken else 0.6
-        axes.add_patch(plt.Circle((x, y), layout.radius, color=color, alpha=alpha))
-        axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
-    (x, y), spread = layout.start, layout.start_spread
-    corner = (x - spread, y - spread)
-    axes.add_patch(
-        plt.Rectangle(corner, 2 * spread, 2 * spread, color="0.85", zorder=0)
-    )
-    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")
-
-
 def learning_curve(
     path: pathlib.Path,
     env_steps: np.ndarray,
@@ -77,10 +107,7 @@ def learning_curve(
     *,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Save mean, spread and each seed's return over environment steps as a PNG.
-
-    Each point is a mean over the preceding fiftieth of training. The mean of the
-    evaluations is dashed.
+    """Save the returns over environment steps as a PNG: all seeds, mean and interval.
 
     Args:
       path: the image file.
@@ -95,19 +122,15 @@ def learning_curve(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    episode_return = smooth(episode_return, max(1, len(env_steps) // 50))
-    figure, axes = plt.subplots(figsize=(6.4, 4.0), layout="constrained")
-    for curve in episode_return:
-        axes.plot(env_steps, curve, color="0.75", linewidth=0.8)
-    has_return = np.isfinite(episode_return).any(axis=0)
-    if has_return.any():
-        seen, steps = episode_return[:, has_return], env_steps[has_return]
-        mean, spread = np.nanmean(seen, axis=0), np.nanstd(seen, axis=0)
-        draw_band(axes, steps, mean, spread, "#0072B2", "mean ± standard deviation")
+    steps, returns = in_parts(env_steps, episode_return)
+    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    axes.plot(steps / 1e6, returns.T, color="0.75", linewidth=0.8)
+    draw_returns(axes, steps, returns, evaluations, color=COLORS[0])
     if evaluations is not None:
-        steps, mean = evaluations["env_steps"][0], evaluations["mean"].mean(axis=0)
-        axes.plot(steps, mean, "--", color="#D55E00", label="mean of the evaluations")
-    if has_return.any() or evaluations is not None:
-        axes.legend(frameon=False, loc="upper left")
-    axes.set(xlabel="environment steps", ylabel="episode return", title=title)
+        axes.legend(frameon=False)
+    elif not len(steps):
+        where: dict[str, Any] = {"ha": "center", "transform": axes.transAxes}
+        axes.text(0.5, 0.5, "not every seed has ended an episode", **where)
+    axes.set_title(title)
+    write_caption(figure, [len(returns)], "; grey: each seed")
     save(figure, path, dpi=150)

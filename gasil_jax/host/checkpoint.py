@@ -19,13 +19,15 @@ import math
 import os
 import pathlib
 import shutil
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
+
+from gasil_jax.host import json_reader
 
 _STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
 _DAMAGED = ".damaged"
@@ -170,17 +172,39 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
     )
 
 
-def read(folder: pathlib.Path) -> Checkpoint:
-    """Return the checkpoint in `folder` after checking its hashes.
+class _Record(TypedDict, total=False):
+    """What training records in a checkpoint."""
+
+    metrics_size: int
+    evaluations_size: int
+    score: float | None
+
+
+class _Manifest(TypedDict):
+    """The content of manifest.json."""
+
+    files: dict[str, str]
+    record: _Record
+
+
+def read(folder: pathlib.Path, required: Sequence[str] = ()) -> Checkpoint:
+    """Return the checkpoint in `folder` after checking its manifest and its hashes.
+
+    Args:
+      folder: the checkpoint's folder.
+      required: names that its record must have.
 
     Raises:
       ValueError: if it is damaged.
     """
     try:
-        manifest = json.loads((folder / _MANIFEST).read_text())
-        files, record = manifest["files"], dict(manifest["record"])
-    except (OSError, ValueError, KeyError, TypeError):
-        raise ValueError(f"{folder} is damaged: its manifest can't be read") from None
+        manifest = json_reader.read(folder / _MANIFEST, _Manifest)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{folder} is damaged: {error}") from None
+    files, record = manifest["files"], manifest["record"]
+    for name in required:
+        if name not in record:
+            raise ValueError(f"{folder} is damaged: its record has no {name}")
     hashes = _hashes(folder)
     if hashes != files:
         name = min(
@@ -190,12 +214,19 @@ def read(folder: pathlib.Path) -> Checkpoint:
     return Checkpoint(folder, int(folder.name), record)
 
 
-def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest undamaged checkpoint, and the errors of damaged newer ones."""
+def latest(
+    root: pathlib.Path, required: Sequence[str] = ()
+) -> tuple[Checkpoint | None, list[str]]:
+    """Return the newest undamaged checkpoint, and the errors of damaged newer ones.
+
+    Args:
+      root: folder of the checkpoints.
+      required: names that a checkpoint's record must have.
+    """
     damages: list[str] = []
     for folder in reversed(_folders(root)):
         try:
-            return read(folder), damages
+            return read(folder, required), damages
         except ValueError as error:
             damages.append(str(error))
     return None, damages
@@ -219,10 +250,10 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
     """Return the scores of the checkpoints that have one."""
     scores = {}
     for folder in folders:
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            score = json.loads((folder / _MANIFEST).read_text())["record"]["score"]
-            if score is not None:
-                scores[folder] = score
+        with contextlib.suppress(OSError, ValueError):
+            record = json_reader.read(folder / _MANIFEST, _Manifest)["record"]
+            if record.get("score") is not None:
+                scores[folder] = record["score"]
     return scores
 
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import errno
 import io
 import re
 import sys
@@ -158,6 +159,11 @@ def _in_one_line(refusal: str) -> str:
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
+def note(text: str) -> None:
+    """Print a line to stderr about something that is allowed but may surprise."""
+    print(f"note: {text}", file=sys.stderr)
+
+
 def check_least(options: Any, **least: int) -> None:
     """Check that numbers are not below their lowest allowed values; None is allowed.
 
@@ -185,14 +191,16 @@ def exit_status(work: Callable[[], int | None]) -> int:
 
     Returns:
       The status that the work returns, or 0 if it is done; 1 if a folder or file can't
-      be read or written, or if a program that it started failed; 2 for bad input; 128
-      plus the signal's number if it was interrupted after saving.
+      be read or written, or if a program that it started failed; 2 for bad input, to
+      which a name belongs that is too long for a file; 128 plus the signal's number if
+      it was interrupted after saving.
     """
     try:
         return work() or 0
     except (InputError, OSError) as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2 if isinstance(error, InputError) else 1
+        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+        return 2 if too_long or isinstance(error, InputError) else 1
     except Interrupted as interrupted:
         print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
         return 128 + interrupted.signal

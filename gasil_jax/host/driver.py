@@ -159,7 +159,7 @@ class _Checkpoints:
 
 
 def _restored(
-    runs: Batch, root: pathlib.Path, progress: Progress
+    runs: Batch, root: pathlib.Path, progress: Progress, tables: Sequence[str]
 ) -> tuple[Any, int, Mapping[str, Any] | None]:
     """The states of the newest whole checkpoint, its iteration and its record.
 
@@ -167,7 +167,7 @@ def _restored(
     newer is damaged, told and set aside.
     """
     with progress.aside("reading the checkpoints"):
-        newest, damages = checkpoint.latest(root)
+        newest, damages = checkpoint.latest(root, [f"{table}_size" for table in tables])
     for damage in damages:
         instead = "starting anew" if newest is None else f"using {newest.folder.name}"
         print(f"warning: {damage}; {instead}", file=sys.stderr)
@@ -225,7 +225,8 @@ def drive(
     config, last = runs.config, runs.config.num_iterations
     steps_of = lambda done: done * config.batch_steps * runs.num_members
     checkpoints = _Checkpoints(folder / "checkpoints", schedule, runs)
-    states, first, record = _restored(runs, checkpoints.root, progress)
+    names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
+    states, first, record = _restored(runs, checkpoints.root, progress, names)
     with command_line.input_checked():
         tables = _Tables(
             runs,

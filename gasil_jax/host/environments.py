@@ -5,7 +5,7 @@ from typing import Any
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
 from gasil_envs.point_mass import PointMass
-from gasil_envs.registry import Settings, check, make, prepare
+from gasil_envs.registry import Settings, check, make, prepare, without_effect
 
 make_env = make
 
@@ -13,11 +13,18 @@ __all__ = [
     "Settings",
     "available_cores",
     "check",
+    "ends_early",
     "is_locomotion",
     "is_point_mass",
     "make_env",
     "prepare",
+    "without_effect",
 ]
+
+
+def ends_early(env: Any) -> bool:
+    """Return whether an episode may end before its step limit; true if unknown."""
+    return getattr(env.unwrapped, "ends_early", True)
 
 
 def is_locomotion(env: Any) -> bool:

@@ -30,6 +30,9 @@ COLUMNS = (
     "explained_variance",
 )
 
+#: The columns of metrics.csv that tables and summaries are made from.
+SUMMARIZED = ("episode_return", "episode_length", "skipped_updates")
+
 
 def versions() -> dict[str, str | None]:
     """Return the versions of Python and the packages; None if not installed."""
@@ -166,7 +169,10 @@ def _cell(value: Any) -> str:
 
 
 def read_metrics(
-    path: pathlib.Path, labels: Sequence[str], num_members: int
+    path: pathlib.Path,
+    labels: Sequence[str],
+    num_members: int,
+    required: Sequence[str] = (),
 ) -> dict[str, np.ndarray]:
     """Return every metric of a `MetricsWriter`'s file, (members, iterations) each.
 
@@ -174,9 +180,11 @@ def read_metrics(
       path: the file; an empty cell becomes NaN.
       labels: names of the first columns, which are not metrics.
       num_members: number of rows per iteration.
+      required: columns that it must have besides "env_steps".
 
     Raises:
-      InputError: if the file is damaged.
+      InputError: if the file is damaged, has no rows or lacks a column.
+      OSError: if there is no such file.
     """
     first = len(labels)
     try:
@@ -185,6 +193,12 @@ def read_metrics(
         values = np.array(
             [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
         ).reshape(-1, num_members, len(header) - first)
-    except ValueError as error:
+        if not len(values):
+            raise ValueError("it has no rows")
+    except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-    return {name: values[:, :, i].T for i, name in enumerate(header[first:])}
+    metrics = {name: values[:, :, i].T for i, name in enumerate(header[first:])}
+    for name in ("env_steps", *required):
+        if name not in metrics:
+            raise InputError(f"{path} is damaged: it has no column {name}")
+    return metrics

@@ -2,7 +2,6 @@
 
 import contextlib
 import pathlib
-import tempfile
 import uuid
 from collections.abc import Iterator, Sequence
 
@@ -32,10 +31,16 @@ def make_parent(path: pathlib.Path) -> None:
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=path.parent):
-            pass
+        probe = _partial(path)
+        probe.touch()
+        probe.unlink()
     except OSError as error:
         raise InputError(unwritable(path, error)) from None
+
+
+def _partial(path: pathlib.Path) -> pathlib.Path:
+    # Not the process number, because processes on several hosts may have the same.
+    return path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
 
 
 @contextlib.contextmanager
@@ -48,8 +53,7 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
     Raises:
       OSError: if it can't be written; the message is one line with the path.
     """
-    # Not the process number, because processes on several hosts may have the same.
-    partial = path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+    partial = _partial(path)
     try:
         yield partial
         partial.rename(path)

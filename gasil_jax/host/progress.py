@@ -1,6 +1,8 @@
 """Show the progress of a run: as a bar on a terminal, as plain lines elsewhere."""
 
 import contextlib
+import datetime
+import math
 import sys
 import threading
 import time
@@ -9,16 +11,9 @@ from types import TracebackType
 
 import numpy as np
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    SpinnerColumn,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
-from rich.progress import (
-    Progress as RichProgress,
-)
+from rich.progress import BarColumn, SpinnerColumn, TextColumn
+from rich.progress import Progress as RichProgress
+from rich.table import Column
 
 _SECONDS_BETWEEN_LINES = 10.0
 _SECONDS_OF_SILENCE = 1.0
@@ -48,30 +43,43 @@ def _line(title: str, text: str) -> None:
 
 
 class Progress:
-    """Shows steps, return (mean and spread over seeds), steps/s and the time left."""
+    """Shows the share of the steps, the return, steps/s and the time left.
 
-    def __init__(self, title: str, total_steps: int):
+    The return is a mean over seeds, with its standard deviation.
+
+    Args:
+      title: name of what is trained.
+      total_steps: environment steps over all seeds.
+      num_seeds: number of seeds; the steps that are shown are those of one seed.
+    """
+
+    def __init__(self, title: str, total_steps: int, num_seeds: int = 1):
         self._console = Console(stderr=True)
         self._title = title
         self._total = total_steps
+        self._num_seeds = num_seeds
+        seeds = f" x {num_seeds} seeds" if num_seeds > 1 else ""
+        self._amount = f"{total_steps // num_seeds:,} steps{seeds}"
         self._live = self._console.is_terminal
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = 0
-        self._return = np.nan
-        self._spread = np.nan
+        self._return: str | None = None
+        # Only the bar gives way where the terminal is narrow.
+        whole = Column(no_wrap=True)
         self._bar = RichProgress(
-            SpinnerColumn(),
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.fields[status]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            SpinnerColumn(table_column=whole),
+            TextColumn("{task.percentage:3.0f}%", table_column=whole),
+            BarColumn(bar_width=None, table_column=Column(ratio=1)),
+            TextColumn("{task.fields[status]}", table_column=whole),
             console=self._console,
             disable=not self._live,
+            expand=True,
         )
         self._task = self._bar.add_task(title, total=total_steps, status="")
 
     def __enter__(self) -> "Progress":
+        if self._live:
+            self._console.print(f"{self._title}: {self._amount}", highlight=False)
         self._bar.start()
         return self
 
@@ -117,16 +125,19 @@ class Progress:
         per_seed = [row[np.isfinite(row)] for row in returns]
         per_seed = [row.mean() for row in per_seed if row.size]
         if per_seed:
-            self._return, self._spread = np.mean(per_seed), np.std(per_seed)
+            self._return = f"{np.mean(per_seed):.1f} ± {np.std(per_seed):.1f}"
         now = time.monotonic()
         speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
+        # The last batch may go beyond what was asked for.
+        steps = min(steps, self._total)
+        left = datetime.timedelta(seconds=math.ceil((self._total - steps) / speed))
         status = (
-            f"{steps:,}/{self._total:,} steps, "
-            f"return {self._return:.1f} ± {self._spread:.1f}, {speed:,.0f} steps/s"
+            f"return {self._return or '(none ended)'}, {speed:,.0f} steps/s, "
+            f"{left} left"
         )
         self._bar.update(self._task, completed=steps, status=status)
         due = now - self._last_line > _SECONDS_BETWEEN_LINES or steps >= self._total
         if not self._live and due:
             self._last_line = now
-            left = (self._total - steps) / speed
-            _line(self._title, f"{status}, {left:,.0f} s left")
+            done = f"{steps // self._num_seeds:,}/{self._amount}"
+            _line(self._title, f"{done}, {status}")

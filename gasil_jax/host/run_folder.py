@@ -3,19 +3,20 @@
 import contextlib
 import dataclasses
 import fcntl
-import json
 import os
 import pathlib
 import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Required, TypedDict
 
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config, validate
 from gasil_jax.errors import InputError
+from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
+from gasil_jax.imitation import agents
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
@@ -134,9 +135,34 @@ def is_described(folder: pathlib.Path) -> bool:
 
 def describe(folder: pathlib.Path, content: Mapping[str, Any]) -> None:
     """Write config.json."""
-    from gasil_jax.host import metrics_files
-
     metrics_files.write_json(folder / _CONFIG, content)
+
+
+class _Described(TypedDict, total=False):
+    """The content of config.json, of a run or a sweep."""
+
+    env: Required[str]
+    seeds: Required[int]
+    first_seed: Required[int]
+    settings: Required[Settings]
+    config: Required[Config]
+    out: str | None
+    resume: bool
+    checkpoint_every: int | None
+    keep_checkpoints: int
+    evaluate_every: int | None
+    evaluate_episodes: int | None
+    log: tuple[str, ...]
+    preset: str
+    devices: int | None
+    grid: tuple[str, ...]
+    random: int | None
+    points_file: str | None
+    points: tuple[dict[str, float], ...]
+    share_counts: bool
+    shard: str | None
+    launcher: str | None
+    shards: int | None
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
@@ -147,31 +173,30 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     """
     path = folder / _CONFIG
     try:
-        content = json.loads(path.read_text())
-        fields = _tuples_in(content["config"])
-        fields["hyperparameters"] = Hyperparameters(**fields["hyperparameters"])
-        described = _tuples_in(content)
-        described["config"] = Config(**fields)
-        described["settings"] = Settings(**content["settings"])
-        if "points" in described:  # A sweep, which may be older than the option.
-            described.setdefault("share_counts", False)
-        for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
-            if type(described[name]) is not kind:
-                raise TypeError(f"{name} is {described[name]!r}")
+        described = json_reader.read(path, _Described)
     except OSError:
         raise InputError(f"run is {folder}: it must be the folder of a run") from None
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    if "points" in described:  # A sweep, which may be older than the options.
+        described = {"share_counts": False, "shard": None} | described
+    try:
+        validate(described["config"], agents())
+        check_seeds(described["seeds"], described["first_seed"])
+    except ValueError as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None
     return described
 
 
-def _tuples_in(fields: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: _as_tuples(value) for name, value in fields.items()}
+#: The largest number of seeds; their keys are numbered up to 2**32.
+_MOST_SEEDS = 2**20
 
 
-def _as_tuples(value: Any) -> Any:
-    # JSON has no tuples, but a config must be hashable.
-    return tuple(map(_as_tuples, value)) if isinstance(value, list) else value
+def check_seeds(seeds: int, first_seed: int) -> None:
+    """Raise `InputError` unless there can be so many seeds, from the first one on."""
+    if not 1 <= seeds <= _MOST_SEEDS:
+        raise InputError(f"seeds is {seeds}: it must be from 1 to {_MOST_SEEDS:,}")
+    last = 2**32 - seeds
+    if not 0 <= first_seed <= last:
+        raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
 
 
 #: Options that may differ between a run and its continuation.

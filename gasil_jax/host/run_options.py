@@ -20,7 +20,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.imitation import AGENTS
+from gasil_jax.imitation import AGENTS, unused
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +167,6 @@ def check(options: Options) -> None:
         trackers.check(options.log)
     command_line.check_least(
         options,
-        seeds=1,
         devices=1,
         checkpoint_every=1,
         keep_checkpoints=1,
@@ -178,12 +177,34 @@ def check(options: Options) -> None:
         raise InputError(
             f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
         )
-    last = 2**32 - options.seeds
-    if last < 0:
-        raise InputError(f"seeds is {options.seeds}: it must be from 1 to {2**32}")
-    if not 0 <= options.first_seed <= last:
-        raise InputError(
-            f"first_seed is {options.first_seed}: it must be from 0 to {last}"
+    run_folder.check_seeds(options.seeds, options.first_seed)
+
+
+def tell_without_effect(options: Options, num_members: int) -> None:
+    """Print a note for each option that differs from its default to no effect.
+
+    Args:
+      options: options that `check` accepts.
+      num_members: number of seeds, over all points of a sweep.
+    """
+    config, settings = options.config, options.settings
+    for name in environments.without_effect(options.env, settings):
+        value = getattr(settings, name)
+        command_line.note(f"{name} is {value}, to no effect: {options.env} has none")
+    default = presets.preset(
+        options.env, config.agent, options.preset, settings.reward_delay
+    )
+    now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
+    for name in sorted(unused(config.agent)):
+        if now[name] != before[name]:
+            command_line.note(
+                f"{name} is {now[name]}, to no effect: agent {config.agent!r} does not "
+                "use it"
+            )
+    if options.devices is not None and options.devices > num_members:
+        command_line.note(
+            f"devices is {options.devices}, of which {num_members} are used, one for "
+            "each seed"
         )
 
 

@@ -10,12 +10,16 @@ from typing import Any
 
 import jax
 
+from gasil_jax import train as training
+from gasil_jax.config import Config
 from gasil_jax.host import (
     command_line,
     devices,
     driver,
+    environments,
     resources,
     run_folder,
+    run_options,
     trackers,
 )
 from gasil_jax.host.interruption import Interruption
@@ -63,11 +67,8 @@ def prepare(
     Raises:
       InputError: if the programs do not fit the devices or the disk.
     """
-    devices.use_devices(
-        options.settings,
-        options.devices,
-        sum(len(program.members) for program in programs),
-    )
+    num_members = sum(len(program.members) for program in programs)
+    devices.use_devices(options.settings, options.devices, num_members)
     env = make_env(options)
     schedule = evaluation_schedule(options)
     with announced(options.env, "starting the devices"):
@@ -91,7 +92,23 @@ def prepare(
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
         )
+    run_options.tell_without_effect(options, num_members)
+    tell_if_no_episode_ends(env, [program.config for program in programs])
     return env
+
+
+def tell_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
+    """Print a note if no episode can end within the steps of an environment."""
+    for config in configs:
+        steps = config.num_iterations * config.num_steps
+        limit = training.max_episode_steps(env, config)
+        if steps < limit and not environments.ends_early(env):
+            command_line.note(
+                f"no return will be known: each of {config.num_envs} environments "
+                f"takes {steps:,} steps, and an episode has {limit:,}: give fewer "
+                "--num-envs or more --total-steps"
+            )
+            return
 
 
 def train(
@@ -119,10 +136,12 @@ def train(
     schedule = driver.CheckpointSchedule(
         options.checkpoint_every, options.keep_checkpoints
     )
+    num_members = sum(len(job.program.members) for job in jobs)
+    total_steps = options.config.total_steps * num_members
     steps_before = 0
     with (
         Interruption() as interruption,
-        Progress(title, sum(job.env_steps for job in jobs)) as progress,
+        Progress(title, total_steps, num_members) as progress,
     ):
         for job in jobs:
             if not job.finished:

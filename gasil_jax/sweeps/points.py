@@ -1,17 +1,18 @@
 """Read or draw the points of a sweep: values of hyperparameters and counts, by name."""
 
+import contextlib
 import itertools
 import json
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from gasil_jax.config import Config, Hyperparameters, ranges
+from gasil_jax.config import Config, Hyperparameters, ranges, validate
 from gasil_jax.errors import InputError, nearest
 from gasil_jax.host.command_line import whole_number
-from gasil_jax.imitation import unused
+from gasil_jax.imitation import agents, unused
 
 Point = Mapping[str, Any]
 
@@ -79,17 +80,8 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
     for point in points:
         if not isinstance(point, dict):
             raise InputError(f"points_file is {path}: {point!r} is not a point")
-        for name, value in point.items():
-            if name not in KINDS:
-                raise InputError(f"points_file is {path}: {_unknown_name(name)}")
-            whole = KINDS[name] is int
-            if isinstance(value, bool) or not isinstance(
-                value, int if whole else int | float
-            ):
-                kind = "a whole number" if whole else "a number"
-                raise InputError(
-                    f"points_file is {path}: {name} is {value!r}, not {kind}"
-                )
+        with _naming(f"points_file is {path}"):
+            check_point(point)
     read = [
         {name: KINDS[name](value) for name, value in point.items()} for point in points
     ]
@@ -97,6 +89,35 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
         if point in read[:index]:
             raise InputError(f"points_file is {path}: it has {point} twice")
     return read
+
+
+@contextlib.contextmanager
+def _naming(where: str) -> Iterator[None]:
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"{where}: {error}") from None
+
+
+def check_point(point: Point) -> None:
+    """Raise `InputError` if a name can't vary or a value is not of its type."""
+    for name, value in point.items():
+        if name not in KINDS:
+            raise InputError(_unknown_name(name))
+        whole = KINDS[name] is int
+        if isinstance(value, bool) or not isinstance(
+            value, int if whole else int | float
+        ):
+            kind = "a whole number" if whole else "a number"
+            raise InputError(f"{name} is {value!r}, not {kind}")
+
+
+def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> None:
+    """Raise `InputError` if the points in a config.json do not fit its config."""
+    with _naming(f"{path} is damaged or of another program: points"):
+        for point in points:
+            check_point(point)
+            validate(config.replace(**point), agents())
 
 
 def _unknown_name(name: str) -> str:

@@ -1,25 +1,36 @@
 """Find and load the training states that a run or a sweep has saved."""
 
+import contextlib
 import dataclasses
-import json
 import pathlib
 import sys
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax import train
-from gasil_jax.config import Config, validate
+from gasil_jax.config import Config
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, command_line, environments, run_folder
-from gasil_jax.imitation import AGENTS
+from gasil_jax.host import (
+    checkpoint,
+    command_line,
+    environments,
+    json_reader,
+    run_folder,
+)
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.shards import Program
 from gasil_jax.sweeps.tables import Trained
+
+
+class _Summary(TypedDict):
+    """What is read of a sweep's summary.json."""
+
+    best_by_mean: int | None
 
 
 class Saved(NamedTuple):
@@ -71,11 +82,8 @@ def _checked(
     """Return the requested point, or the best by mean for None."""
     points: Sequence[Point] = described["points"]
     if point is None:
-        try:
-            summary = json.loads((folder / "summary.json").read_text())
-        except (OSError, ValueError):
-            summary = {}
-        point = summary.get("best_by_mean")
+        with contextlib.suppress(FileNotFoundError):
+            point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
         if point is None:
             raise InputError(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
@@ -148,7 +156,6 @@ def load(
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     settings = dataclasses.asdict(described["settings"])
     with command_line.input_checked():
-        validate(config, tuple(AGENTS))
         env = environments.make_env(described["env"], **settings)
         # The leaves of all members have the same shapes.
         init = lambda seed: train.init(

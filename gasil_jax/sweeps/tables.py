@@ -8,19 +8,18 @@ many hosts.
 
 import csv
 import dataclasses
-import json
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures.statistics import final_returns
-from gasil_jax.host import metrics_files
+from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.points import Point
+from gasil_jax.sweeps.points import Point, check_saved
 from gasil_jax.sweeps.shards import Program
 
 #: The columns of metrics.csv that identify the members.
@@ -46,6 +45,20 @@ def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> N
     metrics_files.write_json(program.folder(folder) / _TRAINING, content)
 
 
+class _Training(TypedDict):
+    """The content of training.json."""
+
+    iterations: int
+    members: int
+    env_steps: int
+    compile_seconds: float
+    train_seconds: float
+    evaluation_seconds: NotRequired[float | None]
+    device: str
+    device_count: int
+    versions: dict[str, str | None]
+
+
 def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
     """Return what `write_training` wrote; None if the program is not yet finished.
 
@@ -54,12 +67,11 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
       program: the program, whose config says where its end is.
     """
     try:
-        content = json.loads((program.folder(folder) / _TRAINING).read_text())
-        ended = content["iterations"] == program.config.num_iterations
-        same = content["members"] == len(program.members)
-    except (OSError, ValueError, KeyError, TypeError):
+        content = json_reader.read(program.folder(folder) / _TRAINING, _Training)
+    except (OSError, ValueError):
         return None
-    return content if ended and same else None
+    ended = content["iterations"] == program.config.num_iterations
+    return content if ended and content["members"] == len(program.members) else None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,7 +88,12 @@ class Trained:
 
     @classmethod
     def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
-        """Return the programs of a folder, from its config.json (`run_folder.read`)."""
+        """Return the programs of a folder, from its config.json (`run_folder.read`).
+
+        Raises:
+          InputError: if its points can't be trained.
+        """
+        check_saved(content["points"], content["config"], folder / "config.json")
         first = content["first_seed"]
         seeds = range(first, first + content["seeds"])
         programs = shards.programs(
@@ -107,7 +124,8 @@ class Trained:
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
-            every |= self._table(program, "metrics.csv", program.config.num_iterations)
+            required, rows = metrics_files.SUMMARIZED, program.config.num_iterations
+            every |= self._table(program, "metrics.csv", required, rows)
         return every
 
     def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
@@ -119,20 +137,26 @@ class Trained:
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program, training in zip(self.programs, self.trainings(), strict=True):
             if training.get("evaluation_seconds") is not None:
-                every |= self._table(program, "evaluations.csv")
+                every |= self._table(program, "evaluations.csv", ("mean",))
         return every
 
     def _table(
-        self, program: Program, name: str, rows: int | None = None
+        self,
+        program: Program,
+        name: str,
+        required: Sequence[str],
+        rows: int | None = None,
     ) -> dict[Member, dict[str, np.ndarray]]:
-        """Return a program's complete table by member, checking a member's `rows`."""
+        """Return a program's complete table by member, checking columns and `rows`."""
         path, config = program.folder(self.folder) / name, program.config
         try:
-            columns = metrics_files.read_metrics(path, LABELS, len(program.members))
-            steps = columns["env_steps"][0]
-            whole = steps[-1] == config.num_iterations * config.batch_steps
-        except (OSError, ValueError, KeyError, IndexError) as error:
+            columns = metrics_files.read_metrics(
+                path, LABELS, len(program.members), required
+            )
+        except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
+        steps = columns["env_steps"][0]
+        whole = steps[-1] == config.num_iterations * config.batch_steps
         if not whole or rows not in (None, len(steps)):
             raise InputError(f"{path} is damaged: it lacks iterations")
         return {
@@ -216,7 +240,7 @@ def write(
         "versions": _joined([training["versions"] for training in trainings]),
     }
     metrics_files.write_json(folder / "summary.json", summary)
-    _plot(folder / "sweep.png", points, final)
+    _plot(folder / "sweep.png", points, final, summary["best_by_mean"])
     return summary
 
 
@@ -300,21 +324,40 @@ def _label(point: Point) -> str:
     return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 
-def _plot(path: pathlib.Path, points: Sequence[Point], final: np.ndarray) -> None:
-    """Plot every seed's final return and their mean, in a row for each point."""
+def _plot(
+    path: pathlib.Path,
+    points: Sequence[Point],
+    final: np.ndarray,
+    best: int | None,
+) -> None:
+    """Plot every seed's final return and their mean, in a row for each point.
+
+    Args:
+      path: the image file.
+      points: all points.
+      final: (points, seeds).
+      best: index of the best point by mean, which is marked; None if there is none.
+    """
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    size = (11.0, 1.4 + 0.35 * len(points))
+    names = {name for point in points for name in point}
+    varied = {x for x in names if len({point.get(x) for point in points}) > 1}
+    size = (8.0, 1.4 + 0.35 * len(points))
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     for row in range(len(points)):
         axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
-        axes.plot(final[row].mean(), row, "|", color="#0072B2", markersize=14)
-    labels = [_label(point) for point in points]
+        color = "#D55E00" if row == best else "#0072B2"
+        axes.plot(final[row].mean(), row, "|", color=color, markersize=14, mew=2)
+    short = [{x: point[x] for x in point if x in varied} for point in points]
+    labels = [_label(point) or "the sweep's own values" for point in short]
     axes.set_yticks(range(len(points)), labels, fontsize=8)
-    axes.set(xlabel="final return (each seed; the bar is their mean)")
+    if best is not None:
+        axes.get_yticklabels()[best].set(color="#D55E00", weight="bold")
+    axes.set(xlabel=f"final return: {final.shape[1]} seeds, the bar is their mean")
+    axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)
     plt.close(figure)

@@ -84,6 +84,10 @@ def test_runs_are_drawn(tmp_path, capsys):
     assert "error: out is /proc/nowhere/figure.png" in capsys.readouterr().err
     assert plot.main([*folders, "--out", str(tmp_path / "new" / "er" / "x.svg")]) == 0
     capsys.readouterr()
+    # A label is no formula.
+    label = ("--labels", r"$\frac$", "others")
+    assert plot.main([*folders, "--out", str(tmp_path / "label.svg"), *label]) == 0
+    assert r"$\frac$" in capsys.readouterr().out
     curves = plot.read(tmp_path / "ppo")
     assert curves.returns.shape == (3, 8) and curves.env_steps[-1] == 2048
 

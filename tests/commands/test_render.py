@@ -132,6 +132,7 @@ def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
         (["--out", str(tmp_path / "there.gif")], "which exists"),
         (["--seed", "9"], "seed is 9: the run has 0 to 1"),
         (["--steps", "0"], "steps is 0"),
+        (["--width", "99999999"], "width is 99999999: it must be from 1 to 4096"),
         (["--key", "-1"], "key is -1: it must be from 0 to 4294967295"),
         (["--out", "/proc/nowhere/film.gif"], "out is /proc/nowhere/film.gif"),
         (["--out", "/proc/film.png"], "out is /proc/film.png, which can't be written"),

@@ -5,10 +5,16 @@ import json
 import resource
 import subprocess
 import sys
+import types
 
+import brax.envs
 import pytest
 
+import gasil_jax
+from gasil_envs import locomotion
+from gasil_jax.host import run_options
 from gasil_jax.run import main
+from gasil_jax.sweeps import assembly
 
 SMALL = (
     "--env",
@@ -127,8 +133,8 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
     [
         ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'?"),
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
-        ("--env hopper --seeds 0", "seeds is 0: it must be 1 or more"),
-        ("--env hopper --seeds 1e30", f"must be from 1 to {2**32}"),
+        ("--env hopper --seeds 0", "seeds is 0: it must be from 1 to"),
+        ("--env hopper --seeds 1e30", "must be from 1 to 1,048,576"),
         ("--env hopper --batch-steps 1000000007", "nearest that does is 1"),
         ("--env hopper --seeds two", "seeds is 'two': it must be a whole number"),
         ("--env hopper --devices 1.5", "devices is '1.5': it must be a whole number"),
@@ -176,3 +182,58 @@ def test_a_refusal_takes_less_than_five_seconds(tmp_path):
     assert result.stdout == "" and len(result.stderr.splitlines()) == 1
     assert "did you mean 'hopper'" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_run_in_which_no_episode_can_end_is_told(capsys):
+    env = gasil_jax.make_env("point_mass")
+    # 3 iterations of 16 steps in each environment; an episode has 50.
+    short = gasil_jax.Config(total_steps=40, num_envs=1, batch_steps=16)
+    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50), short])
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "no return will be known: each of 1 environments takes 48 steps" in line
+    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50)])
+    # Where episodes may end early, they may end within few steps.
+    monopod = types.SimpleNamespace(episode_length=1000)
+    monopod.unwrapped = monopod
+    assembly.tell_if_no_episode_ends(monopod, [short])
+    assert capsys.readouterr().err == ""
+    for name, task in locomotion.TASKS.items():
+        ends = locomotion.Locomotion.ends_early.fget(types.SimpleNamespace(task=task))
+        assert ends == (name not in ("halfcheetah", "swimmer")), name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "messages"),
+    [
+        ("--physics mujoco", ["physics is mujoco, to no effect: point_mass has none"]),
+        ("--solver mjx", ["solver is mjx, to no effect"]),
+        ("--integrator euler", ["integrator is euler, to no effect"]),
+        ("--agent ppo --alpha 0.7", ["alpha is 0.7, to no effect: agent 'ppo' does"]),
+        ("--seeds 2 --devices 8", ["devices is 8, of which 2 are used"]),
+        ("--seeds 2 --devices 2 --alpha 0.7", []),
+        ("--agent ppo --gamma 0.9", []),
+    ],
+)
+def test_an_option_without_effect_is_told(arguments, messages, capsys):
+    words = ["--env", "point_mass", *arguments.split()]
+    options = run_options.parse(run_options.Options, words, "gasil_jax.run")
+    run_options.check(options)
+    run_options.tell_without_effect(options, options.seeds)
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == len(messages)
+    assert all(message in line for message, line in zip(messages, lines, strict=True))
+
+
+def test_an_environment_that_brax_itself_breaks_is_refused(
+    tmp_path, monkeypatch, capsys
+):
+    class Broken:
+        action_size = 1
+        reset = step = staticmethod(lambda *arguments: {}["a_min"])
+
+    monkeypatch.setitem(brax.envs._envs, "broken", Broken)
+    out = tmp_path / "run"
+    assert main(["--env", "brax:broken", "--out", str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "env 'brax:broken' fails within Brax" in line and "KeyError: 'a_min'" in line
+    assert not out.exists()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
+from gymnasium.wrappers import TimeLimit
 
 import gasil_envs
 from gasil_envs import gymnasium_adapter
@@ -63,3 +64,53 @@ def test_a_batch_begins_anew_with_the_step_after_the_last():
             np.testing.assert_array_equal(reward, 0.0)
             assert (np.abs(observation[:, :2] - (0.0, -0.2)) <= 0.1 + 1e-6).all()
         assert info["true_reward"].shape == (3,)
+
+
+def episode(env, num_steps):
+    """The rewards given and earned, and whether it was truncated at its end alone."""
+    env.reset(seed=0)
+    given, earned, cut = 0.0, 0.0, []
+    for _ in range(num_steps):
+        _, reward, _, truncated, info = env.step(env.action_space.sample())
+        given, earned = given + reward, earned + info["true_reward"]
+        cut.append(np.all(truncated))
+    assert cut == [False] * (num_steps - 1) + [True]
+    return given, earned
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda **x: gymnasium.make("gasil_envs/point_mass", max_episode_steps=30, **x),
+        lambda **x: TimeLimit(gymnasium_adapter.GymnasiumEnv("point_mass", **x), 30),
+        lambda **x: gymnasium_adapter.GymnasiumEnv(
+            "point_mass", max_episode_steps=30, **x
+        ),
+        lambda **x: gymnasium.make_vec(
+            "gasil_envs/point_mass", num_envs=2, max_episode_steps=30, **x
+        ),
+    ],
+)
+def test_no_reward_is_lost_where_a_limit_cuts_the_episode(make):
+    given, earned = episode(make(reward_delay=20), 30)
+    np.testing.assert_allclose(given, earned, rtol=1e-5)
+    assert np.all(earned != 0.0)
+
+
+def test_a_limit_above_the_environments_own_is_refused():
+    for wrong in (51, 0, "5"):
+        with pytest.raises(ValueError, match="whole number from 1 to 50"):
+            gasil_envs.make("point_mass", max_episode_steps=wrong)
+
+
+def test_pictures_show_the_episode():
+    env = gymnasium.make("gasil_envs/point_mass", render_mode="rgb_array", width=200)
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (360, 200, 3) and first.dtype == np.uint8
+    for _ in range(5):
+        env.step(np.ones(2, np.float32))
+    assert np.abs(env.render().astype(int) - first).max() > 50
+    assert env.metadata["render_fps"] == 10
+    with pytest.raises(ValueError, match="it must be 'rgb_array'"):
+        gymnasium_adapter.GymnasiumEnv("point_mass", render_mode="ansi")

@@ -1,15 +1,83 @@
-"""Smoothing against a plain loop."""
+"""The parts that curves are drawn of, and what the figures say and show."""
 
 import numpy as np
+import pytest
 
-from gasil_jax.figures import plotting
+from gasil_jax import plot
+from gasil_jax.figures import plotting, statistics
+from gasil_jax.sweeps import tables
 
 
-def test_smooth_is_the_mean_of_the_last_that_are_there():
-    curves = np.array([[np.nan, 1.0, 2.0, np.nan, np.nan, np.nan, 6.0, 4.0], range(8)])
-    smoothed = plotting.smooth(curves, 3)
-    for curve, result in zip(curves, smoothed, strict=True):
-        for i, value in enumerate(result):
-            seen = [x for x in curve[max(0, i - 2) : i + 1] if not np.isnan(x)]
-            expected = np.mean(seen) if seen else np.nan
-            np.testing.assert_allclose(value, expected, atol=1e-12)
+def test_parts_are_means_where_every_seed_has_ended_an_episode():
+    steps = np.arange(1, 101) * 10
+    returns = np.stack([np.arange(100.0), np.ones(100)])
+    returns[0, :3], returns[1, 4] = np.nan, np.nan
+    ends, means = plotting.in_parts(steps, returns)
+    # Fifty parts of two iterations each, the first without the first seed.
+    np.testing.assert_array_equal(ends, np.arange(40, 1001, 20))
+    np.testing.assert_array_equal(means[0], [3.0, *np.arange(4.5, 100, 2)])
+    np.testing.assert_array_equal(means[1], 1.0)
+    ends, means = plotting.in_parts(steps, np.full((2, 100), np.nan))
+    assert ends.shape == (0,) and means.shape == (2, 0)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    kept = []
+    monkeypatch.setattr(plotting, "save", lambda figure, *_, **__: kept.append(figure))
+    return kept
+
+
+def made_up(env, label, num_seeds, scale):
+    draw = np.random.default_rng(num_seeds).normal
+    steps = np.linspace(2e4, 1e6, 50)
+    returns = scale * (steps / 1e6 + draw(scale=0.1, size=(num_seeds, 50)))
+    return plot.Curves(env, f"{env}, {label}", steps, returns, returns[:, -1], None)
+
+
+def test_each_environment_has_titled_panels(figures, tmp_path):
+    runs = [made_up("hopper", x, 5, 3000.0) for x in ("ppo", "ppo+gasil")]
+    plot.draw([*runs, made_up("swimmer", "ppo", 4, 90.0)], tmp_path / "x.png")
+    (figure,) = figures
+    assert "interquartile mean over 4 or 5 seeds, shaded its 95% interval" in (
+        figure.get_supxlabel()
+    )
+    hopper, swimmer = figure.axes[:3], figure.axes[3:]
+    assert [axes[0].get_title() for axes in (hopper, swimmer)] == ["hopper", "swimmer"]
+    assert hopper[0].get_lines()[0].get_xdata().max() == 1.0
+    for axes in (hopper[0], hopper[2]):
+        labels = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert labels == ["ppo", "ppo+gasil"]
+    # A single run needs no legend.
+    assert all(axes.get_legend() is None for axes in swimmer)
+    for axes, drawn in ((hopper[1], runs), (swimmer[1], [])):
+        low, high = axes.get_xlim()
+        assert all(low < x.final.min() and x.final.max() < high for x in drawn)
+
+
+def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
+    run = made_up("hopper", "ppo", 5, 3000.0)
+    plotting.learning_curve(tmp_path / "x.png", run.env_steps, run.returns, "hopper")
+    (figure,) = figures
+    *seeds, middle = figure.axes[0].get_lines()
+    assert len(seeds) == 5
+    expected = statistics.interquartile_mean(run.returns, axis=0)
+    np.testing.assert_allclose(middle.get_ydata(), expected)
+    assert "over 5 seeds" in figure.get_supxlabel()
+    # Nothing to draw is no error.
+    nothing = np.full((2, 50), np.nan)
+    plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, "hopper")
+
+
+def test_a_sweeps_labels_are_what_varies(monkeypatch, tmp_path):
+    import matplotlib.figure
+
+    kept = []
+    monkeypatch.setattr(
+        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
+    )
+    points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0)]
+    tables._plot(tmp_path / "x.png", points, np.array([[1.0, 2.0], [3.0, 4.0]]), 1)
+    labels = kept[0].axes[0].get_yticklabels()
+    assert [label.get_text() for label in labels] == ["alpha=0.1", "alpha=1"]
+    assert [label.get_weight() for label in labels] == ["normal", "bold"]

@@ -15,9 +15,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gasil_jax
-from gasil_jax import evaluate, run
+from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import validate
-from gasil_jax.host import run_folder
+from gasil_jax.errors import InputError
+from gasil_jax.host import output_file, run_folder
 from gasil_jax.host.environments import Settings, check
 from gasil_jax.imitation import expert
 
@@ -27,8 +28,8 @@ def names(kind):
     return [
         f.name
         for f in dataclasses.fields(kind)
-        if f.name not in ("agent", "expert", "hyperparameters", "physics", "solver")
-        and f.name != "integrator"
+        if not isinstance(f.default, str)
+        and f.name not in ("expert", "hyperparameters")
     ]
 
 
@@ -142,6 +143,45 @@ def test_a_refused_configuration_names_its_field(config):
     accepted(config)
 
 
+def schedules_at_fault():
+    yield from (3, None, "a", [(0.0, 1.0)], ((1,),), ((0, True),), ((0, 2**2000),))
+    yield from (lambda s: s * math.nan, lambda s: -1.0, lambda s: None, lambda: 1.0)
+    yield lambda s: np.ones(3)
+
+
+WRONG = [
+    *[("gamma", x) for x in (None, [1], True, 1j, math.nan, 2**2000, {})],
+    *[("agent", x) for x in (3, None, [], "")],
+    *[("hidden_sizes", x) for x in (3, (2**62,), [3], ("a",), (None,), (True,))],
+    *[
+        (name, x)
+        for name in ("num_envs", "total_steps", "buffer_steps", "max_episode_steps")
+        for x in (2**62, 2**2000, True, 1.0, "3", [], 0, math.nan)
+    ],
+    *[("alpha_schedule", x) for x in schedules_at_fault()],
+    ("alpha", 1e300),
+    ("expert", 3),
+    ("normalize_rewards", 1),
+    ("hyperparameters", 3),
+]
+
+
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_a_value_of_any_type_is_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=name) as refusal:
+        validate(gasil_jax.Config().replace(**{name: value}), gasil_jax.agents())
+    assert "\n" not in str(refusal.value)
+
+
+def test_traced_values_pass_unlooked_at():
+    def check(gamma):
+        config = gasil_jax.Config().replace(gamma=gamma, alpha_schedule=lambda s: gamma)
+        validate(config, gasil_jax.agents())
+        return gamma
+
+    jax.eval_shape(check, -1.0)
+
+
 @settings(
     max_examples=3,
     deadline=None,
@@ -244,6 +284,19 @@ GOOD = {
         json.dumps(GOOD | {"settings": {"gravity": 3}}),
         json.dumps(GOOD | {"config": {"hyperparameters": {"alpa": 1}}}),
         json.dumps(GOOD | {"config": {"hyperparameters": {}, "agnt": "ppo"}}),
+        json.dumps(GOOD | {"config": {"hyperparameters": {"alpha": "high"}}}),
+        json.dumps(GOOD | {"config": {"hyperparameters": {"alpha": -1}}}),
+        json.dumps(GOOD | {"config": {"hidden_sizes": {"a": 1}}}),
+        json.dumps(GOOD | {"config": {"alpha_schedule": 3}}),
+        json.dumps(GOOD | {"settings": {"obs_noise": "loud"}}),
+        json.dumps(GOOD | {"settings": []}),
+        json.dumps(GOOD | {"env": None}),
+        json.dumps(GOOD | {"seeds": 2**40}),
+        json.dumps(GOOD | {"first_seed": -1}),
+        json.dumps(GOOD | {"keep_checkpoints": "all"}),
+        json.dumps(GOOD | {"log": "wandb"}),
+        json.dumps(GOOD | {"points": [3]}),
+        "[" * 100_000,
     ],
 )
 def test_a_foreign_run_folder_is_refused(content, tmp_path, capsys):
@@ -268,3 +321,37 @@ def test_a_run_folder_of_another_state_is_refused(tmp_path, capsys):
     assert evaluate.main([str(tmp_path)]) == 2
     assert "holds another state" in capsys.readouterr().err
     assert run_folder.read(tmp_path)["env"] == "point_mass"
+
+
+@pytest.mark.parametrize(
+    ("point", "summary", "message"),
+    [
+        ({"alpha": 1.0}, {"best_by_mean": "first"}, "best_by_mean is 'first': it must"),
+        ({"alpha": 1.0}, {}, "best_by_mean is missing"),
+        ({"alpha": 1.0}, [], "it is []: it must be an object"),
+        ({"alhpa": 1.0}, {"best_by_mean": 0}, "points: 'alhpa' can't vary"),
+        ({"batch_steps": 0}, {"best_by_mean": 0}, "points: batch_steps is 0"),
+    ],
+)
+def test_a_foreign_sweep_folder_is_refused(point, summary, message, tmp_path, capsys):
+    (tmp_path / "config.json").write_text(json.dumps(GOOD | {"points": [point]}))
+    (tmp_path / "summary.json").write_text(json.dumps(summary))
+    assert evaluate.main([str(tmp_path)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert message in line
+
+
+def test_a_file_name_that_is_too_long_is_refused(tmp_path, capsys):
+    for main, arguments in (
+        (run.main, ["--env", "point_mass", "--out", 300 * "x"]),
+        (run.main, ["--resume", "--out", 300 * "x"]),
+        (sweep.main, ["--env", "point_mass", "--out", 300 * "x", "--shard", "1/2"]),
+        (merge.main, [300 * "x"]),
+    ):
+        assert main(arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert "too long" in line and "xxx" in line
+    with pytest.raises(InputError, match="too long"):
+        # A file is first written under a name that is longer by some 40 bytes.
+        output_file.make_parent(tmp_path / f"{'x' * 240}.gif")
+    assert list(tmp_path.iterdir()) == []

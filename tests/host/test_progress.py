@@ -1,10 +1,13 @@
 """What a run says that it is doing, where there is no terminal."""
 
+import functools
+import io
 import threading
 import time
 
 import numpy as np
 import pytest
+import rich.console
 
 from gasil_jax.host import progress
 
@@ -51,4 +54,34 @@ def test_what_is_done_aside_does_not_count_in_the_speed(monkeypatch, capsys):
         shown.update(2000, np.array([[3.0, np.nan]]))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "hopper ppo: training"
-    assert "2,000/2,000 steps, return 3.0 ± 0.0, 100 steps/s, 0 s left" in lines[1]
+    assert lines[1] == (
+        "hopper ppo: 2,000/2,000 steps, return 3.0 ± 0.0, 100 steps/s, 0:00:00 left"
+    )
+
+
+def test_steps_are_of_a_seed(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", -1.0)
+    with progress.Progress("hopper ppo", 10 * 30_000, 10) as shown:
+        shown.update(10 * 15_360, np.full((10, 2), np.nan))
+        shown.update(10 * 30_720, np.full((10, 2), 4.0))
+    half, end = capsys.readouterr().err.splitlines()
+    assert half.startswith("hopper ppo: 15,360/30,000 steps x 10 seeds, return (none")
+    assert end.startswith("hopper ppo: 30,000/30,000 steps x 10 seeds, return 4.0 ± 0")
+
+
+def test_at_80_columns_only_the_bar_gives_way(monkeypatch):
+    shown, clock = io.StringIO(), [0.0]
+    console = functools.partial(
+        rich.console.Console, file=shown, force_terminal=True, width=80, no_color=True
+    )
+    monkeypatch.setattr(progress, "Console", lambda stderr: console())
+    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
+    with progress.Progress("halfcheetah ppo+gasil sweep", 10**9, 100) as bar:
+        bar.phase("training")
+        clock[0] += 1000.0
+        bar.update(10**8, np.array([[-12345.6], [12345.6]]))
+    lines = shown.getvalue().splitlines()
+    assert "halfcheetah ppo+gasil sweep: 10,000,000 steps x 100 seeds" in lines[0]
+    (last,) = [line for line in lines[-2:] if "%" in line]
+    assert " 10% " in last and "━" in last
+    assert "return 0.0 ± 12345.6, 100,000 steps/s, 2:30:00 left" in last

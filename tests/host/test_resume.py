@@ -243,18 +243,43 @@ def delete_the_manifest(folder):
     (folder / "manifest.json").unlink()
 
 
+def edit_the_manifest(**changes):
+    def damage(folder):
+        path = folder / "manifest.json"
+        manifest = json.loads(path.read_text())
+        record = manifest["record"] | changes.pop("record", {})
+        path.write_text(json.dumps(manifest | {"record": record} | changes))
+
+    return damage
+
+
 @pytest.mark.parametrize(
-    "damage", [truncate, flip_a_bit, delete_a_file, delete_the_manifest]
+    "damage",
+    [
+        truncate,
+        flip_a_bit,
+        delete_a_file,
+        delete_the_manifest,
+        edit_the_manifest(files=[]),
+        edit_the_manifest(files={"state": 3}),
+        edit_the_manifest(record={"score": "high"}),
+        edit_the_manifest(record={"metrics_size": "12"}),
+        edit_the_manifest(record={"metrics_size": -1}),
+        lambda folder: (folder / "manifest.json").write_text("[" * 100_000),
+        lambda folder: (folder / "manifest.json").write_text("3"),
+    ],
 )
 def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_path):
     root = tmp_path / "checkpoints"
     states = [{"x": np.full(1000, float(i), np.float32)} for i in range(3)]
     for i, state in enumerate(states):
-        checkpoint.write(root, i, state, {"score": None})
+        checkpoint.write(root, i, state, {"score": float(i), "metrics_size": 5})
     damage(root / "00000002")
+    assert checkpoint.best(root).iteration == 1
     newest, damages = checkpoint.latest(root)
     assert newest.iteration == 1
     assert len(damages) == 1 and "00000002 is damaged" in damages[0]
+    assert checkpoint.latest(root, ["evaluations_size"])[0] is None
     np.testing.assert_array_equal(newest.restore(states[1])["x"], states[1]["x"])
     # Written again, it is whole.
     checkpoint.write(root, 2, states[2], {"score": None})

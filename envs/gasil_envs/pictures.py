@@ -1,0 +1,123 @@
+"""Draw moments of an episode: MuJoCo draws locomotion, Matplotlib the point mass."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import mujoco
+import numpy as np
+from brax.envs import Env
+
+from gasil_envs.locomotion import Locomotion
+from gasil_envs.point_mass import PointMass
+
+
+class NoOpenGL(RuntimeError):
+    """There is no OpenGL for MuJoCo to draw with."""
+
+
+class LocomotionPainter:
+    """Draws states of locomotion off screen; close it after use.
+
+    Args:
+      env: the task, without wrappers.
+      size: width and height of a picture in pixels.
+
+    Raises:
+      NoOpenGL: if MuJoCo finds no OpenGL.
+    """
+
+    def __init__(self, env: Locomotion, size: tuple[int, int]):
+        self._model = model = env.model
+        self.seconds_per_step = env.dt
+        model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
+        model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
+        self._data = mujoco.MjData(model)
+        try:
+            self._renderer = mujoco.Renderer(model, size[1], size[0])
+        # The GL library's own errors are of many types.
+        except Exception as error:
+            raise NoOpenGL(
+                f"no OpenGL for MuJoCo to draw with ({error}): install libegl1 or "
+                "libosmesa6, and set MUJOCO_GL to egl or osmesa"
+            ) from None
+
+    def draw(self, episode: Sequence[Any]) -> np.ndarray:
+        """Return a picture of the last physics state, uint8 (height, width, 3)."""
+        physics = episode[-1].physics
+        self._data.qpos[:], self._data.qvel[:] = physics.qpos, physics.qvel
+        mujoco.mj_forward(self._model, self._data)
+        self._renderer.update_scene(self._data, 0 if self._model.ncam else -1)
+        return self._renderer.render().copy()
+
+    def close(self) -> None:
+        """Free the OpenGL context."""
+        self._renderer.close()
+
+
+class PointMassPainter:
+    """Draws the point mass, its objects and its path.
+
+    Args:
+      env: the point mass, without wrappers.
+      size: width and height of a picture in pixels.
+    """
+
+    seconds_per_step = 0.1
+
+    def __init__(self, env: PointMass, size: tuple[int, int]):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self._layout = env.layout
+        figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+        self._canvas = FigureCanvasAgg(figure)
+        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    def draw(self, episode: Sequence[Any]) -> np.ndarray:
+        """Return a picture of the path so far, uint8 (height, width, 3)."""
+        positions = np.stack([state.position for state in episode])
+        axes = self._axes
+        axes.clear()
+        point_mass_layout(axes, self._layout, episode[-1].collected)
+        axes.plot(*positions.T, color="0.3", linewidth=1)
+        axes.plot(*positions[-1], "o", color="black", markersize=6)
+        axes.set(xticks=[], yticks=[])
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to free."""
+
+
+def painter(env: Env, size: tuple[int, int]) -> LocomotionPainter | PointMassPainter:
+    """Return what draws an environment, wrapped or not.
+
+    Raises:
+      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
+      ValueError: if it is not one of our own environments.
+    """
+    if isinstance(env.unwrapped, Locomotion):
+        return LocomotionPainter(env.unwrapped, size)
+    if isinstance(env.unwrapped, PointMass):
+        return PointMassPainter(env.unwrapped, size)
+    raise ValueError(f"{type(env.unwrapped).__name__} can't be drawn")
+
+
+def point_mass_layout(axes: Any, layout: Any, collected: np.ndarray) -> None:
+    """Draw the point mass' box and objects; `collected` ones, (objects,), are pale."""
+    from matplotlib.patches import Circle, Rectangle
+
+    kinds = (
+        (layout.blue, "#0072B2", layout.blue_reward),
+        (layout.green, "#009E73", layout.green_reward),
+        (layout.orange, "#E69F00", layout.orange_reward),
+    )
+    objects = [(x, y, c, r) for centres, c, r in kinds for x, y in centres]
+    for (x, y, color, reward), taken in zip(objects, collected, strict=True):
+        alpha = 0.12 if taken else 0.6
+        axes.add_patch(Circle((x, y), layout.radius, color=color, alpha=alpha))
+        axes.text(x, y, f"{reward:+g}", ha="center", va="center", fontsize=9)
+    (x, y), spread = layout.start, layout.start_spread
+    corner = (x - spread, y - spread)
+    axes.add_patch(Rectangle(corner, 2 * spread, 2 * spread, color="0.85", zorder=0))
+    axes.set(xlim=(-1, 1), ylim=(-1, 1), aspect="equal")

@@ -1,0 +1,118 @@
+"""Read a JSON file as a type: the one reader of the JSON files in a run folder."""
+
+import dataclasses
+import json
+import math
+import pathlib
+import types
+import typing
+from collections.abc import Callable
+from typing import Any, get_args, get_origin, get_type_hints
+
+from gasil_jax.errors import InputError
+
+_WORDS = {
+    str: "a text",
+    int: "a whole number, 0 or more",
+    float: "a finite number",
+    bool: "true or false",
+    types.NoneType: "null",
+}
+
+
+def read(path: pathlib.Path, kind: Any) -> Any:
+    """Return the content of a JSON file, whose values are of the kinds that are given.
+
+    Args:
+      path: the file.
+      kind: a dataclass, of which an instance is returned; a `TypedDict`, whose other
+        names are returned unchecked; a type of JSON, where a whole number is 0 or more
+        and a number finite; or a tuple, a dict or a union of these. Tuples are lists
+        in the file. A value of `Any` is not checked, but its lists become tuples.
+
+    Raises:
+      InputError: if the content is something else; the message names the field.
+      OSError: if there is no such file.
+    """
+    try:
+        return _as(kind, json.loads(path.read_text()), "")
+    # Deeply nested brackets are a RecursionError.
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path} is damaged or of another program: {error}") from None
+
+
+def _as(kind: Any, value: Any, name: str) -> Any:
+    """Return a value as a kind.
+
+    Raises:
+      InputError: if it is something else; the message names it.
+    """
+    origin, arguments = get_origin(kind), get_args(kind)
+    if kind is Any:
+        return _with_tuples(value)
+    if origin in (typing.Union, types.UnionType):
+        for option in arguments:
+            try:
+                return _as(option, value, name)
+            except InputError:
+                if isinstance(value, list | dict):
+                    raise
+    elif origin is dict and isinstance(value, dict):
+        return {key: _as(arguments[1], x, _join(name, key)) for key, x in value.items()}
+    elif origin is tuple and isinstance(value, list):
+        kinds = arguments
+        if len(arguments) == 2 and arguments[1] is ...:
+            kinds = arguments[:1] * len(value)
+        if len(value) == len(kinds):
+            return tuple(_as(one, x, name) for one, x in zip(kinds, value))
+    elif isinstance(value, dict):
+        if dataclasses.is_dataclass(kind):
+            return _with_fields(kind, value, name)
+        if typing.is_typeddict(kind):
+            hints = get_type_hints(kind)
+            if missing := sorted(kind.__required_keys__ - set(value)):
+                raise InputError(f"{_join(name, missing[0])} is missing")
+            of = lambda key: hints.get(key, Any)
+            return {key: _as(of(key), x, _join(name, key)) for key, x in value.items()}
+    elif kind in _WORDS and _is_plain(kind, value):
+        return value
+    raise InputError(f"{name or 'it'} is {value!r}: it must be {_in_words(kind)}")
+
+
+def _with_fields(kind: Any, value: dict[str, Any], name: str) -> Any:
+    """Return an instance of a dataclass; fields that are missing have their default."""
+    hints = get_type_hints(kind)
+    for key in value:
+        if key not in hints:
+            raise InputError(f"{_join(name, key)} is unknown")
+    return kind(**{key: _as(hints[key], x, key) for key, x in value.items()})
+
+
+def _is_plain(kind: Any, value: Any) -> bool:
+    if kind is float:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        # A whole number may be too large for `isfinite`.
+        return number and abs(value) < math.inf and value == value
+    if kind is int:
+        return type(value) is int and value >= 0
+    return type(value) is kind
+
+
+def _in_words(kind: Any) -> str:
+    arguments = get_args(kind)
+    if get_origin(kind) in (typing.Union, types.UnionType):
+        return " or ".join(
+            _in_words(one) for one in arguments if get_origin(one) is not Callable
+        )
+    if get_origin(kind) is tuple:
+        return "a list"
+    return _WORDS.get(kind, "an object")
+
+
+def _join(name: str, key: str) -> str:
+    return f"{name}.{key}" if name else key
+
+
+def _with_tuples(value: Any) -> Any:
+    # JSON has no tuples, but a config must be hashable.
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value

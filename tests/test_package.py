@@ -1,0 +1,86 @@
+"""The package as it is installed: its wheel, its commands and its version."""
+
+import importlib.metadata
+import importlib.util
+import os
+import pathlib
+import shutil
+import subprocess
+import sys
+import zipfile
+
+import pytest
+
+import gasil_jax
+from gasil_jax import __main__ as package
+
+ROOT = pathlib.Path(__file__).parent.parent
+#: What only an extra installs, by the names of the modules.
+EXTRAS = (
+    "gymnax imageio_ffmpeg minari mkdocs optuna ray stable_baselines3 tensorboardX "
+    "wandb pytest hypothesis"
+).split()
+_RUN = """
+import sys
+sys.modules.update(dict.fromkeys({extras}))
+import gasil_jax.run
+assert gasil_jax.__file__.startswith({site!r}), gasil_jax.__file__
+sys.exit(gasil_jax.run.main({arguments}))
+"""
+
+
+def test_the_commands_are_listed(capsys):
+    assert package.main([]) == 0
+    printed = capsys.readouterr().out
+    for command in package.COMMANDS:
+        assert importlib.util.find_spec(f"gasil_jax.{command}")
+        (line,) = [x for x in printed.splitlines() if f"gasil_jax.{command} " in x]
+        assert len(line.split()) > 4, line
+    assert package.main(["--version"]) == 0
+    assert capsys.readouterr().out == f"{gasil_jax.__version__}\n"
+    assert package.main(["evalute"]) == 2
+    assert "did you mean python -m gasil_jax.evaluate?" in capsys.readouterr().err
+
+
+def test_the_wheel_alone_trains(tmp_path):
+    major = int(importlib.metadata.version("setuptools").partition(".")[0])
+    if major < 77:
+        pytest.skip(f"setuptools is {major}: the wheel is built with 77 or later")
+    source, site = tmp_path / "source", tmp_path / "site"
+    source.mkdir()
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    for name in ("gasil_jax", "envs"):
+        ignored = shutil.ignore_patterns("__pycache__", "*.egg-info")
+        shutil.copytree(ROOT / name, source / name, ignore=ignored)
+    build = "from setuptools import build_meta; build_meta.build_wheel('.')"
+    subprocess.run(
+        [sys.executable, "-c", build], cwd=source, check=True, capture_output=True
+    )
+    (wheel,) = source.glob("*.whl")
+    assert gasil_jax.__version__ in wheel.name
+    zipfile.ZipFile(wheel).extractall(site)
+
+    arguments = (
+        "--env point_mass --agent ppo --total-steps 64 --batch-steps 64 --num-envs 4 "
+        "--num-epochs 1 --hidden-sizes 4 --out run"
+    ).split()
+    program = _RUN.format(extras=EXTRAS, site=str(site), arguments=arguments)
+    environment = os.environ | {
+        "PYTHONPATH": str(site),
+        "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    }
+    result = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert result.returncode == 0, result.stderr
+    # Nothing that is imported prints.
+    (line,) = result.stdout.splitlines()
+    assert line.startswith("final return")
+    assert all(x.startswith(("point_mass", "note")) for x in result.stderr.splitlines())
+    assert (tmp_path / "run" / "policy.npz").is_file()
