@@ -33,7 +33,7 @@ from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, metrics_files, output_file
 from gasil_jax.host.environments import Settings, available_cores, prepare
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 VARIANTS = {
     "mjx": {"solver": "mjx"},
@@ -198,7 +198,7 @@ def training_row(
     config = config.replace(num_envs=options.training_envs or config.num_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    members = make_batch(env, config, range(seeds), devices=devices)
+    members = make_members(env, config, range(seeds), devices=devices)
     began = time.perf_counter()
     states, advance = members.compile()
     compile_seconds = time.perf_counter() - began

@@ -35,7 +35,7 @@ from gasil_jax.host import (
 from gasil_jax.host import devices as host_devices
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 from gasil_jax.host.progress import Progress
 from gasil_jax.sweeps import shards
 
@@ -161,7 +161,7 @@ def train(program: Program, setup: Setup) -> dict[Run, Record]:
         resources.check_memory(env, run.config, count, jax.devices())
     seeds = [run.seed for run in program.runs]
     hyperparameters = [run.config.hyperparameters for run in program.runs]
-    members = make_batch(env, run.config, seeds, hyperparameters)
+    members = make_members(env, run.config, seeds, hyperparameters)
     folder = run_folder.create(program.folder(setup.runs), "")
     steps = run.config.num_iterations * run.config.batch_steps * count
     with (

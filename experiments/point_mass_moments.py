@@ -25,7 +25,7 @@ from experiments.store import RESULTS, Store
 from gasil_jax import normalization, policy
 from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, output_file
-from gasil_jax.host.members import make_batch, member
+from gasil_jax.host.members import make_members, member
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
@@ -58,7 +58,7 @@ class Options:
 
 def train(env: Any, config: gasil_jax.Config, moments: Sequence[float]) -> list[Any]:
     """The state of seed 0 at `moments`, in shares of training, increasing from 0."""
-    members = make_batch(env, config, [0])
+    members = make_members(env, config, [0])
     states, advance = members.compile()
     ends = [max(1, round(share * config.num_iterations)) for share in moments]
     kept = []

@@ -26,7 +26,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.host.members import Batch
+from gasil_jax.host.members import Members
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
 from gasil_jax.sweeps.points import Point, make_points
 from gasil_jax.sweeps.shards import Program
@@ -80,7 +80,7 @@ def train(
     """
     run_options.write_config(options, folder, points=points)
 
-    def on_finished(job: assembly.Job, members: Batch, outcome: Outcome) -> None:
+    def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
         tables.write_training(
             folder,
             job.program,

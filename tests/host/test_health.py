@@ -10,7 +10,7 @@ from brax.envs import State
 import gasil_jax
 from gasil_envs import wrappers
 from gasil_jax import config, run
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 SMALL = test_members.SMALL.replace(total_steps=4 * 128, buffer_steps=300)
 
@@ -22,16 +22,16 @@ def as_arrays(tree):
     return [np.asarray(plain(x)) for x in jax.tree.leaves(tree)]
 
 
-def train(runs, advance, states, iterations):
+def train(members, advance, states, iterations):
     collected = []
     for i in range(iterations):
-        states, metrics = runs.train(advance, states, i, 1)
+        states, metrics = members.train(advance, states, i, 1)
         collected.append(metrics)
     joined = {
         name: np.concatenate([m[name] for m in collected], axis=1)
         for name in collected[0]
     }
-    return runs.trim(states), joined
+    return members.trim(states), joined
 
 
 @pytest.mark.parametrize("agent", ["ppo+gasil", "ppo+sil"])
@@ -39,25 +39,25 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
     env = gasil_jax.make_env("point_mass", reward_delay=7)
     # An episode that is cut short has no return either.
     config = SMALL.replace(agent=agent, stagger_episodes=False)
-    runs = make_batch(env, config, [3, 4, 5, 6])
-    states, advance = runs.compile()
-    clean, clean_metrics = train(runs, advance, states, 3)
+    members = make_members(env, config, [3, 4, 5, 6])
+    states, advance = members.compile()
+    clean, clean_metrics = train(members, advance, states, 3)
 
-    states = jax.tree.map(np.asarray, runs.init().environments.state.pipeline_state)
+    states = jax.tree.map(np.asarray, members.init().environments.state.pipeline_state)
     hurt = jax.tree.map(
         lambda x: (
             x.at[1, 2].set(jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
         ),
         jax.tree.map(jnp.asarray, states),
     )
-    start = runs.init()
+    start = members.init()
     environments = start.environments
     start = start.replace(
         environments=environments.replace(
             state=environments.state.replace(pipeline_state=hurt)
         )
     )
-    after, metrics = train(runs, advance, jax.device_put(start, runs.sharding), 3)
+    after, metrics = train(members, advance, jax.device_put(start, members.sharding), 3)
 
     # One step of seed 4 is counted, and its episode is over with it.
     np.testing.assert_array_equal(metrics["faulty_steps"].sum(axis=1), [0, 1, 0, 0])
@@ -84,14 +84,14 @@ def test_an_update_that_is_not_finite_is_skipped_and_flagged():
     env = gasil_jax.make_env("point_mass")
     usual = config.Hyperparameters()
     wild = usual.replace(learning_rate=float("inf"))
-    runs = make_batch(env, SMALL, [3, 4, 5, 6], [usual, wild, usual, usual])
-    states, advance = runs.compile()
+    members = make_members(env, SMALL, [3, 4, 5, 6], [usual, wild, usual, usual])
+    states, advance = members.compile()
     before = as_arrays(states.actor_critic)
-    after, metrics = train(runs, advance, states, 2)
+    after, metrics = train(members, advance, states, 2)
     np.testing.assert_array_equal(metrics["skipped_updates"].sum(axis=1), [0, 2, 0, 0])
     for left, right in zip(as_arrays(after.actor_critic), before, strict=True):
         np.testing.assert_array_equal(left[1], right[1])
-    calm = make_batch(env, SMALL, [3, 4, 5, 6], [usual] * 4)
+    calm = make_members(env, SMALL, [3, 4, 5, 6], [usual] * 4)
     states, _ = calm.compile()
     expected, _ = train(calm, advance, states, 2)
     others = np.array([0, 2, 3])

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 
 import gasil_jax
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 SMALL = gasil_jax.Config(
     total_steps=256,
@@ -24,11 +24,11 @@ def test_a_seed_does_not_depend_on_the_number_of_devices():
     results = []
     # Three members on two devices: one is padding.
     for devices, seeds in ((1, [6]), (2, [5, 6, 7])):
-        runs = make_batch(env, config, seeds, devices=jax.devices()[:devices])
-        states, advance = runs.compile()
-        last, _ = runs.train(advance, states, 0, 1)
-        last, _ = runs.train(advance, last, 1, 1)
-        results.append(jax.tree.map(np.asarray, runs.trim(last).actor_critic.params))
+        members = make_members(env, config, seeds, devices=jax.devices()[:devices])
+        states, advance = members.compile()
+        last, _ = members.train(advance, states, 0, 1)
+        last, _ = members.train(advance, last, 1, 1)
+        results.append(jax.tree.map(np.asarray, members.trim(last).actor_critic.params))
     alone, two = results
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
     jax.tree.map(lambda a, b: close(a[1], b[0]), two, alone)

@@ -19,7 +19,7 @@ from gasil_jax import plot, run, sweep
 from gasil_jax.evaluation import evaluate as evaluate_directly
 from gasil_jax.figures import plotting, statistics
 from gasil_jax.host import checkpoint, trackers
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 from gasil_jax.host.periodic_evaluation import (
     EvaluationSchedule,
     PeriodicEvaluation,
@@ -285,14 +285,14 @@ def scored(tmp_path, seeds, devices, times=1):
     """Mean, least and greatest return of each seed's first policy, made to act."""
     env = gasil_jax.make_env("point_mass", reward_delay=7)
     config = test_members.SMALL.replace(agent="ppo")
-    runs = make_batch(env, config, seeds, devices=jax.devices()[:devices])
-    states = runs.init()
+    members = make_members(env, config, seeds, devices=jax.devices()[:devices])
+    states = members.init()
     # The first policies hardly move.
     params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
     states = states.replace(actor_critic=params)
     path = tmp_path / f"{devices}.csv"
     evaluation = PeriodicEvaluation(
-        runs, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
+        members, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
     )
     for _ in range(times):
         evaluation.score(states, 1)

@@ -10,7 +10,7 @@ from test_resume import SMALL, finish, rows, start, wait_for
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.host import resources
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 
 @pytest.mark.parametrize(
@@ -23,9 +23,9 @@ from gasil_jax.host.members import make_batch
 def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     env = gasil_jax.make_env("point_mass")
     config = gasil_jax.Config(agent=agent, **changes)
-    runs = make_batch(env, config, range(3), devices=jax.devices()[:1])
-    states = jax.eval_shape(runs.init)
-    account = runs.advance.lower(states, np.int32(0)).compile().memory_analysis()
+    members = make_members(env, config, range(3), devices=jax.devices()[:1])
+    states = jax.eval_shape(members.init)
+    account = members.advance.lower(states, np.int32(0)).compile().memory_analysis()
     total = account.temp_size_in_bytes + account.argument_size_in_bytes
     assert 0.5 < 3 * resources.need(env, config).memory / total < 2.0
 

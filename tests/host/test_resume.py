@@ -19,7 +19,7 @@ import test_members
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.host import checkpoint, run_folder
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 ITERATIONS = 400
 # PPO's state, which has the buffer too, compiles soonest; every agent's: below.
@@ -341,18 +341,18 @@ def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
         sil_buffer_steps=200,
         sil_minibatch_size=32,
     )
-    runs = make_batch(env, config, [3, 4, 5])
-    states, advance = runs.compile()
+    members = make_members(env, config, [3, 4, 5])
+    states, advance = members.compile()
     rest = []
-    states, _ = runs.train(advance, states, 0, 1)
-    states, _ = runs.train(advance, states, 1, 1)
-    checkpoint.write(tmp_path, 2, runs.trim(states), {})
+    states, _ = members.train(advance, states, 0, 1)
+    states, _ = members.train(advance, states, 1, 1)
+    checkpoint.write(tmp_path, 2, members.trim(states), {})
     newest, _ = checkpoint.latest(tmp_path)
-    like = jax.eval_shape(lambda: runs.trim(runs.init()))
-    for before in (states, runs.place(newest.restore(like))):
-        after, metrics = runs.train(advance, before, 2, 1)
-        after, more = runs.train(advance, after, 3, 1)
-        after = jax.tree.leaves(runs.trim(after))
+    like = jax.eval_shape(lambda: members.trim(members.init()))
+    for before in (states, members.to_devices(newest.restore(like))):
+        after, metrics = members.train(advance, before, 2, 1)
+        after, more = members.train(advance, after, 3, 1)
+        after = jax.tree.leaves(members.trim(after))
         rest.append(
             [
                 metrics,
