@@ -138,7 +138,7 @@ def shard_of(call):
     arguments = call[2:]
     options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
     shard = shards.parse(options.shard, "shard")
-    return shard.number, shard.count, str(options.out)
+    return shard.number, shard.count, str(options.out), options.resume
 
 
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
@@ -146,7 +146,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     shell, slurm = BASH[1:]
     *trained, merged = calls_of(shell, tmp_path)
     assert sorted(shard_of(call) for call in trained) == [
-        (number, 4, "OUT") for number in range(1, 5)
+        (number, 4, "OUT", False) for number in range(1, 5)
     ]
     assert merged == ["-m", "gasil_jax.merge", "OUT"]
 
@@ -155,7 +155,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
         (call,) = calls_of(
             slurm, tmp_path, SLURM_ARRAY_TASK_ID=index, SCRATCH="/a place"
         )
-        assert shard_of(call) == (index, last, "/a place/OUT")
+        assert shard_of(call) == (index, last, "/a place/OUT", True)
 
     yaml = pytest.importorskip("yaml")
     (text,) = re.findall(r"```yaml\n(.*?)```", SCALING, re.DOTALL)
@@ -165,7 +165,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     (script,) = container["args"]
     for index in (0, job["completions"] - 1):
         (call,) = calls_of(script, tmp_path, JOB_COMPLETION_INDEX=index)
-        assert shard_of(call) == (index + 1, job["completions"], "/results/OUT")
+        assert shard_of(call) == (index + 1, job["completions"], "/results/OUT", True)
 
 
 def as_toy(line, finished, locomotion, folder):

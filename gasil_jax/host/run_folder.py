@@ -121,10 +121,10 @@ def refuse_used(folder: pathlib.Path) -> None:
     """
     names = (path.name for path in folder.iterdir())
     if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
-        raise InputError(
-            f"out is {folder}, which is not empty: name a new or an empty folder, or "
-            "go on with what is there with --resume"
-        )
+        message = f"out is {folder}, which is not empty: name a new or an empty folder"
+        if is_described(folder):
+            message += ", or continue the run in it with --resume"
+        raise InputError(message)
 
 
 def is_described(folder: pathlib.Path) -> bool:
@@ -153,9 +153,10 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         described = _tuples_in(content)
         described["config"] = Config(**fields)
         described["settings"] = Settings(**content["settings"])
-        if "points" in described:  # A sweep, which may be older than the option.
-            described.setdefault("share_counts", False)
-        for name, kind in (("env", str), ("seeds", int), ("first_seed", int)):
+        kinds = {"env": str, "seeds": int, "first_seed": int}
+        if "points" in described:
+            kinds["share_counts"] = bool
+        for name, kind in kinds.items():
             if type(described[name]) is not kind:
                 raise TypeError(f"{name} is {described[name]!r}")
     except OSError:

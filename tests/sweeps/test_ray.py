@@ -76,7 +76,8 @@ def test_a_killed_workers_shard_goes_on_from_its_checkpoint(cluster, tmp_path):
     assert len(beside) <= 1
     arguments[arguments.index("ray")] = "local"
     before = {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")}
-    assert sweep.main([*arguments, "--out", str(out)]) == 0
+    assert sweep.main([*arguments, "--out", str(out)]) == 2
+    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 0
     assert {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")} == before
 
 
@@ -86,5 +87,5 @@ def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
     (out / "shards").mkdir(parents=True)
     (out / "shards" / "1-of-1").touch()
     arguments = [*SMALL, "--grid", "alpha=1", "--launcher", "ray", "--shards", "1"]
-    assert sweep.main([*arguments, "--out", str(out)]) == 1
+    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 1
     assert "shard 1/1 (status 2) failed" in capsys.readouterr().err

@@ -209,15 +209,16 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
 
     # A half of the points has a program for itself, of the same shapes.
     parts = tmp_path / "parts"
-    part = lambda number: sweep.main(
-        [*SMALL, "--seeds", "2", *grid, "--out", str(parts), "--shard", f"{number}/2"]
+    where = ("--out", str(parts), "--shard")
+    part = lambda number, *more: sweep.main(
+        [*SMALL, "--seeds", "2", *grid, *where, f"{number}/2", *more]
     )
     assert part(2) == 0
     assert merge.main([str(parts)]) == 2
     assert "missing: shards 1/2" in capsys.readouterr().err
     assert part(1) == 0
     before = {p: p.stat().st_mtime_ns for p in parts.rglob("*")}
-    assert part(1) == 0
+    assert part(1, "--resume") == 0
     assert "shard 1/2 is done" in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in parts.rglob("*")} == before
     assert merge.main([str(parts)]) == 0
@@ -252,12 +253,6 @@ def test_a_sweep_goes_on_with_its_own_points_wherever_they_are_listed(tmp_path, 
     options = run_options.parse(sweep.Options, [*arguments, str(copy)], "x", out)
     assert sweep.plan(options)[0] == points
     sweep.check_points(points, out)
-
-    # A folder of before an option that is off by default can still go on.
-    content = json.loads((out / "config.json").read_text())
-    del content["share_counts"]
-    (out / "config.json").write_text(json.dumps(content))
-    assert not run_options.parse(sweep.Options, arguments[:-1], "x", out).share_counts
 
 
 def test_an_interrupted_sweep_goes_on(tmp_path):
