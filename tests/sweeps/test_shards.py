@@ -1,4 +1,4 @@
-"""Shards of a sweep: each member in one of them, and one table out of all."""
+"""Shards of a sweep hold each member once, and merge into the same tables."""
 
 import json
 import shutil
@@ -71,7 +71,7 @@ GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
 
 
 def train(folder, shard=None, *arguments):
-    """What training leaves, with made-up metrics that are a member's own."""
+    """Write the files of a trained sweep, with metrics that tell members apart."""
     small = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
     small += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
     options = command_line.parse(
@@ -118,7 +118,7 @@ TABLES = ("results.csv", "curves.npz", "sweep.png")
 
 @pytest.mark.parametrize("count", [1, 5, 12])
 def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
-    """Five of twelve members: points are cut through, and programs."""
+    """Five shards of twelve members divide points and programs."""
     trained, points = train(tmp_path / "whole")
     expected = tables.write(tmp_path / "whole", points, range(3), [trained])
     assert expected["points"][1]["mean"] is None  # never ended
@@ -143,7 +143,7 @@ def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
         assert described["shard"] is None and described["points"] == tuple(points)
 
 
-def test_what_does_not_belong_together_is_not_merged(tmp_path, capsys):
+def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     def refused(*arguments):
         assert merge.main([str(x) for x in arguments]) == 2
         error = capsys.readouterr().err
@@ -286,7 +286,7 @@ def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """A module whose first argument names a folder, and the second what happens."""
+    """A module that ends as its second argument says; its first one is a folder."""
     (tmp_path / "job.py").write_text(
         textwrap.dedent(
             """
