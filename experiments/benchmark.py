@@ -32,7 +32,7 @@ from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, metrics_files
 from gasil_jax.host.environments import Settings, available_cores, prepare
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 VARIANTS = {
     "mjx": {"solver": "mjx"},
@@ -172,7 +172,7 @@ def training_row(
     config = config.replace(num_envs=options.training_envs or config.num_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    batch = make_batch(env, config, range(seeds), devices=jax.devices()[:devices])
+    batch = make_members(env, config, range(seeds), devices=jax.devices()[:devices])
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began

@@ -16,7 +16,7 @@ from gasil_jax.host import (
     metrics_files,
     policy_file,
 )
-from gasil_jax.host.members import Batch
+from gasil_jax.host.members import Members
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_options import (
     Options,
@@ -45,13 +45,13 @@ def train(
     write_config(options, folder)
     title = f"{options.env} {options.config.agent}"
     job = assembly.Job(program, folder, {"seed": seeds_of(options)})
-    finished: list[tuple[Batch, driver.Outcome]] = []
+    finished: list[tuple[Members, driver.Outcome]] = []
     assembly.train(
         options,
         env,
         [job],
         title=title,
-        on_finished=lambda job, runs, outcome: finished.append((runs, outcome)),
+        on_finished=lambda job, members, outcome: finished.append((members, outcome)),
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
@@ -62,7 +62,7 @@ def _write_results(
     options: Options,
     env: Any,
     folder: pathlib.Path,
-    runs: Batch,
+    members: Members,
     outcome: driver.Outcome,
 ) -> dict[str, Any]:
     """Write the learning curve, the policies and the summary; return the summary."""
@@ -96,8 +96,8 @@ def _write_results(
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
         "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
-        "device": runs.device_kind,
-        "device_count": len(runs.devices),
+        "device": members.device_kind,
+        "device_count": len(members.devices),
         "versions": metrics_files.versions(),
     }
     lengths = final_returns(metrics["episode_length"])

@@ -26,7 +26,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.host.members import Batch
+from gasil_jax.host.members import Members
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
 from gasil_jax.sweeps.points import Point, make_points
 from gasil_jax.sweeps.shards import Program
@@ -48,10 +48,10 @@ class Options(run_options.Options):
         share a program. It compiles once, but every point costs as much as the
         largest; best on a GPU.
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
-        from 1 on, in a folder below `out`. The same command continues it. See
+        from 1 on, in a folder below `out`. With --resume it continues. See
         gasil_jax.merge.
       launcher: train all shards and merge them: local, in one process after another,
-        or ray, on a Ray cluster.
+        or ray, on a Ray cluster. With --resume it continues them.
       shards: number of shards that the launcher makes.
     """
 
@@ -80,7 +80,7 @@ def train(
     """
     run_options.write_config(options, folder, points=points)
 
-    def on_finished(job: assembly.Job, members: Batch, outcome: Outcome) -> None:
+    def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
         tables.write_training(
             folder,
             job.program,
@@ -115,18 +115,25 @@ def _main(arguments: Sequence[str] | None) -> None:
     if given.launcher is not None:
         options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
-    elif given.shard is not None:
-        _train_shard(arguments, shards.parse(given.shard), given.out)
+        return
+    began = run_options.begun_run(arguments)
+    if given.shard is not None:
+        shard = shards.parse(given.shard)
+        folder = _shard_folder(shard, given.out)
+        _train_shard(arguments, shard, folder, bool(given.resume))
+    elif began is not None and (text := run_folder.read(began).get("shard")):
+        _train_shard(arguments, shards.parse(text), began, resume=True)
     else:
-        began = run_options.begun_run(arguments)
         _train_whole(run_options.parse(Options, arguments, _PROGRAM, began), began)
 
 
 def _placement(
     arguments: Sequence[str] | None,
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return the options that say where training runs, and all other arguments."""
+    """Return --resume and the options that say where training runs, and the others."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    # The full parser reports a value.
+    parser.add_argument("--resume", nargs="?", const=True, default=False)
     for name in ("--shard", "--launcher", "--shards", "--out"):
         # The full parser reports a missing value.
         parser.add_argument(name, nargs="?")
@@ -168,8 +175,8 @@ def check_points(points: Sequence[Point], began: pathlib.Path | None) -> None:
     """Raise `InputError` if the sweep that has begun in a folder has other points."""
     if began is not None and list(run_folder.read(began)["points"]) != list(points):
         raise InputError(
-            f"out is {began}, where a sweep of other points has begun: go on with the "
-            "same ones, or name another folder"
+            f"out is {began}, where a sweep of other points has begun: name the same "
+            "points or another folder"
         )
 
 
@@ -196,23 +203,29 @@ def _train_whole(options: Options, began: pathlib.Path | None) -> None:
     print(*tables.report(points, summary), f"in {folder}", sep="\n")
 
 
-def _train_shard(
-    arguments: Sequence[str] | None, shard: shards.Shard, out: str | None
-) -> None:
-    """Train a shard of the sweep in `out`, or continue it."""
+def _shard_folder(shard: shards.Shard, out: str | None) -> pathlib.Path:
+    """Return the folder of a shard of the sweep in `out`, which must fit it."""
     if out is None:
         raise InputError("shard needs --out and the folder of the whole sweep")
-    whole = pathlib.Path(out)
-    shards.refuse_whole(whole)
-    shards.refuse_recut(whole, shard)
-    shard_folder = shard.folder(whole)
-    began = shard_folder if run_folder.is_described(shard_folder) else None
+    shards.refuse_whole(pathlib.Path(out))
+    shards.refuse_recut(pathlib.Path(out), shard)
+    return shard.folder(pathlib.Path(out))
+
+
+def _train_shard(
+    arguments: Sequence[str] | None,
+    shard: shards.Shard,
+    shard_folder: pathlib.Path,
+    resume: bool,
+) -> None:
+    """Train a shard in its own folder or, if `resume` is true, continue it."""
+    began = shard_folder if resume and run_folder.is_described(shard_folder) else None
     options = run_options.parse(Options, arguments, _PROGRAM, began)
-    options = dataclasses.replace(options, out=shard_folder, resume=True)
+    options = dataclasses.replace(options, out=shard_folder)
     points, programs = _plan_here(options, began)
     programs = shards.share(programs, shard)
     trained = tables.Trained(shard_folder, programs)
-    if not trained.unfinished():
+    if began is not None and not trained.unfinished():
         print(f"shard {shard} is done, in {shard_folder}")
         return
     run_options.check_out(options)
@@ -242,14 +255,16 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     shards.share(programs, every[-1])
     shards.refuse_whole(options.out)
     shards.refuse_recut(options.out, every[-1])
-    where = ["--out", str(options.out.absolute())]
+    shards.refuse_used(options.out, options.resume)
+    # A job that is run again after its process died continues.
+    where = ["--resume", "--out", str(options.out.absolute())]
     jobs = {
         f"shard {shard}": [*others, *where, "--shard", str(shard)] for shard in every
     }
     try:
         launch.LAUNCHERS[launcher](_PROGRAM, jobs, options.devices)
     except Interrupted as interrupted:
-        interrupted.add_note("go on with the same command")
+        interrupted.add_note("continue with the same command and --resume")
         raise
     summary = merging.merge([options.out], options.out)
     print(*tables.report(points, summary), f"in {options.out}", sep="\n")

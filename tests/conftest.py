@@ -1,4 +1,4 @@
-"""Shared settings: two host devices and a cache, before anything starts JAX."""
+"""Settings that all tests share: two devices, a cache, how programs are compiled."""
 
 import atexit
 import os
@@ -20,40 +20,48 @@ from gasil_jax.host import run_options
 native.reserve_threads(2)
 
 
-# Of commands, files and processes: what they train is small, and compiling it is most
-# of their time. What compares numbers is compiled as it is for users.
-_OF_COMMANDS = {
-    "test_engine",
-    "test_input",
-    "test_periodic_evaluation",
-    "test_plot",
-    "test_readme",
-    "test_render",
-    "test_resume",
-    "test_run",
-    "test_sweep",
-    "test_trackers",
+# Modules whose programs are compiled as for users: agents learn, physics is compared
+# with MuJoCo, XLA's numbers and memory are checked. Elsewhere compiling would take most
+# of the time, and most optimizations are turned off.
+_COMPILED_AS_FOR_USERS = {
+    "test_agents",
+    "test_determinism",
+    "test_environments",
+    "test_gail",
+    "test_jax",
+    "test_resources",
 }
+# Modules with tests that take long by themselves.
+_LONG = {"test_figures", "test_point_mass_figures", "test_readme", "test_sweep"}
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Set how much what a test compiles, and the programs it starts, is optimized."""
+    """Set how far programs are optimized, here and in the processes a test starts."""
     import jax
 
-    plainly = item.module.__name__ in _OF_COMMANDS
+    plainly = item.module.__name__ not in _COMPILED_AS_FOR_USERS
     before = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(plainly))
     if before != str(int(plainly)):
         jax.config.update("jax_disable_most_optimizations", plainly)
-        # What is compiled, single operations too, is kept for the process whatever
-        # the setting, and rounds otherwise.
+        # JAX keeps compiled programs whatever the setting, and they round otherwise.
         jax.clear_caches()
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items):
-    """One worker for the tests that share a module's fixture: it is made once."""
+    """Order the tests, and give those that share a module's fixture to one worker.
+
+    Programs that are compiled alike come together, since JAX forgets them all when that
+    changes. Long tests come before the others, so that none is left at the end.
+    """
+    items.sort(
+        key=lambda item: (
+            item.module.__name__ not in _COMPILED_AS_FOR_USERS,
+            item.module.__name__ not in _LONG,
+        )
+    )
     for item in items:
         fixtures = item._fixtureinfo.name2fixturedefs.values()
         if any(definitions[-1].scope == "module" for definitions in fixtures):

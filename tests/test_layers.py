@@ -20,7 +20,7 @@ ALLOWED = {
 
 
 def layer(module):
-    """Of a module's name below the package: "host.driver" is of host."""
+    """Return the layer of a module, given its name below the package."""
     top = module.split(".")[0]
     if top in COMMANDS:
         return "commands"
@@ -28,7 +28,7 @@ def layer(module):
 
 
 def imports(path):
-    """Names of all modules that a file imports, wherever in it."""
+    """Yield the names of all modules that a file imports anywhere."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -38,7 +38,7 @@ def imports(path):
 
 
 def modules(package):
-    """Name and path of every module of a package, its top excepted."""
+    """Yield the name and path of every module of a package, except the package."""
     for path in sorted(package.rglob("*.py")):
         name = ".".join(path.relative_to(package).with_suffix("").parts)
         if name != "__init__":
@@ -46,7 +46,7 @@ def modules(package):
 
 
 def edges():
-    """(importing module, imported module) below gasil_jax."""
+    """Yield (importing module, imported module) for modules below gasil_jax."""
     package = ROOT / "gasil_jax"
     names = {name for name, _ in modules(package)}
     for name, path in modules(package):

@@ -53,19 +53,20 @@ NOT_RUN = {
 
 
 def commands():
-    """Lines that start with $, those that end with a backslash joined, once each.
+    """Return every console command of the documents once.
 
-    Without the variables that are set before a command; && divides a line.
+    A line starts with $ and continues after a backslash. && separates commands, and
+    variables that are set before a command are left out.
     """
     text = "\n".join(path.read_text() for path in DOCUMENTS)
-    found = {}
+    unique = {}
     for block in re.findall(r"```console\n(.*?)```", text, re.DOTALL):
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
                 for command in line[2:].split(" && "):
                     command = re.sub(r"^[A-Z_]+=\S+ ", "", command)
-                    found[shlex.join(shlex.split(command, comments=True))] = None
-    return list(found)
+                    unique[shlex.join(shlex.split(command, comments=True))] = None
+    return list(unique)
 
 
 OURS = [line for line in commands() if line.startswith("python -m gasil_jax")]
@@ -103,7 +104,7 @@ SCALING = (DOCS / "scaling.md").read_text()
 
 
 def calls_of(script, folder, **variables):
-    """What each `python` is started with in a shell script, in any order."""
+    """Return the arguments of each `python` in a shell script, in any order."""
     listed = folder / "calls"
     listed.unlink(missing_ok=True)
     stubs = {
@@ -138,7 +139,7 @@ def shard_of(call):
     arguments = call[2:]
     options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
     shard = shards.parse(options.shard, "shard")
-    return shard.number, shard.count, str(options.out)
+    return shard.number, shard.count, str(options.out), options.resume
 
 
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
@@ -146,7 +147,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     shell, slurm = BASH[1:]
     *trained, merged = calls_of(shell, tmp_path)
     assert sorted(shard_of(call) for call in trained) == [
-        (number, 4, "OUT") for number in range(1, 5)
+        (number, 4, "OUT", False) for number in range(1, 5)
     ]
     assert merged == ["-m", "gasil_jax.merge", "OUT"]
 
@@ -155,7 +156,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
         (call,) = calls_of(
             slurm, tmp_path, SLURM_ARRAY_TASK_ID=index, SCRATCH="/a place"
         )
-        assert shard_of(call) == (index, last, "/a place/OUT")
+        assert shard_of(call) == (index, last, "/a place/OUT", True)
 
     yaml = pytest.importorskip("yaml")
     (text,) = re.findall(r"```yaml\n(.*?)```", SCALING, re.DOTALL)
@@ -165,11 +166,11 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     (script,) = container["args"]
     for index in (0, job["completions"] - 1):
         (call,) = calls_of(script, tmp_path, JOB_COMPLETION_INDEX=index)
-        assert shard_of(call) == (index + 1, job["completions"], "/results/OUT")
+        assert shard_of(call) == (index + 1, job["completions"], "/results/OUT", True)
 
 
 def as_toy(line, finished, locomotion, folder):
-    """The program and the arguments of a command, made small, writing to `folder`."""
+    """Return a command's program and arguments, made small, with output in `folder`."""
     _, _, program, *arguments = shlex.split(line)
     needs_locomotion = any(mark in line for mark in LOCOMOTION)
     for i, (option, value) in enumerate(zip(["", *arguments], arguments)):
@@ -186,15 +187,15 @@ def as_toy(line, finished, locomotion, folder):
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
 def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper):
-    """On the point mass and for some hundred steps; the runs come before the rest."""
+    """Training commands run first, on the point mass and for some hundred steps."""
     pytest.importorskip("minari")
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
-    wanted = [line for line in OURS if not line.startswith(tuple(NOT_RUN))]
-    training = [line for line in wanted if line.startswith("python -m gasil_jax.run")]
+    lines = [line for line in OURS if not line.startswith(tuple(NOT_RUN))]
+    training = [line for line in lines if line.startswith("python -m gasil_jax.run")]
     assert training
     finished = tmp_path / "0"
-    rest = [line for line in wanted if line not in training]
+    rest = [line for line in lines if line not in training]
     for number, line in enumerate([*training, *rest]):
         folder = tmp_path / str(number)
         if line in rest:
@@ -215,12 +216,10 @@ def test_options_in_the_table_exist():
     rows = re.findall(r"^\| (`--.*?) \|", table, re.MULTILINE)
     fields = [field for row in rows for field in re.findall(r"--[a-z-]+", row)]
     assert len(fields) > 18
-    known = command_line.parse(run_options.Options, ["--env", "hopper"], "x")
-    names = {
-        name
-        for part in (known, known.settings, known.config, known.config.hyperparameters)
-        for name in vars(part)
-    }
+    options = command_line.parse(run_options.Options, ["--env", "hopper"], "x")
+    config = options.config
+    parts = (options, options.settings, config, config.hyperparameters)
+    names = {name for part in parts for name in vars(part)}
     for field in fields:
         assert field[2:].replace("-", "_") in names, field
 
@@ -245,21 +244,22 @@ def finished_hopper(tmp_path, monkeypatch):
 
 
 def run_python(path):
-    """Run a document's Python on the point mass, for some thousand steps; the names."""
+    """Run a document's Python on the point mass, made small; return its names."""
     blocks = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
     assert blocks
     env = gasil_jax.make_env("point_mass")
-    names = {"observation": np.zeros(env.observation_size, np.float32)}
-    train = "make_train(env, config.replace(total_steps=4096))"
-    small = {
+    small = {"batch_steps": 512, "num_envs": 4, "num_epochs": 1}
+    small |= {"hidden_sizes": (8,), "discriminator_hidden_sizes": (8,)}
+    names = {"observation": np.zeros(env.observation_size, np.float32), "small": small}
+    changes = {
         r'"(walker2d|hopper)", ': '"point_mass", ',
-        "1_000_000": "4096",
-        r"make_train\(env, config\)": train,
+        r"(gasil_jax\.preset\(.*\))": r"\1.replace(**small, total_steps=1024)",
+        "1_000_000": "1024",
         r"key\(0\), \d+\)": "key(0), 2)",
         r"n_trials=\d+": "n_trials=2",
     }
     for block in blocks:
-        for pattern, value in small.items():
+        for pattern, value in changes.items():
             block = re.sub(pattern, value, block)
         exec(compile(block, str(path), "exec"), names)
     return names
@@ -289,7 +289,7 @@ def test_the_search_with_optuna_runs():
 
 
 def test_the_caption_of_the_film_is_what_the_film_says():
-    """Its comment was written with it."""
+    """The film's comment was written with it."""
     from PIL import Image
 
     film = DOCS / "walker2d_delayed.gif"
@@ -302,7 +302,7 @@ def test_the_caption_of_the_film_is_what_the_film_says():
 
 
 def test_every_page_and_plot_can_be_reached():
-    """Pages of results from the navigation, their plots from a page."""
+    """The navigation leads to all pages, and the pages show all plots."""
     results = README.parent / "experiments" / "results"
     navigation = (README.parent / "mkdocs.yml").read_text()
     pages = [*DOCS.glob("*.md"), *results.glob("*.md")]

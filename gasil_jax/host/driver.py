@@ -1,9 +1,8 @@
-"""Train a batch for a command line: chunk by chunk, logged, saved and interruptible.
+"""Train members for a command line: in chunks, logged, saved and interruptible.
 
-The folder that it is given gets metrics.csv, checkpoints/ and, where policies are
-evaluated on the way, evaluations.csv. What a checkpoint has seen of the two tables is
-recorded in it, so that a run that goes on from it cuts them there and writes the same
-rows again.
+The folder gets metrics.csv, checkpoints/ and, if policies are evaluated during
+training, evaluations.csv. A checkpoint records the sizes of the two tables. Training
+that continues from it cuts the tables to these sizes and writes the same rows again.
 """
 
 import dataclasses
@@ -19,25 +18,28 @@ import numpy as np
 
 from gasil_jax.host import checkpoint, command_line, metrics_files
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.members import Batch
+from gasil_jax.host.interval import Interval
+from gasil_jax.host.members import Members
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker, log
 
-# Between two calls of the compiled program: time to react to Ctrl-C, and between two
-# updates of the display.
+# The time between two calls of the compiled program. The display is updated and Ctrl-C
+# takes effect at this rate.
 _SECONDS_OF_A_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
 @dataclasses.dataclass(frozen=True)
 class CheckpointSchedule:
-    """When checkpoints are written and how many are kept.
+    """The times of checkpoints and the number to keep.
 
     Attributes:
-      every: environment steps of a seed between two of them; None for ten minutes.
-      keep: so many of the newest, and the one with the best evaluation or, where
-        there is none, the best returns since the one before.
+      every: environment steps per seed between two checkpoints, rounded up to whole
+        iterations; None writes one every ten minutes.
+      keep: number of newest checkpoints to keep. One more is kept: the one with the
+        best evaluation or, without evaluations, with the best returns since the
+        checkpoint before it.
     """
 
     every: int | None
@@ -46,15 +48,15 @@ class CheckpointSchedule:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What training has given.
+    """The result of training.
 
     Attributes:
-      states: of the members after the last iteration.
-      new_steps: environment steps over all members that this process took.
-      compile_seconds: spent in this process on compiling the training.
-      train_seconds: spent in this process on training, without its evaluations.
-      evaluation_seconds: spent in this process on evaluations, compiling included;
-        None without evaluations.
+      states: the members' states after the last iteration.
+      new_steps: environment steps that this process took, over all members.
+      compile_seconds: time that this process spent on compiling the training.
+      train_seconds: time that this process spent on training, without evaluations.
+      evaluation_seconds: time that this process spent on evaluations, including
+        compilation; None without evaluations.
     """
 
     states: Any
@@ -65,21 +67,23 @@ class Outcome:
 
 
 class _Tables:
-    """metrics.csv and evaluations.csv of a folder, and the trackers beside them.
+    """The files metrics.csv and evaluations.csv, and the trackers that get the same.
 
     Args:
-      runs: what is trained.
-      folder: of the files.
-      labels: columns that tell the members apart, (members,) each.
-      evaluation_schedule: of evaluations; None for none.
-      trackers: given the same numbers.
-      record: of the checkpoint that training goes on from: the tables are cut where
-        it was written. None without a checkpoint.
+      members: the members that are trained.
+      folder: the folder of the files.
+      labels: columns that identify the members, (members,) each.
+      evaluation_schedule: the times of evaluations; None for none.
+      trackers: trackers that get the same numbers.
+      record: record of the checkpoint that training continues from; None without one.
+
+    Attributes:
+      evaluation: the periodic evaluation; None for none.
     """
 
     def __init__(
         self,
-        runs: Batch,
+        members: Members,
         folder: pathlib.Path,
         labels: Mapping[str, Sequence[Any]],
         *,
@@ -89,26 +93,27 @@ class _Tables:
     ):
         self._labels, self._trackers = labels, trackers
         path = folder / "metrics.csv"
-        self._metrics = metrics_files.MetricsWriter(path, labels, _size(path, record))
+        size = _recorded_size(path, record)
+        self._metrics = metrics_files.MetricsWriter(path, labels, size)
         self.evaluation = None
         if evaluation_schedule is not None:
             path = folder / "evaluations.csv"
             self.evaluation = PeriodicEvaluation(
-                runs,
+                members,
                 evaluation_schedule,
                 path,
                 labels=labels,
-                size=_size(path, record),
-                following=trackers,
+                size=_recorded_size(path, record),
+                trackers=trackers,
             )
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
-        """Add the metrics of a chunk, (members, iterations) each."""
+        """Write and log the metrics of a chunk, (members, iterations) each."""
         self._metrics.write(metrics)
         log(self._trackers, self._labels, metrics)
 
     def sizes(self) -> dict[str, int]:
-        """Bytes of each table on the disk, as a checkpoint's record has them."""
+        """Write everything to the disk; return each file's size for a record."""
         sizes = {"metrics_size": self._metrics.size()}
         if self.evaluation is not None:
             sizes["evaluations_size"] = self.evaluation.size()
@@ -124,47 +129,48 @@ class _Tables:
 
 
 class _Checkpoints:
-    """When checkpoints of a run are due, and writing them.
+    """Writes the checkpoints of a run when they are due.
 
     Args:
-      root: folder of the checkpoints.
-      schedule: when they are written and how many are kept.
-      runs: what is trained.
+      root: the folder of the checkpoints.
+      schedule: the times of checkpoints and the number to keep.
+      members: the members that are trained.
     """
 
-    def __init__(self, root: pathlib.Path, schedule: CheckpointSchedule, runs: Batch):
-        self.root, self._schedule, self._runs = root, schedule, runs
-        every = schedule.every
-        # None: by the clock.
-        self._interval = every and math.ceil(every / runs.config.batch_steps)
+    def __init__(
+        self, root: pathlib.Path, schedule: CheckpointSchedule, members: Members
+    ):
+        self.root, self._keep, self._members = root, schedule.keep, members
+        # Without an interval the clock decides.
+        self._interval = None
+        if schedule.every is not None:
+            self._interval = Interval.of_steps(schedule.every, members.config)
         self._saved_at = time.monotonic()
 
     def iterations_left(self, done: int) -> float:
-        """Iterations from `done` to the next checkpoint; infinity if by the clock."""
-        if self._interval is None:
-            return math.inf
-        return self._interval - done % self._interval
+        """Return the iterations to the next checkpoint; infinity if by the clock."""
+        return self._interval.iterations_left(done) if self._interval else math.inf
 
     def is_due(self, done: int) -> bool:
-        """Whether a checkpoint is to be written after so many iterations."""
+        """Return whether a checkpoint is due after `done` iterations."""
         if self._interval is None:
             return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        return done % self._interval == 0
+        return self._interval.is_due(done)
 
     def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
-        """Write a checkpoint, and delete those that are not kept."""
-        checkpoint.write(self.root, done, self._runs.trim(states), record)
-        checkpoint.prune(self.root, self._schedule.keep)
+        """Write a checkpoint, and delete those that are not to be kept."""
+        checkpoint.write(self.root, done, self._members.trim(states), record)
+        checkpoint.prune(self.root, self._keep)
         self._saved_at = time.monotonic()
 
 
 def _restored(
-    runs: Batch, root: pathlib.Path, progress: Progress, tables: Sequence[str]
+    members: Members, root: pathlib.Path, progress: Progress, tables: Sequence[str]
 ) -> tuple[Any, int, Mapping[str, Any] | None]:
-    """The states of the newest whole checkpoint, its iteration and its record.
+    """Return states, iteration and record of the newest undamaged checkpoint.
 
-    Without one the states and the record are None, and the iteration is 0. What is
-    newer is damaged, told and set aside.
+    Without one they are None, 0 and None. Newer, damaged checkpoints are set aside with
+    a warning.
     """
     with progress.aside("reading the checkpoints"):
         newest, damages = checkpoint.latest(root, [f"{table}_size" for table in tables])
@@ -175,17 +181,17 @@ def _restored(
     if newest is None:
         return None, 0, None
     with progress.aside(f"restoring {newest.folder.name}"):
-        like = jax.eval_shape(lambda: runs.trim(runs.init()))
+        like = jax.eval_shape(lambda: members.trim(members.init()))
         with command_line.input_checked():
             return newest.restore(like), newest.iteration, newest.record
 
 
-def _size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Where a table goes on: what the checkpoint has seen of it; None where it begins.
+def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
+    """Return the size to cut a table to; None if there is no table yet.
 
     Args:
-      path: of the table, such as metrics.csv.
-      record: of the checkpoint that training goes on from; None without one.
+      path: the table, such as metrics.csv.
+      record: record of the checkpoint that training continues from; None without one.
     """
     if record is not None:
         return record[f"{path.stem}_size"]
@@ -193,7 +199,7 @@ def _size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
 
 
 def drive(
-    runs: Batch,
+    members: Members,
     folder: pathlib.Path,
     labels: Mapping[str, Sequence[Any]],
     *,
@@ -204,32 +210,33 @@ def drive(
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
 ) -> Outcome:
-    """Train to the end, from the newest whole checkpoint in the folder if it has one.
+    """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
     Args:
-      runs: what to train.
-      folder: of metrics.csv, evaluations.csv and checkpoints/.
-      labels: what the tables call the members, (members,) each.
-      schedule: of the checkpoints.
-      progress: told what is going on.
-      interruption: looked at after each chunk; a checkpoint is written then.
-      evaluation_schedule: of evaluations on the way; None for none.
-      steps_before: environment steps that `progress` has counted already.
-      trackers: given the metrics too, and closed.
+      members: the members to train.
+      folder: the folder of metrics.csv, evaluations.csv and checkpoints/.
+      labels: columns that identify the members in the tables, (members,) each.
+      schedule: the times of checkpoints and the number to keep.
+      progress: the progress display.
+      interruption: checked after each chunk; if it has a signal, a checkpoint is
+        written.
+      evaluation_schedule: the times of evaluations; None for none.
+      steps_before: environment steps that `progress` has already counted.
+      trackers: trackers that also get the metrics; they are closed at the end.
 
     Raises:
-      Interrupted: after the checkpoint that an interruption asks for.
-      InputError: the checkpoint is of another state, or a table is damaged.
-      OSError: the folder can't be written, or the disk is full.
+      Interrupted: if a signal was received; a checkpoint was written first.
+      InputError: if the checkpoint is of another state, or if a table is damaged.
+      OSError: if the folder can't be written, or if the disk is full.
     """
-    config, last = runs.config, runs.config.num_iterations
-    steps_of = lambda done: done * config.batch_steps * runs.num_members
-    checkpoints = _Checkpoints(folder / "checkpoints", schedule, runs)
+    config, last = members.config, members.config.num_iterations
+    steps_of = lambda done: done * config.batch_steps * members.num_members
+    checkpoints = _Checkpoints(folder / "checkpoints", schedule, members)
     names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
-    states, first, record = _restored(runs, checkpoints.root, progress, names)
+    states, first, record = _restored(members, checkpoints.root, progress, names)
     with command_line.input_checked():
         tables = _Tables(
-            runs,
+            members,
             folder,
             labels,
             evaluation_schedule=evaluation_schedule,
@@ -241,33 +248,33 @@ def drive(
     started = time.monotonic()
     if first < last:
         progress.phase("compiling", steps_before + steps_of(first))
-        states, advance = runs.compile(states)
+        states, advance = members.compile(states)
     compile_seconds = time.monotonic() - started
 
     progress.phase("training", steps_before + steps_of(first))
     started = time.monotonic()
-    done, seconds_of_one = first, math.inf
-    # Since the last checkpoint, and of the states as they are now.
+    done, seconds_per_iteration = first, math.inf
+    # The returns since the last checkpoint, and the score of the current policies.
     returns: list[np.ndarray] = []
     evaluated: float | None = None
 
     def save() -> None:
-        # Where policies are evaluated, one that was not has no score.
+        # With evaluations, a checkpoint whose policies were not evaluated has no score.
         score = _mean(returns) if evaluation is None else evaluated
         with progress.aside("saving a checkpoint"):
             checkpoints.save(done, states, tables.sizes() | {"score": score})
 
     while done < last and interruption.signal is None:
         count = min(
-            runs.chunk,
+            members.chunk,
             last - done,
-            max(1, int(_SECONDS_OF_A_CHUNK / seconds_of_one)),
+            max(1, int(_SECONDS_OF_A_CHUNK / seconds_per_iteration)),
             checkpoints.iterations_left(done),
             math.inf if evaluation is None else evaluation.iterations_left(done),
         )
         chunk_started = time.monotonic()
-        states, metrics = runs.train(advance, states, done, int(count))
-        seconds_of_one = (time.monotonic() - chunk_started) / count
+        states, metrics = members.train(advance, states, done, int(count))
+        seconds_per_iteration = (time.monotonic() - chunk_started) / count
         done += int(count)
         tables.write(metrics)
         returns.append(metrics["episode_return"])
@@ -288,7 +295,7 @@ def drive(
         raise Interrupted(interruption.signal)
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
-        states=runs.trim(states),
+        states=members.trim(states),
         new_steps=steps_of(done - first),
         compile_seconds=compile_seconds,
         train_seconds=train_seconds - (evaluation_seconds or 0.0),
@@ -297,7 +304,7 @@ def drive(
 
 
 def _mean(returns: Sequence[np.ndarray]) -> float | None:
-    """The mean of all that are finite; None where none is."""
+    """Return the mean of all finite returns; None if there are none."""
     finite = [x[np.isfinite(x)] for x in returns]
     every = np.concatenate(finite) if finite else np.empty(0)
     return float(every.mean()) if every.size else None

@@ -1,4 +1,8 @@
-"""Many runs in one program: vmapped, and sharded over devices."""
+"""Train many members in one compiled program: vmapped, and sharded over devices.
+
+A member is a seed with its hyperparameters. Its random numbers come from its seed
+alone, not from the members beside it or from the device it runs on.
+"""
 
 import dataclasses
 import functools
@@ -16,14 +20,14 @@ from gasil_jax.config import Config, Hyperparameters
 
 
 def member(states: Any, index: int) -> Any:
-    """One run out of a batch of them: the leading axis of every leaf is taken away."""
+    """Return the state of one member: entry `index` of the first axis of each leaf."""
     return jax.tree.map(lambda x: x[index], states)
 
 
 def init_member(
     env: Any, config: Config, seed: jax.Array, hyperparameters: Hyperparameters
 ) -> train.TrainState:
-    """The first state of a member. Its key is of its seed number alone."""
+    """Return the first state of a member, whose key comes from its seed alone."""
     return train.init(env, config, jax.random.key(seed), hyperparameters)
 
 
@@ -34,15 +38,15 @@ def advance_members(
 
     Args:
       env: one environment.
-      config: of all members.
-      states: (members, ...) each leaf.
-      num_iterations: int32 (), how many.
+      config: the config of all members.
+      states: the members' training states, (members, ...) each leaf.
+      num_iterations: the number of iterations, int32 ().
 
     Returns:
-      the states after them, and metrics (members, chunk), of which the first
-      `num_iterations` are written and the others NaN.
+      The new states, and metrics (members, chunk). The first `num_iterations` columns
+      are filled and the others are NaN.
     """
-    # Jitted, it is traced once for the shapes and the loop: seconds less.
+    # A jitted function is traced once for both uses, which saves seconds.
     step = jax.jit(jax.vmap(lambda state: train.iterate(env, config, state)))
     chunk = chunk_size(config)
     metrics = jax.tree.map(
@@ -62,22 +66,22 @@ def advance_members(
 
 
 def chunk_size(config: Config) -> int:
-    """Iterations between two looks at a run: about 50 looks, 100 iterations at most."""
+    """Return how many iterations one call trains: a fiftieth of all, at most 100."""
     return max(1, min(100, config.num_iterations // 50))
 
 
 @dataclasses.dataclass(frozen=True)
-class Batch:
-    """Members that train in one program, each a seed with its hyperparameters.
+class Members:
+    """The members that train in one program.
 
-    Arrays of all members are padded to a multiple of the devices: (padded, ...).
+    Their arrays are padded to a multiple of the number of devices: (padded, ...).
 
     Attributes:
       env: one environment.
-      config: what runs.
+      config: the config that the members share.
       seeds: absolute seed number of each member.
-      hyperparameters: of each member.
-      devices: what the members are sharded over.
+      hyperparameters: the hyperparameters of each member.
+      devices: the devices that the members are sharded over.
     """
 
     env: Any
@@ -88,26 +92,26 @@ class Batch:
 
     @property
     def num_members(self) -> int:
-        """How many members there are, without the padding."""
+        """The number of members, without the padding."""
         return len(self.seeds)
 
     @property
     def chunk(self) -> int:
-        """Most iterations in one call of `advance`."""
+        """The largest number of iterations in one call of `advance`."""
         return chunk_size(self.config)
 
     @property
     def device_kind(self) -> str:
-        """How many devices of which kind: "2 x cpu"."""
+        """The number and kind of the devices, such as "2 x cpu"."""
         return f"{len(self.devices)} x {self.devices[0].device_kind}"
 
     @functools.cached_property
     def sharding(self) -> NamedSharding:
-        """Of the states: each device has its share of the members."""
+        """The sharding of all arrays: each device has its share of the members."""
         return NamedSharding(Mesh(np.array(self.devices), ("members",)), P("members"))
 
     def _shard(self, function: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
-        # Nothing passes between the members, so nothing is to be checked.
+        # Members do not communicate, so there is no replication to check.
         return jax.shard_map(
             function,
             mesh=self.sharding.mesh,
@@ -117,7 +121,7 @@ class Batch:
         )
 
     def init(self) -> Any:
-        """The first states of all members, (padded, ...) each leaf."""
+        """Return the first states of all members, (padded, ...) each leaf."""
         pad = lambda values: [*values, *[values[-1]] * self._padding]
         init_one = lambda seed, hyperparameters: init_member(
             self.env, self.config, seed, hyperparameters
@@ -134,48 +138,49 @@ class Batch:
 
     @functools.cached_property
     def advance(self) -> Any:
-        """`advance_members`, jitted and sharded: it takes the states' memory."""
+        """`advance_members`, jitted and sharded; it reuses the memory of its input."""
         advance = functools.partial(advance_members, self.env, self.config)
         return jax.jit(self._shard(advance, (P("members"), P())), donate_argnums=0)
 
     def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
-        """The states to start from, and `advance`, compiled.
+        """Return the states to start from, and the compiled `advance`.
 
         Args:
-          states: of the members, (members, ...), to go on from; default the first.
+          states: states to continue from, (members, ...); default the first states.
         """
-        states = self.init() if states is None else self.place(states)
+        states = self.init() if states is None else self.to_devices(states)
         states = jax.block_until_ready(states)
         return states, self.advance.lower(states, np.int32(0)).compile()
 
-    def of_members(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """A function of one member's arrays, for all members: sharded as in training.
+    def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function of one member's arrays as one of all members' arrays.
 
-        Compiles when it is first called. Takes and gives padded arrays, (padded, ...).
+        It is sharded like the training, compiles when it is first called, and takes and
+        returns padded arrays, (padded, ...).
         """
         return jax.jit(self._shard(jax.vmap(function), P("members")))
 
     def train(
         self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
-        """Train for some iterations, no more than a chunk.
+        """Train for some iterations, at most `chunk`.
 
         Args:
-          advance: compiled.
-          states: before them; their memory is taken.
-          first: iterations done already.
-          count: how many to do.
+          advance: the compiled function from `compile`.
+          states: the states before; their memory is reused.
+          first: number of iterations before this call.
+          count: number of iterations in this call.
 
         Returns:
-          the states after them, and their metrics, (members, iterations) each;
-          "env_steps" are whole numbers.
+          The states after it, and the metrics, (members, iterations) each. "env_steps"
+          holds whole numbers.
         """
         states, metrics = advance(states, np.int32(count))
         metrics = {
             name: np.asarray(value)[: self.num_members, :count]
             for name, value in metrics.items()
         }
-        # float32 counts exactly only to 2**24.
+        # Counted here, because float32 is exact only up to 2**24.
         steps = (np.arange(first, first + count) + 1) * self.config.batch_steps
         metrics["env_steps"] = np.broadcast_to(steps, (self.num_members, count))
         return states, metrics
@@ -184,41 +189,39 @@ class Batch:
     def _padding(self) -> int:
         return -self.num_members % len(self.devices)
 
-    def place(self, states: Any) -> Any:
-        """States of the members, (members, ...), padded and on their devices."""
+    def to_devices(self, states: Any) -> Any:
+        """Return the members' arrays, (members, ...), padded and on their devices."""
         pad = lambda x: jnp.concatenate([x, *[x[-1:]] * self._padding])
         return jax.device_put(jax.tree.map(pad, states), self.sharding)
 
     def trim(self, states: Any) -> Any:
-        """States without the padding: (members, ...)."""
+        """Return the members' arrays without the padding: (members, ...)."""
         return jax.tree.map(lambda x: x[: self.num_members], states)
 
 
-def make_batch(
+def make_members(
     env: Any,
     config: Config,
     seeds: Sequence[int],
     hyperparameters: Sequence[Hyperparameters] | None = None,
     *,
     devices: Sequence[jax.Device] | None = None,
-) -> Batch:
-    """Prepare to train members side by side, sharded over `devices`.
-
-    A member's key is ``jax.random.key(seed)``, whatever its place in the batch and
-    the device it runs on. Nothing is compiled yet.
+) -> Members:
+    """Return members to train side by side. Nothing is compiled yet.
 
     Args:
       env: one environment.
-      config: what to run.
-      seeds: absolute seed number of each member.
-      hyperparameters: of each member; default the config's for all.
-      devices: default all; no more of them are used than there are members.
+      config: the config that the members share.
+      seeds: absolute seed number of each member. Its key is ``jax.random.key(seed)``.
+      hyperparameters: the hyperparameters of each member; default the config's.
+      devices: the devices to shard over, default all. At most one for each member is
+        used.
 
     Raises:
-      ValueError: the configuration is bad.
+      ValueError: if the config is not valid.
     """
     train.check(env, config)
     if hyperparameters is None:
         hyperparameters = [config.hyperparameters] * len(seeds)
     devices = list(devices or jax.devices())[: len(seeds)]
-    return Batch(env, config, seeds, hyperparameters, devices)
+    return Members(env, config, seeds, hyperparameters, devices)

@@ -1,11 +1,10 @@
-"""Evaluate the policies of a batch at regular intervals during training.
+"""Evaluate the policies of all members at regular intervals during training.
 
 The scores go to evaluations.csv, beside metrics.csv: a row for each member and
 evaluation, with the mean, lowest and highest return of its episodes and their mean
 length. Evaluations do not change training, not by a single bit.
 """
 
-import math
 import pathlib
 import time
 from collections.abc import Mapping, Sequence
@@ -15,8 +14,10 @@ import jax
 import numpy as np
 
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host import metrics_files, trackers
-from gasil_jax.host.members import Batch
+from gasil_jax.host import metrics_files
+from gasil_jax.host.interval import Interval
+from gasil_jax.host.members import Members
+from gasil_jax.host.trackers import Tracker, log_evaluation
 from gasil_jax.train import TrainState
 
 #: Columns of evaluations.csv after those that identify the members.
@@ -42,7 +43,7 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
     """Return the key of a seed's evaluation after `iteration` iterations.
 
     It depends on these two numbers alone, not on the keys of training or on the other
-    members of the batch.
+    members.
     """
     return jax.random.fold_in(
         jax.random.fold_in(jax.random.key(_ROOT), seed), iteration
@@ -53,13 +54,13 @@ class PeriodicEvaluation:
     """Evaluates all members with one compiled program, sharded as training is.
 
     Args:
-      runs: the batch of runs that is trained.
+      members: the members that are trained.
       schedule: the times of evaluations and their number of episodes.
       path: the file evaluations.csv.
       labels: columns that identify the members, (members,) each.
       size: number of bytes to keep of an existing file, see
         `metrics_files.MetricsWriter`.
-      following: trackers that also get the scores.
+      trackers: trackers that also get the scores.
 
     Attributes:
       seconds: time of all evaluations in this process, including compilation.
@@ -71,37 +72,38 @@ class PeriodicEvaluation:
 
     def __init__(
         self,
-        runs: Batch,
+        members: Members,
         schedule: EvaluationSchedule,
         path: pathlib.Path,
         *,
         labels: Mapping[str, Sequence[Any]],
         size: int | None = None,
-        following: Sequence[trackers.Tracker] = (),
+        trackers: Sequence[Tracker] = (),
     ):
         def score(state: TrainState, seed: jax.Array) -> dict[str, jax.Array]:
             return evaluate(
-                runs.env,
-                runs.config,
+                members.env,
+                members.config,
                 state,
                 evaluation_key(seed, state.iteration),
                 num_episodes=schedule.num_episodes,
             )
 
         self.seconds = 0.0
-        self._interval = math.ceil(schedule.every / runs.config.batch_steps)
-        self._runs, self._labels, self._trackers = runs, labels, following
-        self._seeds = runs.place(np.array(runs.seeds, np.uint32))
-        self._score = runs.of_members(score)
+        self._interval = Interval.of_steps(schedule.every, members.config)
+        self._members, self._labels, self._trackers = members, labels, trackers
+        self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
+        self._score = members.vmap(score)
         self._writer = metrics_files.MetricsWriter(path, labels, size, columns=COLUMNS)
 
     def iterations_left(self, done: int) -> int:
         """Return the iterations from `done` to the next evaluation, at least one."""
-        return self._interval - done % self._interval
+        return self._interval.iterations_left(done)
 
     def is_due(self, done: int) -> bool:
         """Return whether an evaluation is due after `done` iterations."""
-        return done % self._interval == 0 or done == self._runs.config.num_iterations
+        last = self._members.config.num_iterations
+        return self._interval.is_due(done) or done == last
 
     def score(self, states: Any, done: int) -> float:
         """Evaluate the policies, write the scores and log them to the trackers.
@@ -115,17 +117,17 @@ class PeriodicEvaluation:
         """
         started = time.monotonic()
         episodes = jax.tree.map(np.asarray, self._score(states, self._seeds))
-        episodes = self._runs.trim(episodes)
+        episodes = self._members.trim(episodes)
         returns, length = episodes["episode_return"], episodes["episode_length"]
         scores = {
-            "env_steps": np.full(len(returns), done * self._runs.config.batch_steps),
+            "env_steps": np.full(len(returns), done * self._members.config.batch_steps),
             "mean": returns.mean(axis=1),
             "min": returns.min(axis=1),
             "max": returns.max(axis=1),
             "length": length.mean(axis=1),
         }
         self._writer.write({name: x[:, None] for name, x in scores.items()})
-        trackers.log_evaluation(self._trackers, self._labels, scores)
+        log_evaluation(self._trackers, self._labels, scores)
         self.seconds += time.monotonic() - started
         return float(scores["mean"].mean(dtype=np.float64))
 

@@ -122,10 +122,10 @@ def refuse_used(folder: pathlib.Path) -> None:
     """
     names = (path.name for path in folder.iterdir())
     if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
-        raise InputError(
-            f"out is {folder}, which is not empty: name a new or an empty folder, or "
-            "go on with what is there with --resume"
-        )
+        message = f"out is {folder}, which is not empty: name a new or an empty folder"
+        if is_described(folder):
+            message += ", or continue the run in it with --resume"
+        raise InputError(message)
 
 
 def is_described(folder: pathlib.Path) -> bool:
@@ -176,9 +176,11 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         described = json_reader.read(path, _Described)
     except OSError:
         raise InputError(f"run is {folder}: it must be the folder of a run") from None
-    if "points" in described:  # A sweep, which may be older than the options.
-        described = {"share_counts": False, "shard": None} | described
     try:
+        if "points" in described:
+            for name in ("share_counts", "shard"):
+                if name not in described:
+                    raise ValueError(f"{name} is missing")
         validate(described["config"], agents())
         check_seeds(described["seeds"], described["first_seed"])
     except ValueError as error:

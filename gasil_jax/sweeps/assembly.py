@@ -23,7 +23,7 @@ from gasil_jax.host import (
     trackers,
 )
 from gasil_jax.host.interruption import Interruption
-from gasil_jax.host.members import Batch, make_batch
+from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.progress import Progress, announced
 from gasil_jax.host.run_options import Options, evaluation_schedule, make_env
 from gasil_jax.sweeps.shards import Program
@@ -117,7 +117,7 @@ def train(
     jobs: Sequence[Job],
     *,
     title: str,
-    on_finished: Callable[[Job, Batch, driver.Outcome], None],
+    on_finished: Callable[[Job, Members, driver.Outcome], None],
 ) -> None:
     """Train the unfinished jobs, one after the other.
 
@@ -149,7 +149,7 @@ def train(
                 with progress.aside("starting the trackers"):
                     described = run_folder.flat(vars(options))
                     following = trackers.make(options.log, job.folder, described)
-                members = make_batch(
+                members = make_members(
                     env,
                     job.program.config,
                     [seed for _, seed in job.program.members],

@@ -38,7 +38,8 @@ def _refuse_failed(failed: Mapping[str, str]) -> None:
     if failed:
         jobs = ", ".join(f"{name} ({why})" for name, why in failed.items())
         raise ChildProcessError(
-            f"{jobs} failed; the others are done, and the same command goes on"
+            f"{jobs} failed; the others are done. Continue with the same command and "
+            "--resume"
         )
 
 

@@ -108,7 +108,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
     ]
     if unfinished:
         raise InputError(
-            f"not finished: shards {', '.join(unfinished)}; run them again"
+            f"not finished: shards {', '.join(unfinished)}; continue them with --resume"
         )
     run_folder.create(out, out.name)
     with run_folder.lock(out):

@@ -135,9 +135,21 @@ def refuse_sharded(out: pathlib.Path) -> None:
     """Raise `InputError` if the folder holds a sweep with shards."""
     if root(out).is_dir():
         raise InputError(
-            f"out is {out}, which holds shards: go on with each of them with --shard, "
-            "and then python -m gasil_jax.merge"
+            f"out is {out}, which holds shards: continue each of them with --shard and "
+            "--resume, then run python -m gasil_jax.merge"
         )
+
+
+def refuse_used(out: pathlib.Path, resume: bool) -> None:
+    """Raise `InputError` unless the folder is empty or holds shards to resume."""
+    if root(out).is_dir():
+        if not resume:
+            raise InputError(
+                f"out is {out}, where shards have begun: name a new or an empty "
+                "folder, or continue them with --resume"
+            )
+    elif out.is_dir():
+        run_folder.refuse_used(out)
 
 
 def parse(text: str, name: str = "shard") -> Shard:

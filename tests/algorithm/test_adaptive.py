@@ -7,13 +7,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import SMALL, trainer
+from test_train import SMALL
 
 import gasil_jax
 from gasil_jax.imitation import adaptive, adversarial
 
 AGENT = "ppo+gasil-adaptive"
 ENV = gasil_jax.make_env("point_mass")
+
+
+@functools.cache
+def train(**changes):
+    """Train one seed of PPO, but for the changes."""
+    config = SMALL.replace(**{"agent": "ppo", **changes})
+    return jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
 
 
 def test_mix_and_correlation_are_their_formulas():
@@ -61,17 +68,14 @@ def test_the_policys_return_follows_its_latest_whole_episodes():
 
 
 def test_without_weight_it_is_ppo():
-    config = SMALL.replace(agent=AGENT, imitation_weight=0.0)
-    state, _ = jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
-    plain, _ = trainer("ppo")(jax.random.key(0))
+    (state, _), (plain, _) = train(agent=AGENT, imitation_weight=0.0), train()
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     jax.tree.map(close, state.actor_critic.policy, plain.actor_critic.policy)
 
 
 @pytest.mark.parametrize("rule", adaptive.RULES)
 def test_a_rule_is_the_product_of_the_factors_in_its_name(rule):
-    train = gasil_jax.make_train(ENV, SMALL.replace(agent=AGENT, imitation_rule=rule))
-    _, metrics = jax.jit(train)(jax.random.key(0))
+    _, metrics = train(agent=AGENT, imitation_rule=rule)
     expected = 0.7
     if rule in ("agreement", "both"):
         expected *= np.maximum(metrics["advantage_correlation"], 0.0)
@@ -113,14 +117,10 @@ def test_which_bonus_pays_for_staying_up(name, pays):
 
 
 def test_the_control_is_paid_for_every_step():
-    train = jax.jit(
-        gasil_jax.make_train(ENV, SMALL.replace(agent="ppo+bonus", alpha=0.0))
-    )
-    without, _ = train(jax.random.key(0))
-    plain, _ = trainer("ppo")(jax.random.key(0))
+    (without, _), (plain, _) = train(agent="ppo+bonus", alpha=0.0), train()
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     jax.tree.map(close, without.actor_critic, plain.actor_critic)
-    paid, _ = train(jax.random.key(0), SMALL.hyperparameters.replace(alpha=1.0))
+    paid, _ = train(agent="ppo+bonus", alpha=1.0)
     value = lambda state: jax.tree.leaves(state.actor_critic.values[0].params)[0]
     assert not np.allclose(value(paid), value(without))
 
@@ -143,13 +143,12 @@ def test_a_form_that_does_not_exist_is_refused():
     ],
 )
 def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):
-    run = lambda config: jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
-    config = SMALL.replace(agent="gasil", total_steps=768, buffer_steps=300)
-    (plain, _), (state, metrics) = run(config), run(config.replace(**change))
+    gasil = {"agent": "gasil", "total_steps": 768, "buffer_steps": 300}
+    (plain, before), (state, metrics) = train(**gasil), train(**gasil, **change)
     kernels = [jax.tree.leaves(x.imitation.params)[0] for x in (plain, state)]
     assert not np.allclose(*kernels, atol=1e-7)
     assert np.all(metrics["skipped_updates"] == 0)
     if "buffer_episodes" in change:
         assert state.good_trajectories.size == 50
     if "buffer_discounts" in change:
-        assert metrics["good_return"][-1] > 1.02 * run(config)[1]["good_return"][-1]
+        assert metrics["good_return"][-1] > 1.02 * before["good_return"][-1]

@@ -136,7 +136,7 @@ def test_a_compiled_insertion_equals_an_eager_one():
 
 def test_compiled_advantages_equal_eager_ones():
     keys = jax.random.split(jax.random.key(0), 5)
-    shape = (64, 8)
+    shape = (16, 4)
     arrays = [jax.random.normal(key, shape) for key in keys[:3]]
     flags = [jax.random.bernoulli(key, 0.1, shape) for key in keys[3:]]
     flags[1] = flags[0] | flags[1]

@@ -70,7 +70,7 @@ def test_the_papers_rule_for_humanoid():
     assert config.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
 
 
-def test_what_is_unknown_is_refused(capsys):
+def test_an_unknown_preset_is_refused(capsys):
     assert run.main(["--env", "hopper", "--preset", "papre"]) == 2
     assert "did you mean 'paper'" in capsys.readouterr().err
     with pytest.raises(ValueError, match="did you mean 'tuned'"):

@@ -75,7 +75,7 @@ def test_an_empty_place_is_never_drawn(monkeypatch):
     assert index.tolist() == [1, 1, 1] and np.isfinite(weight).all()
 
 
-def test_scale_is_the_standard_deviation_of_what_is_stored():
+def test_the_scale_is_the_standard_deviation_of_the_stored_returns():
     returns = np.array([3.0, -1.0, 7.0, 1e6], np.float32)
     replay = self_imitation.init_replay(4, 1, 1).replace(
         return_=jnp.array(returns), priority=jnp.array([1.0, 0.1, 2.0, 0.0])

@@ -120,8 +120,17 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
         sil_minibatch_size=8,
         hyperparameters=gasil_jax.Hyperparameters(gamma=1.0, buffer_steps=30),
     )
-    train = lambda config: jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
-    state, metrics = train(config)
+    iterate = jax.jit(lambda state: gasil_jax.iterate(env, config, state))
+
+    def train(state):
+        rows = []
+        for _ in range(config.num_iterations):
+            state, metrics = iterate(state)
+            rows.append(metrics)
+        return state, jax.tree.map(lambda *x: np.stack(x), *rows)
+
+    first = gasil_jax.init(env, config, jax.random.key(0))
+    state, metrics = train(first)
     assert np.nansum(metrics["episodes"]) > 0
     ended = np.asarray(metrics["episodes"]) > 0
     assert (np.asarray(metrics["episode_length"])[ended] == LIMIT).all()
@@ -137,8 +146,12 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
         assert (counts == counts[0]).all() and counts[0] > 0
         assert counts[0] == np.nansum(metrics["episodes"])
     # All began together: more whole episodes, none cut.
-    _, together = train(config.replace(stagger_episodes=False))
-    assert np.nansum(together["episodes"]) == 8 * (24 // LIMIT)
+    together = config.replace(stagger_episodes=False)
+    ages = gasil_jax.init(env, together, jax.random.key(0)).environments.starting_age
+    assert not ages.any() and first.environments.starting_age.any()
+    environments = first.environments.replace(starting_age=ages)
+    _, metrics = train(first.replace(environments=environments))
+    assert np.nansum(metrics["episodes"]) == 8 * (24 // LIMIT)
 
 
 @pytest.mark.parametrize("delay", [4, 100])

@@ -11,7 +11,6 @@ import pytest
 import gasil_jax
 from gasil_jax import rollout
 from gasil_jax import train as training
-from gasil_jax.imitation import AGENTS
 
 SMALL = gasil_jax.Config(
     total_steps=512,
@@ -29,85 +28,24 @@ SMALL = gasil_jax.Config(
 )
 
 
-@functools.cache
-def trainer(agent="ppo+gasil"):
-    env = gasil_jax.make_env("point_mass")
-    return jax.jit(gasil_jax.make_train(env, SMALL.replace(agent=agent)))
-
-
-# GAIL needs an expert: tests/test_gail.py.
-SELF_TAUGHT = [name for name in gasil_jax.agents() if name != "gail"]
-
-
-def test_vmap_over_every_hyperparameter_equals_single_runs():
-    env = gasil_jax.make_env("point_mass")
-    # Counts may be less than those of the configuration, which decide the shapes.
-    larger = SMALL.replace(buffer_steps=130, discriminator_updates=4)
-    train = gasil_jax.make_train(env, larger)
-    key, plain = jax.random.key(0), SMALL.hyperparameters
-    half = jax.tree.map(lambda x: 0.5 * x, plain)
-    counts = {"buffer_steps": 100, "discriminator_updates": 2}
-    both = (plain, half.replace(**counts))
-    stacked = jax.tree.map(lambda *x: jnp.array(x), *both)
-    _, swept = jax.jit(jax.vmap(train, in_axes=(None, 0)))(key, stacked)
-    for i, hyperparameters in enumerate(both):
-        _, single = trainer()(key, hyperparameters)
-        for name in (
-            "bonus",
-            "policy_loss",
-            "value_loss",
-            "learning_rate",
-            "good_steps",
-        ):
-            np.testing.assert_allclose(
-                swept[name][i], single[name], rtol=1e-3, atol=1e-5, err_msg=name
-            )
-    assert np.all(swept["bonus"][0] > swept["bonus"][1])
-
-
-@pytest.mark.parametrize("agent", SELF_TAUGHT)
-def test_an_agent_looks_at_the_fields_that_it_says_and_at_no_others(agent):
-    env = gasil_jax.make_env("point_mass")
-    train = gasil_jax.make_train(env, SMALL.replace(agent=agent, total_steps=768))
-    plain = SMALL.hyperparameters
-    every = {name for each in AGENTS.values() for name in each.fields}
-    swept = sorted(name for name in every if hasattr(plain, name))
-    changed = [plain.replace(**{name: getattr(plain, name) / 2}) for name in swept]
-    stacked = jax.tree.map(lambda *x: jnp.array(x), plain, *changed)
-    last, _ = jax.jit(jax.vmap(train, in_axes=(None, 0)))(jax.random.key(0), stacked)
-    (first, *_) = [np.asarray(x) for x in jax.tree.leaves(last.actor_critic)]
-    seen = {x for x, w in zip(swept, first[1:], strict=True) if (w != first[0]).any()}
-    assert seen == {name for name in AGENTS[agent].fields if name in swept}
-
-
 def test_it_trains_an_environment_of_brax():
-    env = gasil_jax.make_env("brax:inverted_pendulum")
-    assert isinstance(env.unwrapped, brax.envs.inverted_pendulum.InvertedPendulum)
+    env = gasil_jax.make_env("brax:fast")
     config = SMALL.replace(agent="ppo", total_steps=1024, max_episode_steps=50)
     state, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
     assert np.all(np.isfinite(metrics["policy_loss"]))
-    # One point for each step upright, and no episode above the limit.
-    np.testing.assert_allclose(metrics["episode_return"], metrics["episode_length"])
-    assert np.nanmax(metrics["episode_length"]) <= 50
+    # No episode ends by itself, and none is longer than the limit.
+    assert set(np.asarray(metrics["episode_length"])) == {50.0}
     assert int(state.good_trajectories.size) > 0
 
 
-@pytest.mark.parametrize("agent", SELF_TAUGHT)
-def test_it_learns_on_the_point_mass(agent):
-    env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config(
-        agent=agent,
-        total_steps=40 * 2048,
-        hyperparameters=gasil_jax.Hyperparameters(
-            alpha=1.0, discriminator_updates=20, discriminator_learning_rate=3e-4
-        ),
+def test_an_environment_with_the_physics_of_brax_can_be_traced():
+    env = gasil_jax.make_env("brax:inverted_pendulum")
+    assert isinstance(env.unwrapped, brax.envs.inverted_pendulum.InvertedPendulum)
+    action = jnp.zeros(env.action_size)
+    state = jax.eval_shape(
+        lambda key: env.step(env.reset(key), action), jax.random.key(0)
     )
-    keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    _, metrics = jax.jit(jax.vmap(gasil_jax.make_train(env, config)))(keys)
-    returns = np.asarray(metrics["episode_return"])
-    # From about 5 at random, a blue object now and then; both and a green one are 20.
-    assert np.all(returns[:, 0] < 8.0)
-    assert np.all(returns[:, -3:].mean(1) > 18.0)
+    assert state.obs.shape == (env.observation_size,)
 
 
 @pytest.mark.parametrize("limit", [50, 30, 1])
@@ -166,11 +104,11 @@ def test_a_state_may_begin_outside_of_jit_and_be_donated():
     env = gasil_jax.make_env("point_mass", obs_noise=0.1)
     config = SMALL.replace(agent="ppo")
     key = jax.random.key(0)
-    state = gasil_jax.init(env, config, key)
-    step = jax.jit(lambda state: gasil_jax.iterate(env, config, state)[0])
+    iterate = lambda state: gasil_jax.iterate(env, config, state)[0]
+    step = jax.jit(iterate, donate_argnums=0)
+    result = step(gasil_jax.init(env, config, key))
     expected = step(jax.jit(lambda key: gasil_jax.init(env, config, key))(key))
-    result = jax.jit(step, donate_argnums=0)(state)
-    # A program of its own may round in another way.
+    # Compiled, the first state may be rounded in another way.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7)
     jax.tree.map(close, result.actor_critic, expected.actor_critic)
 
@@ -180,34 +118,6 @@ def test_double_precision_is_refused():
     with jax.enable_x64(True):
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
             gasil_jax.make_train(env, SMALL)
-
-
-def test_two_streams_of_the_same_reward_are_that_reward():
-    """Each has a value of its own; with one of them at weight 0 it is plain PPO."""
-
-    def twice(state, context, key):
-        reward = context.rollout.reward
-        return state, jnp.stack([reward, -3.0 * reward], axis=-1), {}
-
-    first_alone = lambda state, advantages, context: (advantages[..., 0], {})
-    two = AGENTS["ppo"]._replace(
-        update_and_reward=twice, num_streams=2, mix=first_alone
-    )
-    env = gasil_jax.make_env("point_mass")
-    AGENTS["two streams"] = two
-    try:
-        config = SMALL.replace(agent="two streams")
-        state, _ = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
-    finally:
-        del AGENTS["two streams"]
-    plain, _ = trainer("ppo")(jax.random.key(0))
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
-    jax.tree.map(close, state.actor_critic.policy, plain.actor_critic.policy)
-    first, second = state.actor_critic.values
-    jax.tree.map(close, first, plain.actor_critic.values[0])
-    (kernel, *_) = jax.tree.leaves(second.params)
-    (other, *_) = jax.tree.leaves(first.params)
-    assert not np.allclose(kernel, other)
 
 
 def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():

@@ -72,7 +72,7 @@ def test_stochastic_scores_vary_more(trained_point_mass):
     assert float(jnp.std(score(False))) > float(jnp.std(score(True)))
 
 
-def test_one_seed_scores_as_among_all_and_every_episode_is_written(tmp_path, capsys):
+def test_one_seed_scores_as_with_all_and_every_episode_is_written(tmp_path, capsys):
     folder = str(tmp_path / "run")
     toy = ("--hidden-sizes", "8", "--batch-steps", "64", "--num-envs", "4")
     begin = ("--seeds", "2", "--first-seed", "4", "--total-steps", "64")

@@ -86,7 +86,7 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     assert "(gamma 0.9)" in metadata["description"]
 
 
-def test_a_buffer_s_last_episode_is_kept_if_it_is_whole():
+def test_the_last_episode_of_a_buffer_is_kept_if_it_is_whole():
     lengths = lambda kept, *limits: [
         len(episode.action) for episode in export_minari.episodes(kept, *limits)
     ]

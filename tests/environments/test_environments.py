@@ -83,7 +83,7 @@ def gymnasium_transitions(name):
 # the acceleration jumps, and a rounding of the state decides in which substep.
 @pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME[1:])
-def test_one_step_is_gymnasiums(name, physics):
+def test_one_step_equals_gymnasiums(name, physics):
     env, reset, step = env_and_functions(name, physics)
     # Here, and not in a test of its own, so that a step is compiled once. A reset is
     # the same for all tasks, so MJX's, slow to compile, is compiled for one.
@@ -184,7 +184,7 @@ class Env(Env):
 """
 
 
-def test_one_s_own_environment_is_built(tmp_path, monkeypatch):
+def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
     (tmp_path / "own_that_is_whole.py").write_text(_OWN)
     monkeypatch.syspath_prepend(tmp_path)
     env = gasil_envs.make("own_that_is_whole:Env", reward_delay=3)
@@ -218,7 +218,7 @@ def test_one_s_own_environment_is_built(tmp_path, monkeypatch):
         (_OWN + "    episode_length = 0\n", "has episode_length 0: it must be a whole"),
     ],
 )
-def test_a_fault_of_one_s_own_environment_is_a_line(
+def test_a_fault_of_the_users_environment_is_one_line(
     module, message, tmp_path, monkeypatch
 ):
     name = f"own_{abs(hash(module))}"

@@ -89,7 +89,7 @@ class OnlyTruncating(Truncating):
         return super().step(state, action).replace(done=jnp.float32(0))
 
 
-def test_a_truncation_alone_ends_the_episode_and_gives_what_is_held():
+def test_a_truncation_alone_ends_the_episode_and_pays_the_held_reward():
     env = wrappers.EpisodeLimit(OnlyTruncating(4), 7)
     _, cut = roll(wrappers.RewardDelay(env, 3), 4)
     np.testing.assert_array_equal(cut.done, [0, 0, 0, 1])

@@ -1,9 +1,11 @@
-"""What a seed's result does not depend on, from the command line."""
+"""A seed's result does not depend on devices, other seeds or the process."""
 
 import csv
 
 import numpy as np
 from test_resume import SMALL, finish, start
+
+from gasil_jax import run
 
 BASE = (
     *SMALL,
@@ -22,21 +24,6 @@ BASE = (
 RELATIVE, ABSOLUTE = 2e-3, 2e-4
 
 
-def results(tmp_path, *variants):
-    """The bytes of metrics.csv of runs side by side."""
-    contents = []
-    for first in range(0, len(variants), 2):
-        children = []
-        for number, more in enumerate(variants[first : first + 2]):
-            out = tmp_path / f"{first + number}"
-            children.append((out, start(out, *BASE, *more)))
-        for out, child in children:
-            status, _, err = finish(child)
-            assert status == 0, err
-            contents.append((out / "metrics.csv").read_bytes())
-    return contents
-
-
 def by_seed(content):
     table = {}
     for row in csv.DictReader(content.decode().splitlines()):
@@ -46,23 +33,20 @@ def by_seed(content):
 
 
 def test_a_seeds_result_is_its_own(tmp_path):
-    # The second finds the first's program in the cache: they don't run side by side.
-    one, two, again, alone = results(
-        tmp_path,
-        ("--devices", "1"),
-        ("--devices", "2"),
-        ("--devices", "1"),
-        ("--devices", "1", "--first-seed", "7", "--seeds", "1"),
-    )
-    assert one == again
-    expected = by_seed(one)
-    assert set(expected) == {"5", "6", "7", "8"} and set(by_seed(alone)) == {"7"}
-    for other in (two, alone):
-        for seed, numbers in by_seed(other).items():
-            difference = np.abs(numbers - expected[seed])
-            print(seed, np.nanmax(difference / (1e-3 + np.abs(expected[seed]))))
-            np.testing.assert_allclose(
-                numbers, expected[seed], rtol=RELATIVE, atol=ABSOLUTE
-            )
+    """Compare four seeds on two devices, the same in another process, and one seed."""
+    here, again, alone = (tmp_path / name for name in ("here", "again", "alone"))
+    both = ("--devices", "2")
+    assert run.main([*BASE, *both, "--out", str(here)]) == 0
+    status, _, err = finish(start(again, *BASE, *both))
+    assert status == 0, err
+    of_one = ("--devices", "1", "--first-seed", "7", "--seeds", "1")
+    assert run.main([*BASE, *of_one, "--out", str(alone)]) == 0
+    contents = [(out / "metrics.csv").read_bytes() for out in (here, again, alone)]
+    assert contents[0] == contents[1]
+    expected, other = by_seed(contents[0]), by_seed(contents[2])
+    assert set(expected) == {"5", "6", "7", "8"} and set(other) == {"7"}
+    difference = np.abs(other["7"] - expected["7"])
+    print(np.nanmax(difference / (1e-3 + np.abs(expected["7"]))))
+    np.testing.assert_allclose(other["7"], expected["7"], rtol=RELATIVE, atol=ABSOLUTE)
     # Seeds differ.
     assert np.nanmax(np.abs(expected["5"] - expected["6"])) > 0.1

@@ -1,4 +1,4 @@
-"""Numbers that are not finite harm one step, one update, and nobody else."""
+"""Numbers that are not finite affect one step or update of one member alone."""
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +9,7 @@ from brax.envs import State
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import config, run
-from gasil_jax.host.members import make_batch
-
-SMALL = test_members.SMALL.replace(total_steps=4 * 128, buffer_steps=300)
+from gasil_jax import run
 
 
 def as_arrays(tree):
@@ -22,45 +19,52 @@ def as_arrays(tree):
     return [np.asarray(plain(x)) for x in jax.tree.leaves(tree)]
 
 
-def train(runs, advance, states, iterations):
+def train(agent, change, iterations):
+    """Train members from changed first states; return their last states and metrics."""
+    members, first, advance = test_members.compiled(agent)
+    states = members.to_devices(change(first))
     collected = []
     for i in range(iterations):
-        states, metrics = runs.train(advance, states, i, 1)
+        states, metrics = members.train(advance, states, i, 1)
         collected.append(metrics)
     joined = {
         name: np.concatenate([m[name] for m in collected], axis=1)
         for name in collected[0]
     }
-    return runs.trim(states), joined
+    return members.trim(states), joined
 
 
-@pytest.mark.parametrize("agent", ["ppo+gasil", "ppo+sil"])
+def assert_others_are_equal(states, others_states):
+    """All but the second of three members are the same, bit for bit."""
+    others = np.array([0, 2])
+    for left, right in zip(as_arrays(states), as_arrays(others_states), strict=True):
+        np.testing.assert_array_equal(left[others], right[others])
+
+
+@pytest.mark.parametrize(
+    "agent",
+    [
+        pytest.param(agent, marks=pytest.mark.xdist_group(f"members {agent}"))
+        for agent in ("ppo+gasil", "ppo+sil")
+    ],
+)
 def test_a_nan_in_one_environment_of_one_seed(agent):
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    # An episode that is cut short has no return either.
-    config = SMALL.replace(agent=agent, stagger_episodes=False)
-    runs = make_batch(env, config, [3, 4, 5, 6])
-    states, advance = runs.compile()
-    clean, clean_metrics = train(runs, advance, states, 3)
-
-    states = jax.tree.map(np.asarray, runs.init().environments.state.pipeline_state)
-    hurt = jax.tree.map(
-        lambda x: (
-            x.at[1, 2].set(jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
-        ),
-        jax.tree.map(jnp.asarray, states),
-    )
-    start = runs.init()
-    environments = start.environments
-    start = start.replace(
-        environments=environments.replace(
-            state=environments.state.replace(pipeline_state=hurt)
+    def hurt(states):
+        environments = states.environments
+        physics = jax.tree.map(
+            lambda x: (
+                x.at[1, 2].set(jnp.nan) if jnp.issubdtype(x.dtype, jnp.floating) else x
+            ),
+            environments.state.pipeline_state,
         )
-    )
-    after, metrics = train(runs, advance, jax.device_put(start, runs.sharding), 3)
+        state = environments.state.replace(pipeline_state=physics)
+        return states.replace(environments=environments.replace(state=state))
 
-    # One step of seed 4 is counted, and its episode is over with it.
-    np.testing.assert_array_equal(metrics["faulty_steps"].sum(axis=1), [0, 1, 0, 0])
+    clean, clean_metrics = train(agent, lambda states: states, 3)
+    after, metrics = train(agent, hurt, 3)
+
+    # One step of the second seed is counted, and its episode is over with it.
+    np.testing.assert_array_equal(metrics["faulty_steps"].sum(axis=1), [0, 1, 0])
     assert metrics["skipped_updates"].sum() == 0
     learned = (after.actor_critic.params, after.imitation, after.normalizer)
     for leaf in as_arrays(learned):
@@ -69,36 +73,26 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
     for leaf in (after.good_trajectories.observation, after.good_trajectories.return_):
         assert np.isfinite(leaf[1, :filled]).all()
     # Its return is unknown.
-    assert np.isnan(after.history.reward).sum(axis=(1, 2)).tolist() == [0, 1, 0, 0]
-    # The others are what they were, bit for bit.
-    others = np.array([0, 2, 3])
-    for left, right in zip(as_arrays(after), as_arrays(clean), strict=True):
-        np.testing.assert_array_equal(left[others], right[others])
-    for name in metrics:
-        np.testing.assert_array_equal(
-            metrics[name][others], clean_metrics[name][others], err_msg=name
-        )
+    assert np.isnan(after.history.reward).sum(axis=(1, 2)).tolist() == [0, 1, 0]
+    assert_others_are_equal(after, clean)
+    assert_others_are_equal(metrics, clean_metrics)
 
 
+@pytest.mark.xdist_group("members ppo+gasil")
 def test_an_update_that_is_not_finite_is_skipped_and_flagged():
-    env = gasil_jax.make_env("point_mass")
-    usual = config.Hyperparameters()
-    wild = usual.replace(learning_rate=float("inf"))
-    runs = make_batch(env, SMALL, [3, 4, 5, 6], [usual, wild, usual, usual])
-    states, advance = runs.compile()
-    before = as_arrays(states.actor_critic)
-    after, metrics = train(runs, advance, states, 2)
-    np.testing.assert_array_equal(metrics["skipped_updates"].sum(axis=1), [0, 2, 0, 0])
+    def wild(states):
+        rate = states.hyperparameters.learning_rate.at[1].set(jnp.inf)
+        hyperparameters = states.hyperparameters.replace(learning_rate=rate)
+        return states.replace(hyperparameters=hyperparameters)
+
+    _, first, _ = test_members.compiled("ppo+gasil")
+    after, metrics = train("ppo+gasil", wild, 2)
+    np.testing.assert_array_equal(metrics["skipped_updates"].sum(axis=1), [0, 2, 0])
+    before = as_arrays(first.actor_critic)
     for left, right in zip(as_arrays(after.actor_critic), before, strict=True):
         np.testing.assert_array_equal(left[1], right[1])
-    calm = make_batch(env, SMALL, [3, 4, 5, 6], [usual] * 4)
-    states, _ = calm.compile()
-    expected, _ = train(calm, advance, states, 2)
-    others = np.array([0, 2, 3])
-    for left, right in zip(
-        as_arrays(after.actor_critic), as_arrays(expected.actor_critic)
-    ):
-        np.testing.assert_array_equal(left[others], right[others])
+    expected, _ = train("ppo+gasil", lambda states: states, 2)
+    assert_others_are_equal(after.actor_critic, expected.actor_critic)
 
 
 def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
@@ -106,6 +100,8 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
     arguments = (
         "--env",
         "point_mass",
+        "--agent",
+        "ppo",
         "--seeds",
         "2",
         "--total-steps",
@@ -133,7 +129,7 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
 
 
 class Fragile:
-    """A line whose reward, and nothing else, is NaN beyond a certain position."""
+    """A line whose reward alone is NaN beyond a certain position."""
 
     observation_size, action_size, episode_length = 1, 1, 20
 
@@ -150,7 +146,9 @@ class Fragile:
 @pytest.mark.parametrize("limit", [20, 15])
 def test_a_reward_that_is_held_back_is_looked_at_too(limit):
     env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), 20), 10)
-    small = SMALL.replace(max_episode_steps=limit)
+    small = test_members.SMALL.replace(
+        agent="ppo", total_steps=4 * 128, max_episode_steps=limit
+    )
     _, metrics = jax.jit(gasil_jax.make_train(env, small))(jax.random.key(0))
     assert metrics["faulty_steps"].sum() > 0
     assert metrics["skipped_updates"].sum() == 0

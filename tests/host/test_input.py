@@ -1,4 +1,4 @@
-"""Any input at all: refused in one line before anything compiles, or it runs."""
+"""Any input either runs or is refused in one line before anything compiles."""
 
 import contextlib
 import dataclasses
@@ -24,7 +24,7 @@ from gasil_jax.imitation import expert
 
 
 def names(kind):
-    """Fields that are numbers, and tuples of them."""
+    """Return the fields that are numbers or tuples of numbers."""
     return [
         f.name
         for f in dataclasses.fields(kind)
@@ -97,7 +97,7 @@ ANY_FLOAT = st.one_of(
 
 @st.composite
 def configurations(draw):
-    """Small ones, about half of them valid."""
+    """Draw small configs, about half of them valid."""
     floats = {"buffer_steps": draw(st.integers(1, 60))} | {
         field.name: draw(ANY_FLOAT)
         for field in dataclasses.fields(gasil_jax.Hyperparameters)
@@ -213,7 +213,7 @@ def test_settings_are_refused_or_made(delay, noise):
 
 
 class Bomb:
-    """Unpickling it would leave a mark."""
+    """An object whose unpickling leaves a mark."""
 
     def __reduce__(self):
         return (exec, ("import builtins; builtins.exploded = True",))

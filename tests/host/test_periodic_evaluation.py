@@ -1,4 +1,4 @@
-"""Policies that are scored while they train."""
+"""Policies are evaluated during training."""
 
 import csv
 import json
@@ -19,7 +19,7 @@ from gasil_jax import plot, run, sweep
 from gasil_jax.evaluation import evaluate as evaluate_directly
 from gasil_jax.figures import plotting, statistics
 from gasil_jax.host import checkpoint, trackers
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 from gasil_jax.host.periodic_evaluation import (
     EvaluationSchedule,
     PeriodicEvaluation,
@@ -72,7 +72,7 @@ TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
 
 
 class Collector:
-    """A tracker that keeps the scalars it gets."""
+    """A tracker that keeps the scalars that it gets."""
 
     taken: list = []  # noqa: RUF012
 
@@ -88,7 +88,7 @@ class Collector:
 
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory):
-    """The folder of a run with evaluations, and what its tracker was given."""
+    """The folder of a run with evaluations, and the scalars of its tracker."""
     out = tmp_path_factory.mktemp("evaluated") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(trackers.TRACKERS, "collector", ("json", Collector))
@@ -104,7 +104,7 @@ def rows(out):
 
 
 def means(out):
-    """The mean over seeds by iteration."""
+    """Return the mean score over seeds for each iteration."""
     by_iteration = {}
     for row in rows(out):
         iteration = int(row["env_steps"]) // 128
@@ -183,7 +183,7 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     ).read_bytes()
 
 
-def test_an_interrupted_run_goes_on_with_its_scores(evaluated, tmp_path, monkeypatch):
+def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monkeypatch):
     whole, out = evaluated[0], tmp_path / "out"
     score = PeriodicEvaluation.score
 
@@ -282,17 +282,17 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, monkeypatch):
 
 
 def scored(tmp_path, seeds, devices, times=1):
-    """Mean, least and greatest return of each seed's first policy, made to act."""
+    """Return the mean, lowest and highest return of each seed's amplified policy."""
     env = gasil_jax.make_env("point_mass", reward_delay=7)
     config = test_members.SMALL.replace(agent="ppo")
-    runs = make_batch(env, config, seeds, devices=jax.devices()[:devices])
-    states = runs.init()
+    members = make_members(env, config, seeds, devices=jax.devices()[:devices])
+    states = members.init()
     # The first policies hardly move.
     params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
     states = states.replace(actor_critic=params)
     path = tmp_path / f"{devices}.csv"
     evaluation = PeriodicEvaluation(
-        runs, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
+        members, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
     )
     for _ in range(times):
         evaluation.score(states, 1)

@@ -1,4 +1,4 @@
-"""What a run says that it is doing, where there is no terminal."""
+"""Progress messages where there is no terminal."""
 
 import functools
 import io
@@ -20,7 +20,7 @@ def wait_for_text(capsys, seconds=20.0):
     return text
 
 
-def test_what_takes_long_is_said_in_one_line(monkeypatch, capsys):
+def test_a_slow_phase_is_announced_in_one_line(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 0.01)
     with progress.announced("hopper", "building"):
         assert wait_for_text(capsys) == "hopper: building\n"
@@ -29,12 +29,12 @@ def test_what_takes_long_is_said_in_one_line(monkeypatch, capsys):
         raise OSError("full")
 
 
-def test_what_is_quick_is_not_said(monkeypatch, capsys):
+def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 600.0)
     before = threading.active_count()
     with progress.announced("hopper", "building"):
         assert threading.active_count() == before + 1
-    # What would have said it has ended, long before its time.
+    # The thread that would have announced it ends at once.
     deadline = time.monotonic() + 20.0
     while threading.active_count() > before and time.monotonic() < deadline:
         time.sleep(0.005)
@@ -42,7 +42,7 @@ def test_what_is_quick_is_not_said(monkeypatch, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_what_is_done_aside_does_not_count_in_the_speed(monkeypatch, capsys):
+def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     clock = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with progress.Progress("hopper ppo", 2000) as shown:

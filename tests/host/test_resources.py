@@ -1,16 +1,14 @@
-"""Memory: estimated before a run, and flat during one."""
-
-import pathlib
+"""Memory and disk are estimated before a run; memory during one: test_resume.py."""
 
 import jax
 import numpy as np
 import pytest
-from test_resume import SMALL, finish, rows, start, wait_for
+from test_resume import SMALL
 
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.host import resources
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import make_members
 
 
 @pytest.mark.parametrize(
@@ -23,14 +21,14 @@ from gasil_jax.host.members import make_batch
 def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     env = gasil_jax.make_env("point_mass")
     config = gasil_jax.Config(agent=agent, **changes)
-    runs = make_batch(env, config, range(3), devices=jax.devices()[:1])
-    states = jax.eval_shape(runs.init)
-    account = runs.advance.lower(states, np.int32(0)).compile().memory_analysis()
+    members = make_members(env, config, range(3), devices=jax.devices()[:1])
+    states = jax.eval_shape(members.init)
+    account = members.advance.lower(states, np.int32(0)).compile().memory_analysis()
     total = account.temp_size_in_bytes + account.argument_size_in_bytes
     assert 0.5 < 3 * resources.need(env, config).memory / total < 2.0
 
 
-def test_what_cannot_fit_is_refused_with_the_numbers(monkeypatch, tmp_path, capsys):
+def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
     arguments = [*SMALL, "--out", str(tmp_path / "out")]
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
     assert run.main(arguments) == 2
@@ -57,18 +55,3 @@ def test_what_cannot_fit_is_refused_with_the_numbers(monkeypatch, tmp_path, caps
 def test_available_memory_is_read():
     free = resources.available(jax.devices())
     assert free is None or 10**7 < free < 10**14
-
-
-def test_a_thousand_iterations_take_no_more_memory(tmp_path):
-    out = tmp_path / "out"
-    child = start(out, *SMALL, "--total-steps", str(1_100 * 128))
-    resident = lambda: int(
-        pathlib.Path(f"/proc/{child.pid}/statm").read_text().split()[1]
-    )
-    pages = []
-    for iterations in (100, 400, 700, 1000):
-        wait_for(lambda: rows(out) > 3 * iterations, child)  # noqa: B023
-        pages.append(resident())
-    status, _, err = finish(child)
-    assert status == 0, err
-    assert max(pages[1:]) * 4096 - pages[0] * 4096 < 20e6, pages

@@ -1,5 +1,6 @@
 """A run that is stopped early loses nothing, and continues bit for bit."""
 
+import itertools
 import json
 import os
 import pathlib
@@ -19,7 +20,7 @@ import test_members
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.host import checkpoint, run_folder
-from gasil_jax.host.members import make_batch
+from gasil_jax.host.members import Members
 
 ITERATIONS = 400
 # PPO's state, which has the buffer too, compiles soonest; every agent's: below.
@@ -89,25 +90,66 @@ def rows(out):
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    """A run that nothing disturbed, without checkpoints on the way."""
+def whole_and_memory(tmp_path_factory):
+    """An undisturbed run without checkpoints on the way, and its memory in MB.
+
+    The memory is that of the process after 80, 200, 300 and 390 iterations.
+    """
     out = tmp_path_factory.mktemp("whole") / "out"
-    status, _, err = finish(start(out, *SMALL))
+    child = start(out, *SMALL)
+    statistics = pathlib.Path(f"/proc/{child.pid}/statm")
+    memory = []
+    for iterations in (80, 200, 300, 390):
+        wait_for(lambda: rows(out) > 3 * iterations, child)  # noqa: B023
+        pages = int(statistics.read_text().split()[1])
+        memory.append(pages * resource.getpagesize() / 1e6)
+    status, _, err = finish(child)
     assert status == 0, err
-    return out
+    return out, memory
 
 
-def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
+@pytest.fixture(scope="module")
+def whole(whole_and_memory):
+    """The folder of the undisturbed run."""
+    return whole_and_memory[0]
+
+
+def test_iterations_take_no_more_memory(whole_and_memory):
+    _, (first, *later) = whole_and_memory
+    print("MB:", first, *later)
+    assert max(later) - first < 10.0
+
+
+def interrupt_at_call(count, monkeypatch):
+    """Send this process SIGINT when it trains its chunk number `count`."""
+    train, calls = Members.train, itertools.count(1)
+
+    def interrupted(self, *arguments):
+        if next(calls) == count:
+            os.kill(os.getpid(), signal.SIGINT)
+        return train(self, *arguments)
+
+    monkeypatch.setattr(Members, "train", interrupted)
+
+
+def test_killed_again_and_again_it_ends_as_if_undisturbed(
+    whole, tmp_path, monkeypatch, capsys
+):
     out = tmp_path / "out"
     root = out / "checkpoints"
     new = lambda: set(checkpoints(out)) - before
 
-    # A run that was killed before its first checkpoint starts again.
+    # While it runs, its folder is locked.
     before = set()
     child = start(out, *SMALL, "--checkpoint-every", str(10**9))
     wait_for(lambda: rows(out) > 30, child)
+    assert run.main(["--resume", "--out", str(out)]) == 2
+    assert f"process {child.pid}" in capsys.readouterr().err
     child.kill()
     finish(child)
+    with run_folder.lock(out):
+        pass
+    # It was killed before its first checkpoint, so it starts again.
     assert checkpoints(out) == []
 
     # During one: what is half written does not count.
@@ -127,13 +169,8 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
     child.kill()
     finish(child)
 
-    # SIGTERM and Ctrl-C save and say how to go on.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        before = set(checkpoints(out))
-        child = start(out, "--resume", *OFTEN)
-        wait_for(new, child)
-        child.send_signal(number)
-        status, _, err = finish(child)
+    # SIGTERM and Ctrl-C save and say how to continue.
+    def assert_saved(status, number, err):
         assert status == 128 + number
         assert "Traceback" not in err and "all that was done is saved" in err
         command = re.search(r"python -m gasil_jax.run --resume --out (\S+)", err)
@@ -141,8 +178,20 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(whole, tmp_path):
         done = int(max(checkpoints(out)))
         assert done < ITERATIONS and rows(out) == 1 + 3 * done
 
-    status, _, err = finish(start(out, "--resume", *OFTEN))
-    assert status == 0, err
+    before = set(checkpoints(out))
+    child = start(out, "--resume", *OFTEN)
+    wait_for(new, child)
+    child.send_signal(signal.SIGTERM)
+    status, _, err = finish(child)
+    assert_saved(status, signal.SIGTERM, err)
+
+    # From here on in this process: programs and folders are the same.
+    resumed = ["--resume", "--out", str(out), *OFTEN]
+    with monkeypatch.context() as patch:
+        interrupt_at_call(2, patch)
+        status = run.main(resumed)
+    assert_saved(status, signal.SIGINT, capsys.readouterr().err)
+    assert run.main(resumed) == 0
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     assert list(out.glob("metrics-cut-*.csv"))  # no row is thrown away
     # The newest two and the best.
@@ -189,7 +238,9 @@ def test_resume_needs_a_folder(capsys):
         ),
     ],
 )
-def test_a_damaged_table_is_told_in_one_line(damage, message, whole, tmp_path, capsys):
+def test_a_damaged_table_is_reported_in_a_line(
+    damage, message, whole, tmp_path, capsys
+):
     out = copy(whole, tmp_path)
     damage(out / "metrics.csv")
     assert run.main(["--resume", "--out", str(out)]) == 2
@@ -211,8 +262,7 @@ def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
 def test_total_steps_may_grow(whole, tmp_path):
     out = copy(whole, tmp_path)
     more = str((ITERATIONS + 5) * 128)
-    status, _, err = finish(start(out, "--resume", "--total-steps", more))
-    assert status == 0, err
+    assert run.main(["--resume", "--out", str(out), "--total-steps", more]) == 0
     assert rows(out) == 1 + 3 * (ITERATIONS + 5)
     assert (
         (out / "metrics.csv")
@@ -269,7 +319,7 @@ def edit_the_manifest(**changes):
         lambda folder: (folder / "manifest.json").write_text("3"),
     ],
 )
-def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_path):
+def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_used(damage, tmp_path):
     root = tmp_path / "checkpoints"
     states = [{"x": np.full(1000, float(i), np.float32)} for i in range(3)]
     for i, state in enumerate(states):
@@ -286,14 +336,15 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_pat
     assert checkpoint.latest(root)[0].iteration == 2
 
 
-def test_a_run_goes_on_from_the_checkpoint_before_a_damaged_one(whole, tmp_path):
+def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
+    whole, tmp_path, capsys
+):
     out = copy(whole, tmp_path)
     # The best and the last.
     *_, last = checkpoints(out)
     flip_a_bit(out / "checkpoints" / last)
-    status, _, err = finish(start(out, "--resume"))
-    assert status == 0, err
-    assert f"{last} is damaged" in err
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert f"{last} is damaged" in capsys.readouterr().err
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
     assert (out / "checkpoints" / f"{last}.damaged").is_dir()
@@ -335,49 +386,30 @@ def test_a_full_disk_in_mid_run_leaves_the_last_checkpoint(whole, tmp_path):
     assert err.splitlines()[-1].startswith("error: ") and "Traceback" not in err
     newest, damages = checkpoint.latest(out / "checkpoints")
     assert newest is not None and damages == []
-    status, _, err = finish(start(out, "--resume"))
-    assert status == 0, err
+    assert run.main(["--resume", "--out", str(out)]) == 0
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
 
 
-def test_a_folder_in_use_is_refused_until_its_process_dies(tmp_path, capsys):
-    out = tmp_path / "out"
-    child = start(out, *SMALL)
-    wait_for(lambda: rows(out) > 1, child)
-    assert run.main(["--resume", "--out", str(out)]) == 2
-    assert f"process {child.pid}" in capsys.readouterr().err
-    child.kill()
-    finish(child)
-    with run_folder.lock(out):
-        pass
-
-
-AGENTS = [name for name in gasil_jax.agents() if name != "gail"]
-
-
-@pytest.mark.parametrize("agent", AGENTS)
-def test_every_agent_goes_on_bit_for_bit(agent, tmp_path):
-    """Three members on two devices: one is padding."""
-    env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
-    config = test_members.SMALL.replace(
-        agent=agent,
-        total_steps=4 * 128,
-        buffer_steps=100,
-        sil_buffer_steps=200,
-        sil_minibatch_size=32,
-    )
-    runs = make_batch(env, config, [3, 4, 5])
-    states, advance = runs.compile()
+@pytest.mark.parametrize(
+    "agent",
+    [
+        pytest.param(name, marks=pytest.mark.xdist_group(f"members {name}"))
+        for name in gasil_jax.agents()
+        if name != "gail"
+    ],
+)
+def test_every_agent_continues_bit_for_bit(agent, tmp_path):
+    members, first, advance = test_members.compiled(agent)
     rest = []
-    states, _ = runs.train(advance, states, 0, 1)
-    states, _ = runs.train(advance, states, 1, 1)
-    checkpoint.write(tmp_path, 2, runs.trim(states), {})
+    states, _ = members.train(advance, members.to_devices(first), 0, 1)
+    states, _ = members.train(advance, states, 1, 1)
+    checkpoint.write(tmp_path, 2, members.trim(states), {})
     newest, _ = checkpoint.latest(tmp_path)
-    like = jax.eval_shape(lambda: runs.trim(runs.init()))
-    for before in (states, runs.place(newest.restore(like))):
-        after, metrics = runs.train(advance, before, 2, 1)
-        after, more = runs.train(advance, after, 3, 1)
-        after = jax.tree.leaves(runs.trim(after))
+    like = jax.eval_shape(lambda: first)
+    for before in (states, members.to_devices(newest.restore(like))):
+        after, metrics = members.train(advance, before, 2, 1)
+        after, more = members.train(advance, after, 3, 1)
+        after = jax.tree.leaves(members.trim(after))
         rest.append(
             [
                 metrics,

@@ -14,6 +14,8 @@ from gasil_jax.sweeps import assembly
 SMALL = (
     "--env",
     "point_mass",
+    "--agent",
+    "ppo",
     "--seeds",
     "2",
     "--first-seed",
@@ -102,7 +104,7 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     out = tmp_path / "out"
     out.mkdir()
     labels = {"seed": [3, 4]}
-    # A run and how it goes on, with more steps than it had.
+    # A run, and its continuation with more steps.
     for total_steps, steps in ((256, [128, 256]), (384, [384])):
         (tracker,) = trackers.make(["wandb"], out, {"total_steps": total_steps})
         returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])

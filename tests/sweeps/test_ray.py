@@ -35,11 +35,11 @@ def cluster():
 
 
 def process_of(folder):
-    """Of the shard that is trained in a folder."""
+    """Return the process that trains the shard in a folder."""
     return int(re.match(r"process (\d+)", (folder / ".lock").read_text()).group(1))
 
 
-def test_a_killed_workers_shard_goes_on_from_its_checkpoint(cluster, tmp_path):
+def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp_path):
     out = tmp_path / "out"
     shard = out / "shards" / "2-of-2"
     killed = []
@@ -76,15 +76,16 @@ def test_a_killed_workers_shard_goes_on_from_its_checkpoint(cluster, tmp_path):
     assert len(beside) <= 1
     arguments[arguments.index("ray")] = "local"
     before = {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")}
-    assert sweep.main([*arguments, "--out", str(out)]) == 0
+    assert sweep.main([*arguments, "--out", str(out)]) == 2
+    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 0
     assert {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")} == before
 
 
 def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
-    """The disk is full: its folder can't be made."""
+    """A file stands where the folder of the shard must be made."""
     out = tmp_path / "out"
     (out / "shards").mkdir(parents=True)
     (out / "shards" / "1-of-1").touch()
     arguments = [*SMALL, "--grid", "alpha=1", "--launcher", "ray", "--shards", "1"]
-    assert sweep.main([*arguments, "--out", str(out)]) == 1
+    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 1
     assert "shard 1/1 (status 2) failed" in capsys.readouterr().err

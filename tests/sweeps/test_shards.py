@@ -1,4 +1,4 @@
-"""Shards of a sweep: each member in one of them, and one table out of all."""
+"""Shards of a sweep hold each member once, and merge into the same tables."""
 
 import json
 import shutil
@@ -16,7 +16,7 @@ from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, metrics_files, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.sweeps import launch, shards, tables
+from gasil_jax.sweeps import assembly, launch, shards, tables
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -71,7 +71,7 @@ GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
 
 
 def train(folder, shard=None, *arguments):
-    """What training leaves, with made-up metrics that are a member's own."""
+    """Write the files of a trained sweep, with metrics that tell members apart."""
     small = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
     small += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
     options = command_line.parse(
@@ -118,7 +118,7 @@ TABLES = ("results.csv", "curves.npz", "sweep.png")
 
 @pytest.mark.parametrize("count", [1, 5, 12])
 def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
-    """Five of twelve members: points are cut through, and programs."""
+    """Five shards of twelve members divide points and programs."""
     trained, points = train(tmp_path / "whole")
     expected = tables.write(tmp_path / "whole", points, range(3), [trained])
     assert expected["points"][1]["mean"] is None  # never ended
@@ -143,7 +143,7 @@ def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
         assert described["shard"] is None and described["points"] == tuple(points)
 
 
-def test_what_does_not_belong_together_is_not_merged(tmp_path, capsys):
+def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     def refused(*arguments):
         assert merge.main([str(x) for x in arguments]) == 2
         error = capsys.readouterr().err
@@ -206,21 +206,87 @@ def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, caps
     assert sweep.main([*more, str(tmp_path / "whole"), "--shard", "1/2"]) == 2
     assert "not in shards" in capsys.readouterr().err
     assert sweep.main(["--resume", "--out", str(tmp_path / "parts")]) == 2
-    assert "go on with each of them" in capsys.readouterr().err
+    assert "continue each of them with --shard and --resume" in capsys.readouterr().err
     for again in (["--shard", "1/3"], ["--launcher", "local", "--shards", "3"]):
         assert sweep.main([*more, str(tmp_path / "parts"), *again]) == 2
         assert "is cut into 2" in capsys.readouterr().err
-    # With its own settings: where it is trained, nothing is left to do.
-    same = [*more, str(tmp_path / "parts"), "--shard", "1/2"]
-    assert sweep.main(same) == 0
-    assert "shard 1/2 is done" in capsys.readouterr().out
-    assert sweep.main([*same, "--gamma", "0.9"]) == 2
+
+
+def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
+    jobs_to_train = []
+
+    def interrupted_at_once(options, env, jobs, **_):
+        jobs_to_train.extend(job for job in jobs if not job.finished)
+        raise Interrupted(signal.SIGTERM)
+
+    monkeypatch.setattr(assembly, "train", interrupted_at_once)
+    trained, _ = train(tmp_path, "1/2")
+    folder = trained.folder
+    more = ["--env", "point_mass", "--grid", *GRID, "--out", str(tmp_path)]
+    same = [*more, "--shard", "1/2"]
+    assert sweep.main(same) == 2
+    error = capsys.readouterr().err
+    assert f"{folder}, which is not empty: " in error and "with --resume" in error
+    assert len(error.splitlines()) == 1
+    assert sweep.main([*same, "--resume", "--gamma", "0.9"]) == 2
     assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
+    # The shard's own settings are used, and nothing is left to do.
+    resumed = ([*same, "--resume"], ["--resume", "--out", str(folder)])
+    for command in resumed:
+        assert sweep.main(command) == 0
+        assert "shard 1/2 is done" in capsys.readouterr().out
+    # An unfinished program is trained with the shard's members alone. The second
+    # command is the one that the first one prints when it is interrupted.
+    program = trained.programs[-1]
+    (program.folder(folder) / "training.json").unlink()
+    for command in resumed:
+        assert sweep.main(command) == 128 + signal.SIGTERM
+        job = jobs_to_train.pop()
+        assert job.folder == program.folder(folder)
+        assert job.program.members == program.members
+        assert f"gasil_jax.sweep --resume --out {folder}" in capsys.readouterr().err
+    assert not jobs_to_train
+    # A cluster that runs a job again may do so before the job has begun.
+    begin = [*more, "--shard", "2/2", "--resume", "--seeds", "3"]
+    assert sweep.main(begin) == 128 + signal.SIGTERM
+    assert sum(len(job.program.members) for job in jobs_to_train) == 6
+
+
+def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):
+    launched = []
+    monkeypatch.setitem(
+        launch.LAUNCHERS, "local", lambda program, jobs, devices: launched.append(jobs)
+    )
+    out = tmp_path / "out"
+    for number in ("1/2", "2/2"):
+        train(out, number)
+    more = ["--env", "point_mass", "--grid", *GRID, "--launcher", "local"]
+    more += ["--seeds", "3", "--shards", "2"]
+    assert sweep.main([*more, "--out", str(out)]) == 2
+    assert "continue them with --resume" in capsys.readouterr().err
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "text.tex").touch()
+    for resume in ([], ["--resume"]):
+        assert sweep.main([*more, *resume, "--out", str(tmp_path / "thesis")]) == 2
+        error = capsys.readouterr().err
+        assert "is not empty" in error and "--resume" not in error
+    assert not launched
+    assert sweep.main([*more, "--resume", "--out", str(out)]) == 0
+    (jobs,) = launched
+    assert list(jobs) == ["shard 1/2", "shard 2/2"]
+    for name, arguments in jobs.items():
+        assert arguments.count("--resume") == 1
+        assert sweep.main(arguments) == 0
+        assert f"{name} is done" in capsys.readouterr().out
+    # A job continues when it is run again, even if the launch was the first.
+    assert sweep.main([*more, "--out", str(tmp_path / "new")]) == 2
+    assert "must hold shards" in capsys.readouterr().err
+    assert all("--resume" in arguments for arguments in launched[-1].values())
 
 
 @pytest.fixture
 def program(tmp_path, monkeypatch):
-    """A module whose first argument names a folder, and the second what happens."""
+    """A module that ends as its second argument says; its first one is a folder."""
     (tmp_path / "job.py").write_text(
         textwrap.dedent(
             """

@@ -1,21 +1,20 @@
-"""Sweeps: which run, which are refused; a point's results are those of a single run."""
+"""Sweeps run or are refused; a point's results are those of a single run."""
 
 import csv
 import json
+import os
 import signal
-import subprocess
-import sys
 import types
 
 import jax
 import numpy as np
 import pytest
-from test_resume import finish, wait_for
 
 from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_options
+from gasil_jax.host.members import Members
 from gasil_jax.sweeps import saved_states, shards, tables
 from gasil_jax.sweeps.points import PAPER_RANGES
 
@@ -209,15 +208,16 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
 
     # A half of the points has a program for itself, of the same shapes.
     parts = tmp_path / "parts"
-    part = lambda number: sweep.main(
-        [*SMALL, "--seeds", "2", *grid, "--out", str(parts), "--shard", f"{number}/2"]
+    where = ("--out", str(parts), "--shard")
+    part = lambda number, *more: sweep.main(
+        [*SMALL, "--seeds", "2", *grid, *where, f"{number}/2", *more]
     )
     assert part(2) == 0
     assert merge.main([str(parts)]) == 2
     assert "missing: shards 1/2" in capsys.readouterr().err
     assert part(1) == 0
     before = {p: p.stat().st_mtime_ns for p in parts.rglob("*")}
-    assert part(1) == 0
+    assert part(1, "--resume") == 0
     assert "shard 1/2 is done" in capsys.readouterr().out
     assert {p: p.stat().st_mtime_ns for p in parts.rglob("*")} == before
     assert merge.main([str(parts)]) == 0
@@ -233,7 +233,7 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
 
 
-def test_a_sweep_goes_on_with_its_own_points_wherever_they_are_listed(tmp_path, capsys):
+def test_a_sweep_continues_with_its_own_points_from_any_file(tmp_path, capsys):
     first, copy, other = (tmp_path / f"{name}.json" for name in ("a", "b", "c"))
     points = [{"alpha": 0.1}, {"alpha": 1.0, "discriminator_updates": 2}]
     for path, listed in ((first, points), (copy, points), (other, points[:1])):
@@ -253,38 +253,29 @@ def test_a_sweep_goes_on_with_its_own_points_wherever_they_are_listed(tmp_path, 
     assert sweep.plan(options)[0] == points
     sweep.check_points(points, out)
 
-    # A folder of before an option that is off by default can still go on.
-    content = json.loads((out / "config.json").read_text())
-    del content["share_counts"]
-    (out / "config.json").write_text(json.dumps(content))
-    assert not run_options.parse(sweep.Options, arguments[:-1], "x", out).share_counts
 
-
-def test_an_interrupted_sweep_goes_on(tmp_path):
-    long = (*SMALL, "--total-steps", str(200 * 256), "--seeds", "2")
+def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
+    long = (*SMALL, "--total-steps", str(60 * 256), "--seeds", "2")
     grid = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
-    results = []
-    for name in ("whole", "interrupted"):
-        out = tmp_path / name
-        command = [sys.executable, "-m", "gasil_jax.sweep", *long, *grid]
-        child = subprocess.Popen(
-            [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
-        )
-        if name == "interrupted":
-            second = out / "programs" / "1" / "metrics.csv"
-            wait_for(lambda: second.exists() and second.stat().st_size > 5000, child)  # noqa: B023
-            child.terminate()
-            status, _, err = finish(child)
-            assert status == 128 + signal.SIGTERM, err
-            assert f"gasil_jax.sweep --resume --out {out}" in err
-            assert not (out / "results.csv").exists()
-            command = [sys.executable, "-m", "gasil_jax.sweep", "--resume"]
-            child = subprocess.Popen(
-                [*command, "--out", str(out)], stderr=subprocess.PIPE, text=True
-            )
-        status, _, err = finish(child)
-        assert status == 0, err
-        results.append((out / "results.csv").read_bytes())
-    assert results[0] == results[1]
-    more = ["--resume", "--out", str(out), "--grid", "alpha=3"]
-    assert sweep.main(more) == 2
+    whole, out = tmp_path / "whole", tmp_path / "interrupted"
+    assert sweep.main([*long, *grid, "--out", str(whole)]) == 0
+    train = Members.train
+
+    def interrupted(self, advance, states, first, count):
+        # In the second program, after some chunks.
+        if self.config.hyperparameters.discriminator_updates == 2 and first >= 20:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return train(self, advance, states, first, count)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Members, "train", interrupted)
+        status = sweep.main([*long, *grid, "--out", str(out)])
+    assert status == 128 + signal.SIGTERM
+    assert f"gasil_jax.sweep --resume --out {out}" in capsys.readouterr().err
+    assert not (out / "results.csv").exists()
+    seconds = (out / "programs" / "0" / "training.json").read_bytes()
+    assert sweep.main(["--resume", "--out", str(out)]) == 0
+    assert (out / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+    # The first program was finished, and is left as it was.
+    assert (out / "programs" / "0" / "training.json").read_bytes() == seconds
+    assert sweep.main(["--resume", "--out", str(out), "--grid", "alpha=3"]) == 2
