@@ -170,27 +170,14 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Sample policy trajectories.
     environments, batch = sample_trajectories(
-        env,
-        config,
-        state,
-        act_key,
-        policy=policy,
-        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
+        env, config, state, act_key, policy=policy, hyperparameters=hyperparameters
     )
     # Update the good trajectory buffer.
-    history, buffer = remember(
-        state.history,
-        state.good_trajectories,
-        batch,
-        max_steps=hyperparameters.buffer_steps,
-        max_episodes=config.buffer_episodes,
-    )
+    history, buffer = remember(config, state, batch, hyperparameters)
     # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
     rewards, reward_metrics = learner_rewards(
         env, config, state, batch, history, decompose_key, hyperparameters
     )
-    # Sample good trajectories, update the discriminator by equation 8, and shape the
-    # reward with it (section 4.3): what the agent imitates with does so.
     context = Context(
         rollout=rewards.batch,
         history=rewards.history,
@@ -202,30 +189,26 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         policy=policy,
         value=value,
     )
+    # Sample good trajectories, update the discriminator by equation 8, and shape the
+    # reward with it (section 4.3): what the agent imitates with does so.
     imitation, streams, imitation_metrics = agent.update_and_reward(
         state.imitation, context, imitate_key
     )
     # Update the policy.
-    experience, advantage_metrics = advantages(
-        state.actor_critic, streams, context, agent=agent, imitation=imitation
+    actor_critic, imitation, policy_metrics = update_policy(
+        agent, state.actor_critic, imitation, streams, context, (ppo_key, policy_key)
     )
-    actor_critic, ppo_metrics = ppo.update(
-        state.actor_critic,
-        experience,
-        ppo_key,
-        policy=policy,
-        value=value,
-        config=config,
-        hyperparameters=hyperparameters,
-    )
-    imitation, actor_critic, policy_metrics = agent.update_policy(
-        imitation, actor_critic, context, policy_key
-    )
-    healthy, learned = keep_if_finite(
+    healthy, (actor_critic, imitation, decomposition) = keep_if_finite(
         (actor_critic, imitation, rewards.decomposition),
         (state.actor_critic, state.imitation, state.reward_decomposition),
     )
-    actor_critic, imitation, decomposition = learned
+    metrics: Metrics = {
+        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
+        "learning_rate": jnp.asarray(hyperparameters.learning_rate),
+        "skipped_updates": ~healthy,
+        **rollout_metrics(batch, buffer),
+        **reward_metrics,
+    }
     state = state.replace(
         actor_critic=actor_critic,
         # Only now: within an iteration the policy that acts is the one that learns.
@@ -240,18 +223,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         iteration=state.iteration + 1,
     )
     return state, merge_metrics(
-        config.agent,
-        {
-            "env_steps": (state.iteration - 1).astype(jnp.float32) * config.batch_steps,
-            **rollout_metrics(batch, buffer),
-            "skipped_updates": ~healthy,
-            "learning_rate": jnp.asarray(hyperparameters.learning_rate),
-            **reward_metrics,
-            **ppo_metrics,
-        },
-        advantage_metrics,
-        imitation_metrics,
-        policy_metrics,
+        config.agent, metrics, imitation_metrics, policy_metrics
     )
 
 
@@ -262,7 +234,7 @@ def sample_trajectories(
     key: jax.Array,
     *,
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
-    gamma: jax.Array | float,
+    hyperparameters: Hyperparameters,
 ) -> tuple[rollout.EnvironmentStates, Rollout]:
     """Act in the environments for one batch with the policy as it is.
 
@@ -272,7 +244,7 @@ def sample_trajectories(
       state: with the policy and the running episodes.
       key: consumed.
       policy: (params, normalized observation) -> mean, log standard deviation.
-      gamma: discount of the returns by which the buffer ranks episodes.
+      hyperparameters: their values in this iteration.
 
     Returns:
       the running episodes after the batch, and the batch, (time, env, ...).
@@ -287,29 +259,23 @@ def sample_trajectories(
         key,
         num_steps=config.num_steps,
         max_episode_steps=max_episode_steps(env, config),
-        gamma=gamma,
+        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
     )
 
 
 def remember(
-    history: good_trajectories.History,
-    buffer: good_trajectories.GoodTrajectories,
-    batch: Rollout,
-    *,
-    max_steps: jax.Array | float,
-    max_episodes: int | None = None,
+    config: Config, state: TrainState, batch: Rollout, hyperparameters: Hyperparameters
 ) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
     """Record a batch, and offer the whole episodes that ended in it to the buffer.
 
     Args:
-      history: the last steps of each environment, before the batch.
-      buffer: the good trajectories so far.
+      config: gives the number of episodes that the buffer keeps at most.
+      state: with the history and the buffer before the batch.
       batch: of the environment's own reward.
-      max_steps: number of steps that the buffer keeps at most, ().
-      max_episodes: number of episodes that it keeps at most; None for any number.
+      hyperparameters: give the number of steps that the buffer keeps at most.
     """
     history = good_trajectories.record(
-        history,
+        state.history,
         batch.observation,
         batch.action,
         # No return of an episode with a faulty step, or of one cut short, is one.
@@ -320,7 +286,11 @@ def remember(
         history, batch.ended, batch.discounted_return, batch.episode_length
     )
     return history, good_trajectories.insert(
-        buffer, history, episodes, max_steps, max_episodes
+        state.good_trajectories,
+        history,
+        episodes,
+        hyperparameters.buffer_steps,
+        config.buffer_episodes,
     )
 
 
@@ -439,6 +409,49 @@ def advantages(
         advantage=flat(mixed),
         returns=flat(returns),
     ), {"explained_variance": jnp.mean(explained), **metrics}
+
+
+def update_policy(
+    agent: Imitation,
+    actor_critic: ActorCritic,
+    imitation: Any,
+    rewards: jax.Array,
+    context: Context,
+    keys: tuple[jax.Array, jax.Array],
+) -> tuple[ActorCritic, Any, Metrics]:
+    """Update the policy and the values by PPO, then by the agent's own steps.
+
+    Args:
+      agent: mixes the advantages, and may take further gradient steps.
+      actor_critic: the networks before.
+      imitation: the agent's state.
+      rewards: float32 (time, env) of one stream, or (time, env, stream).
+      context: of the iteration.
+      keys: of PPO and of the agent's own steps; both are consumed.
+
+    Returns:
+      The networks and the agent's state after, and metrics.
+    """
+    ppo_key, own_key = keys
+    batch, advantage_metrics = advantages(
+        actor_critic, rewards, context, agent=agent, imitation=imitation
+    )
+    actor_critic, ppo_metrics = ppo.update(
+        actor_critic,
+        batch,
+        ppo_key,
+        policy=context.policy,
+        value=context.value,
+        config=context.config,
+        hyperparameters=context.hyperparameters,
+    )
+    imitation, actor_critic, own_metrics = agent.update_policy(
+        imitation, actor_critic, context, own_key
+    )
+    metrics = merge_metrics(
+        context.config.agent, ppo_metrics, advantage_metrics, own_metrics
+    )
+    return actor_critic, imitation, metrics
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
