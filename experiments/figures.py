@@ -334,18 +334,6 @@ _GEOMETRY = [
     )
     for agent, drawn, num_envs in itertools.product(PAIR, _AGES, _NUM_ENVS)
 ]
-#: The agent that imitates adaptively, and itself without each of its parts.
-_ADAPTIVE = "ppo+gasil-adaptive"
-_PARTS = [
-    Arm("whole", _ADAPTIVE),
-    Arm("without decomposed rewards", _ADAPTIVE, {"decompose_rewards": False}),
-    Arm("without imitation", _ADAPTIVE, {"imitation_weight": 0.0}),
-    Arm("without agreement", _ADAPTIVE, {"imitation_rule": "gap"}),
-    Arm("without gap", _ADAPTIVE, {"imitation_rule": "agreement"}),
-    Arm("with a fixed weight", _ADAPTIVE, {"imitation_rule": "fixed"}),
-    Arm("with the weight 1", _ADAPTIVE, {"imitation_weight": 1.0}),
-    Arm("with the deviation 1", _ADAPTIVE, {"initial_deviation": 1.0}),
-]
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
     "on most of them."
@@ -472,26 +460,12 @@ FIGURES: Mapping[str, Figure] = {
     "adaptive_imitation": Figure(
         "Delayed rewards with adaptive imitation, beyond the paper",
         "",
-        grid(TASKS, (*AGENTS, _ADAPTIVE), (DELAY,), panel="{env}"),
-        favourite=_ADAPTIVE,
-    ),
-    "adaptive_parts": Figure(
-        "The parts of adaptive imitation",
-        "",
-        grid(TASKS, _PARTS, (DELAY,), panel="{env}"),
-        favourite="whole",
-    ),
-    "delays": Figure(
-        "Rewards that are delayed by 1 step to a whole episode",
-        "",
         grid(
-            ("hopper", "walker2d", "halfcheetah"),
-            ("ppo", "ppo+gasil", _ADAPTIVE),
-            (1, 5, DELAY, 100, 1000),
+            ("walker2d", "halfcheetah", "swimmer"),
+            (*PAIR, "ppo+gasil-adaptive"),
+            (DELAY,),
             panel="{env}",
-            curve="{arm}-{delay}",
         ),
-        favourite=_ADAPTIVE,
-        over=("reward_delay", "delay"),
+        favourite="ppo+gasil-adaptive",
     ),
 }

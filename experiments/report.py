@@ -25,6 +25,7 @@ from PIL import Image
 from experiments.figures import FIGURES, Comparisons, Curve, Figure
 from experiments.search import AGENTS, SPACES, by_value, means
 from experiments.store import Record, Run, Store
+from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
@@ -165,6 +166,15 @@ def point_in_words(point: Mapping[str, Any]) -> str:
     """Return changed settings as "name value, name value"."""
     words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
     return ", ".join(f"{name} {words(value)}" for name, value in point.items())
+
+
+def changed(config: Config) -> dict[str, Any]:
+    """Return the settings of a config that are not the defaults."""
+    default = Config(agent=config.agent)
+    values = lambda config: {**vars(config), **vars(config.hyperparameters)}
+    mine, defaults = values(config), values(default)
+    names = [name for name in mine if name not in ("hyperparameters", "total_steps")]
+    return {name: mine[name] for name in names if mine[name] != defaults[name]}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -430,10 +440,13 @@ class Page:
         """Return what each curve was trained with, beyond the appendix's values."""
         rows = []
         for names, results in self.results.items():
-            point = point_in_words(results.point)
-            if next(iter(results.records)).config.normalize_rewards:
-                point += ", rewards normalized"
-            rows.append([*names, point, results.provenance()])
+            config = next(iter(results.records)).config
+            if isinstance(results.curve.base, str):
+                words = point_in_words(changed(config))
+            else:
+                words = point_in_words(results.point)
+                words += ", rewards normalized" if config.normalize_rewards else ""
+            rows.append([*names, words, results.provenance()])
         head = ["task", "agent", "hyperparameters", "trained with"]
         return markdown_table(head, rows)
 

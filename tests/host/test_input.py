@@ -334,7 +334,8 @@ def test_a_run_folder_of_another_state_is_refused(tmp_path, capsys):
     ],
 )
 def test_a_foreign_sweep_folder_is_refused(point, summary, message, tmp_path, capsys):
-    (tmp_path / "config.json").write_text(json.dumps(GOOD | {"points": [point]}))
+    described = GOOD | {"points": [point], "share_counts": False, "shard": None}
+    (tmp_path / "config.json").write_text(json.dumps(described))
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     assert evaluate.main([str(tmp_path)]) == 2
     (line,) = capsys.readouterr().err.splitlines()
