@@ -128,11 +128,14 @@ def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
     Raises:
       ValueError: if they are none, not different or out of range.
     """
-    if isinstance(seeds, int):
-        run_folder.check_seeds(seeds, 0)
-        return range(seeds)
+    if isinstance(seeds, int | np.integer):
+        run_folder.check_seeds(int(seeds), 0)
+        return range(int(seeds))
     allowed = Range(0, 2**32 - 1, whole=True)
-    if not len(set(seeds)) == len(seeds) > 0 or not all(x in allowed for x in seeds):
+    listed = isinstance(seeds, Sequence | np.ndarray) and all(
+        x in allowed for x in seeds
+    )
+    if not (listed and len(set(seeds)) == len(seeds) > 0):
         raise ValueError(
             f"seeds is {seeds!r}: it must be a number of seeds, or different whole "
             f"numbers from 0 to {2**32 - 1}"

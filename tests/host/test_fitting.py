@@ -107,6 +107,7 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     [
         ({"seeds": 0}, "seeds is 0: it must be from 1"),
         ({"seeds": []}, r"seeds is \[\]: it must be a number of seeds"),
+        ({"seeds": None}, "seeds is None: it must be a number of seeds"),
         ({"seeds": [1, 1]}, "different whole numbers"),
         ({"seeds": [-1]}, "different whole numbers"),
         ({"evaluate_every": 0}, "evaluate_every is 0: it must be a whole number"),
