@@ -9,6 +9,9 @@ if TYPE_CHECKING:
     from gasil_jax.config import Config as Config
     from gasil_jax.config import Hyperparameters as Hyperparameters
     from gasil_jax.host.environments import make_env as make_env
+    from gasil_jax.host.fitting import FitProgress as FitProgress
+    from gasil_jax.host.fitting import FitResult as FitResult
+    from gasil_jax.host.fitting import fit as fit
     from gasil_jax.host.members import member as member
     from gasil_jax.imitation import agents as agents
     from gasil_jax.policy import load_policy as load_policy
@@ -23,9 +26,12 @@ __version__ = "0.1.0"
 #: The module that defines each public name.
 _MODULES = {
     "Config": "config",
+    "FitProgress": "host.fitting",
+    "FitResult": "host.fitting",
     "Hyperparameters": "config",
     "TrainState": "train",
     "agents": "imitation",
+    "fit": "host.fitting",
     "init": "train",
     "iterate": "train",
     "load_policy": "policy",

@@ -4,7 +4,9 @@ Defaults come from the paper's appendix, and where it gives none from OpenAI bas
 on which the paper's code was built. Each field is declared with its allowed range.
 """
 
+import contextlib
 import dataclasses
+import inspect
 import math
 import numbers
 from collections.abc import Callable, Mapping, Sequence
@@ -12,6 +14,7 @@ from typing import Any, NamedTuple
 
 from flax import struct
 
+from gasil_jax import registry
 from gasil_jax.errors import unknown
 
 #: A factor that multiplies a hyperparameter, as a function of environment steps. Either
@@ -54,9 +57,17 @@ class Range(NamedTuple):
         return f"{least} and {most}"
 
 
-def _number(
+def number(
     default: float, low: float, high: float = math.inf, excludes_low: bool = False
 ) -> Any:
+    """Declare a float of `Hyperparameters` or of a class that is derived from it.
+
+    Args:
+      default: its value where none is given.
+      low: the lowest number that it may be.
+      high: the highest number that it may be.
+      excludes_low: whether it must be more than `low`.
+    """
     return _field(default, Range(low, high, excludes_low))
 
 
@@ -74,48 +85,51 @@ class Hyperparameters(struct.PyTreeNode):
     Two of them are counts, `discriminator_updates` and `buffer_steps`. The values in
     the configuration decide shapes and are upper limits: a member of a sweep may have
     smaller ones.
+
+    An agent with numbers of its own derives a class from this one, declares them with
+    `number` and names the class in its `Imitation`.
     """
 
-    learning_rate: float = _number(3e-4, 0.0, excludes_low=True)
+    learning_rate: float = number(3e-4, 0.0, excludes_low=True)
     """Adam's step size for policy and value."""
-    learning_rate_decay: float = _number(1.0, 0.0, 1.0)
+    learning_rate_decay: float = number(1.0, 0.0, 1.0)
     """Fraction of the learning rate that is lost, linearly, by the end of training: 1
     anneals it to 0, and 0 keeps it constant."""
-    gamma: float = _number(0.99, 0.0, 1.0)
+    gamma: float = number(0.99, 0.0, 1.0)
     """Discount factor."""
-    gae_lambda: float = _number(0.95, 0.0, 1.0)
+    gae_lambda: float = number(0.95, 0.0, 1.0)
     """The lambda of generalized advantage estimation."""
-    clip_epsilon: float = _number(0.2, 0.0, excludes_low=True)
+    clip_epsilon: float = number(0.2, 0.0, excludes_low=True)
     """PPO's clip range of the probability ratio."""
-    entropy_coefficient: float = _number(0.0, 0.0)
+    entropy_coefficient: float = number(0.0, 0.0)
     """Weight of the policy's entropy (the paper's lambda)."""
-    value_coefficient: float = _number(1.0, 0.0)
+    value_coefficient: float = number(1.0, 0.0)
     """Weight of the value's squared error. It hardly matters, because the value has its
     own network, gradient clip and Adam."""
-    max_grad_norm: float = _number(0.5, 0.0, excludes_low=True)
+    max_grad_norm: float = number(0.5, 0.0, excludes_low=True)
     """Largest global norm of a gradient; the policy's and the value's gradients are
     clipped separately."""
-    initial_deviation: float = _number(1.0, 0.0, excludes_low=True)
+    initial_deviation: float = number(1.0, 0.0, excludes_low=True)
     """Standard deviation of the untrained policy's actions."""
-    alpha: float = _number(0.1, 0.0)
+    alpha: float = number(0.1, 0.0)
     """Scale of the discriminator's reward (paper, section 4.3)."""
-    discriminator_learning_rate: float = _number(1e-4, 0.0, excludes_low=True)
+    discriminator_learning_rate: float = number(1e-4, 0.0, excludes_low=True)
     """Adam's step size for the discriminator."""
     discriminator_updates: int = _count(5)
     """Gradient steps of the discriminator in an iteration."""
-    discriminator_entropy_coefficient: float = _number(1e-3, 0.0)
+    discriminator_entropy_coefficient: float = number(1e-3, 0.0)
     """Weight of the entropy of the discriminator's output."""
     buffer_steps: int = _count(1000)
     """Capacity of the good-trajectory buffer, in steps."""
-    imitation_weight: float = _number(0.7, 0.0, 1.0)
+    imitation_weight: float = number(0.7, 0.0, 1.0)
     """Largest share of imitation in the policy's advantage, in ppo+gasil-adaptive."""
-    decomposition_learning_rate: float = _number(1e-3, 0.0, excludes_low=True)
+    decomposition_learning_rate: float = number(1e-3, 0.0, excludes_low=True)
     """Adam's step size for the network that decomposes rewards."""
-    behavior_cloning_coefficient: float = _number(0.1, 0.0)
+    behavior_cloning_coefficient: float = number(0.1, 0.0)
     """Weight of the cloning loss of PPO+BC."""
-    sil_coefficient: float = _number(0.1, 0.0)
+    sil_coefficient: float = number(0.1, 0.0)
     """Weight of the loss of PPO+SIL."""
-    sil_value_coefficient: float = _number(0.01, 0.0)
+    sil_value_coefficient: float = number(0.01, 0.0)
     """Weight of the value's loss within PPO+SIL's loss."""
 
 
@@ -124,7 +138,7 @@ class Config:
     """The settings that change array shapes, loop counts or the program; hashable."""
 
     agent: str = "ppo+gasil"
-    """Name of the agent; `gasil_jax.agents()` lists them."""
+    """Name of the agent: one of `gasil_jax.agents()`, or MODULE:NAME of your own."""
     total_steps: int = _count(1_000_000)
     """Environment steps per seed, rounded up to whole batches."""
     num_envs: int = _count(16)
@@ -158,7 +172,7 @@ class Config:
     """Replayed steps in one gradient step on PPO+SIL's loss."""
     sil_buffer_steps: int = _count(50_000)
     """Capacity of PPO+SIL's replay buffer, in steps."""
-    discriminator_gradient_penalty: float = _number(0.0, 0.0)
+    discriminator_gradient_penalty: float = number(0.0, 0.0)
     """Weight of the penalty on the discriminator's gradient with respect to its input,
     which is pulled to norm 1 between good pairs and the policy's (as in WGAN-GP)."""
     discriminator_normalizes_actions: bool = False
@@ -212,7 +226,28 @@ class Config:
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
     )
-    """The numbers that can be swept; `make_train` accepts traced replacements."""
+    """The numbers that can be swept; `make_train` accepts traced replacements. They are
+    of the agent's class, and those that it does not have are dropped."""
+
+    def __post_init__(self) -> None:
+        """Give the hyperparameters the class that the agent declares."""
+        # `validate` refuses what is not an agent.
+        with contextlib.suppress(ValueError):
+            own = hyperparameters_of(self.agent)
+            values = self.hyperparameters
+            if isinstance(values, Hyperparameters) and type(values) is not own:
+                kept = {x: y for x, y in vars(values).items() if x in _names(own)}
+                object.__setattr__(self, "hyperparameters", own(**kept))
+
+    @staticmethod
+    def types_of(values: Mapping[str, Any]) -> dict[str, type]:
+        """Return the types of fields that the values of others decide.
+
+        Raises:
+          ValueError: if the values name no agent.
+        """
+        agent = values.get("agent", Config.agent)
+        return {"hyperparameters": hyperparameters_of(agent)}
 
     @property
     def num_steps(self) -> int:
@@ -230,13 +265,67 @@ class Config:
         return math.ceil(self.total_steps / self.batch_steps)
 
     def replace(self, **changes: Any) -> "Config":
-        """Return a copy with changed fields, including those of `hyperparameters`."""
-        own = {field.name for field in dataclasses.fields(self)}
-        swept = {name: changes.pop(name) for name in set(changes) - own}
-        if swept:
-            hyperparameters = changes.get("hyperparameters", self.hyperparameters)
-            changes["hyperparameters"] = hyperparameters.replace(**swept)
-        return dataclasses.replace(self, **changes)
+        """Return a copy with changed fields, including those of `hyperparameters`.
+
+        Raises:
+          ValueError: if the agent has no hyperparameter of a name.
+        """
+        swept = {name: changes.pop(name) for name in set(changes) - set(_names(Config))}
+        changed = dataclasses.replace(self, **changes)
+        if not swept:
+            return changed
+        names = _names(type(changed.hyperparameters))
+        for name in swept:
+            if name not in names:
+                hyperparameters_of(changed.agent)  # An agent may be what is unknown.
+                raise ValueError(unknown("hyperparameter", name, names))
+        hyperparameters = changed.hyperparameters.replace(**swept)
+        return dataclasses.replace(changed, hyperparameters=hyperparameters)
+
+
+def _names(kind: type) -> tuple[str, ...]:
+    """Return the names of a dataclass' fields."""
+    return tuple(field.name for field in dataclasses.fields(kind))
+
+
+def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
+    """Return the class of an agent's hyperparameters.
+
+    Args:
+      agent: the agent's name, see `registry.find`.
+
+    Raises:
+      ValueError: if there is no such agent, or if a number of its own is not declared
+        with `number` or has a name that is taken.
+    """
+    kind = registry.find(agent).hyperparameters
+    if not (isinstance(kind, type) and issubclass(kind, Hyperparameters)):
+        raise ValueError(
+            f"agent {agent!r} has hyperparameters {kind!r}: they must be a class that "
+            "is derived from gasil_jax.Hyperparameters"
+        )
+    for parent in kind.__mro__[: kind.__mro__.index(Hyperparameters)]:
+        for name in inspect.get_annotations(parent):
+            if hasattr(Hyperparameters, name) or name in _names(Config):
+                raise ValueError(
+                    f"agent {agent!r} has a hyperparameter {name!r}, a name that is "
+                    "taken: it must be a new one"
+                )
+            if name not in ranges(kind):
+                raise ValueError(
+                    f"agent {agent!r} has a hyperparameter {name!r} without a range: "
+                    "it must be declared with gasil_jax.config.number"
+                )
+    return kind
+
+
+def own_names(agent: str) -> tuple[str, ...]:
+    """Return the names of the hyperparameters that only this agent has.
+
+    Raises:
+      ValueError: see `hyperparameters_of`.
+    """
+    return _names(hyperparameters_of(agent))[len(_names(Hyperparameters)) :]
 
 
 def ranges(kind: type) -> Mapping[str, Range]:
@@ -260,7 +349,7 @@ def validate(config: Config, agents: Sequence[str]) -> None:
     Args:
       config: the config to check. Hyperparameters that are arrays are skipped, because
         they may be traced.
-      agents: names of the registered agents.
+      agents: names of the registered agents; MODULE:NAME is allowed besides.
 
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
@@ -273,8 +362,9 @@ def validate(config: Config, agents: Sequence[str]) -> None:
             raise _refusal(field.name, value, "a text")
     if not isinstance(config.expert, str | None):
         raise _refusal("expert", config.expert, "a text or None")
-    if config.agent not in agents:
+    if config.agent not in agents and ":" not in config.agent:
         raise ValueError(unknown("agent", config.agent, agents))
+    hyperparameters_of(config.agent)
     _validate_sizes(config)
     for name in ("num_envs", "minibatch_size"):
         _validate_divides(name, getattr(config, name), config.batch_steps)
@@ -282,7 +372,7 @@ def validate(config: Config, agents: Sequence[str]) -> None:
         _validate_schedule(name, getattr(config, name), config.total_steps)
     if not isinstance(config.hyperparameters, Hyperparameters):
         raise _refusal("hyperparameters", config.hyperparameters, "Hyperparameters")
-    for name, allowed in ranges(Hyperparameters).items():
+    for name, allowed in ranges(type(config.hyperparameters)).items():
         value = getattr(config.hyperparameters, name)
         is_array = hasattr(value, "shape") and not isinstance(value, numbers.Number)
         if not is_array:

@@ -8,6 +8,10 @@ class InputError(ValueError):
     """Bad input; the message is one line with the value and what is allowed."""
 
 
+class NotImportable(InputError):
+    """A MODULE:NAME that can't be imported here."""
+
+
 def nearest(name: str, allowed: Sequence[str]) -> str:
     """Return the allowed name that is most similar to `name`."""
     return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 from gasil_jax.config import Config
 from gasil_jax.errors import unknown
-from gasil_jax.imitation import agents
+from gasil_jax.imitation import find_agent
 
 Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
@@ -181,7 +181,7 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
     Args:
       env: name of the environment. One without a row gets the defaults and the
         preset's overrides for all tasks.
-      agent: name of the agent.
+      agent: name of the agent, or MODULE:NAME of one of your own.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
 
@@ -190,8 +190,7 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
     """
     if name not in PRESETS:
         raise ValueError(unknown("preset", name, names()))
-    if agent not in agents():
-        raise ValueError(unknown("agent", agent, agents()))
+    find_agent(agent)
     chosen = PRESETS[name]
     rows = chosen.delayed if reward_delay > 1 else chosen.dense
     return Config(agent=agent).replace(**{**chosen.every, **rows.get((env, agent), {})})

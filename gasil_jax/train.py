@@ -25,7 +25,7 @@ from gasil_jax import (
 )
 from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.errors import unknown
-from gasil_jax.imitation import AGENTS
+from gasil_jax.imitation import agents, find_agent
 from gasil_jax.imitation.adaptive import RULES
 from gasil_jax.imitation.adversarial import BONUSES
 from gasil_jax.imitation.interface import Context, Imitation
@@ -81,6 +81,8 @@ def init(
     """The state before the first iteration. The key is consumed."""
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
+    # Of the agent's class, with its own numbers.
+    hyperparameters = config.replace(hyperparameters=hyperparameters).hyperparameters
     hyperparameters = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32), hyperparameters
     )
@@ -121,7 +123,7 @@ def init(
         good_trajectories=good_trajectories.init(
             int(config.hyperparameters.buffer_steps), *sizes
         ),
-        imitation=AGENTS[config.agent].init(imitation_key, config, *sizes),
+        imitation=find_agent(config.agent).init(imitation_key, config, *sizes),
         hyperparameters=hyperparameters,
         key=key,
         iteration=jnp.int32(0),
@@ -143,7 +145,7 @@ def _init_actor_critic(
     policy, value = _networks(env, config)
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(hyperparameters)
-    num_streams = AGENTS[config.agent].num_streams
+    num_streams = find_agent(config.agent).num_streams
     value_keys = [value_key, *jax.random.split(value_key, num_streams)[1:]]
     policy_params = policy.init(policy_key, observation)
     policy_params["params"]["log_std"] += jnp.log(hyperparameters.initial_deviation)
@@ -162,7 +164,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     Returns the next state and a dict of float32 scalars. Means over the whole episodes
     that ended in the batch are NaN if none did.
     """
-    agent = AGENTS[config.agent]
+    agent = find_agent(config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(
@@ -515,7 +517,7 @@ def check(env: Any, config: Config) -> None:
         )
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
-    validate(config, tuple(AGENTS))
+    validate(config, agents())
     for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
         if (value := getattr(config, name)) not in allowed:
             raise ValueError(unknown(name, value, tuple(allowed)))
@@ -525,7 +527,7 @@ def check(env: Any, config: Config) -> None:
             f"max_episode_steps is {config.max_episode_steps}: the environment's own "
             f"limit is {limit}"
         )
-    AGENTS[config.agent].check(config, env.observation_size, env.action_size)
+    find_agent(config.agent).check(config, env.observation_size, env.action_size)
 
 
 class Train(Protocol):

@@ -15,7 +15,7 @@ import pytest
 import gasil_jax
 from gasil_jax import evaluate, merge, plot, render, run, sweep
 from gasil_jax import export_minari as export
-from gasil_jax.host import command_line, policy_file, run_options
+from gasil_jax.host import command_line, metrics_files, policy_file, run_options
 from gasil_jax.sweeps import saved_states, shards
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
@@ -77,11 +77,28 @@ FIGURES = [
 ]
 
 
+@pytest.fixture(scope="session")
+def my_tasks(tmp_path_factory):
+    """The agent and the task of the documents can be imported; return the test."""
+    text = (DOCS / "extending.md").read_text()
+    agent, test, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    # Whatever its attributes are called, it is none of ours.
+    names = "Line.model = Line.layout = Line.task = None"
+    folder = tmp_path_factory.mktemp("my_tasks")
+    (folder / "my_tasks.py").write_text(f"{agent}\n{task}\n{names}\n")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(folder)
+        yield test
+
+
 @pytest.mark.parametrize("line", OURS)
-def test_a_command_is_understood(line):
+def test_a_command_is_understood(line, my_tasks):
     _, _, program, *arguments = shlex.split(line)
     kind = PROGRAMS[program].Options
-    command_line.parse(kind, arguments, program)
+    if issubclass(kind, run_options.Options):
+        run_options.parse(kind, arguments, program)
+    else:
+        command_line.parse(kind, arguments, program)
 
 
 def test_other_commands_are_named_with_a_reason():
@@ -186,7 +203,7 @@ def as_toy(line, finished, locomotion, folder):
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
-def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper):
+def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_tasks):
     """Training commands run first, on the point mass and for some hundred steps."""
     pytest.importorskip("minari")
     pytest.importorskip("imageio_ffmpeg")
@@ -278,6 +295,10 @@ def test_the_python_of_the_documentation_runs(finished_hopper):
     assert names["state"].iteration.shape == (2,)
     assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+    result = names["result"]
+    assert result.metrics["episode_return"].shape == (10, 2)
+    assert result.evaluations["mean"].shape == (10, 1)
+    assert pathlib.Path("runs/walker2d/checkpoints").is_dir()
 
 
 def test_the_search_with_optuna_runs():
@@ -334,40 +355,79 @@ def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
 
 
-def test_the_documented_agent_and_task_train(tmp_path, monkeypatch, capsys):
-    from gasil_jax.imitation import AGENTS
-
-    text = (DOCS / "extending.md").read_text()
-    agent, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
-    monkeypatch.setitem(AGENTS, "halved", None)  # and away again
-    names = {}
-    exec(agent, names)
-    exec(task, names)
-    config = gasil_jax.Config(
-        agent="halved", total_steps=256, batch_steps=128, num_envs=4, num_epochs=1
-    )
-    _, metrics = jax.jit(gasil_jax.make_train(names["Line"](), config))(
-        jax.random.key(0)
-    )
-    assert np.isfinite(metrics["policy_loss"]).all()
-    assert (metrics["halved_reward"] < 0).all()
+def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
+    out, swept = tmp_path / "out", tmp_path / "swept"
+    small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
+    both = ["--env", "my_tasks:Line", "--agent", "my_tasks:SCALED", *small.split()]
+    arguments = ["--reward-factor", "0.3", "--first-seed", "5", "--out", str(out)]
+    assert run.main([*both, *arguments]) == 0
+    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
+    assert (metrics["scaled_reward"] < 0).all()
     # At most 20 steps of at most 0.1.
     assert (metrics["episode_length"] <= 20).all()
-
-    # Whatever its attributes are called, it is none of ours.
-    names = "Line.model = Line.layout = Line.task = None"
-    (tmp_path / "my_tasks.py").write_text(f"{task}\n{names}\n")
-    monkeypatch.syspath_prepend(tmp_path)
-    out = str(tmp_path / "out")
-    small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
-    arguments = ["--env", "my_tasks:Line", "--first-seed", "5", "--out", out]
-    assert run.main([*arguments, *small.split()]) == 0
-    assert evaluate.main([out, "--episodes", "2"]) == 0
+    assert evaluate.main([str(out), "--episodes", "2"]) == 0
     assert re.search(r"5 +2 +-[0-9.]+ +[0-9.]+ +20.0", capsys.readouterr().out)
-    assert render.main([out, "--out", str(tmp_path / "line.gif")]) == 2
+    assert render.main([str(out), "--out", str(tmp_path / "line.gif")]) == 2
     assert "of an environment that can't be drawn" in capsys.readouterr().err
-    assert evaluate.main([out, "--gymnasium"]) == 2
+    assert evaluate.main([str(out), "--gymnasium"]) == 2
     assert "must be of a locomotion task" in capsys.readouterr().err
+
+    grid = ["--grid", "reward_factor=0.1,0.3", "--out", str(swept)]
+    assert sweep.main([*both, *grid]) == 0
+    scaled = np.load(swept / "curves.npz")["scaled_reward"][:, 0, 0]
+    # The first batch is that of the same policy.
+    np.testing.assert_allclose(scaled[1] / scaled[0], 3.0, rtol=1e-5)
+
+
+def test_the_documented_test_of_an_agent_passes(my_tasks):
+    names = {"gasil_jax": gasil_jax}
+    exec(my_tasks, names)
+    names["test_the_reward_is_scaled"]()
+
+
+def rows_of(page, heading):
+    """Return the cells of the table below a heading of a document, in rows."""
+    table = (DOCS / page).read_text().split(f"## {heading}\n")[1].split("\n## ")[0]
+    rows = [x for x in table.splitlines() if x.startswith("| `")]
+    return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
+
+
+@pytest.mark.parametrize("agent", gasil_jax.agents())
+def test_the_list_of_metrics_is_complete(agent, tmp_path):
+    env = gasil_jax.make_env("point_mass", reward_delay=5)
+    config = gasil_jax.Config(
+        agent=agent,
+        batch_steps=64,
+        num_envs=4,
+        normalize_rewards=True,
+        decompose_rewards=True,
+        discriminator_gradient_penalty=1.0,
+    )
+    if agent == "gail":
+        observation = np.zeros((9, env.observation_size), np.float32)
+        action = np.zeros((9, env.action_size), np.float32)
+        np.savez(tmp_path / "expert.npz", observation=observation, action=action)
+        config = config.replace(expert=str(tmp_path / "expert.npz"))
+    first = lambda: gasil_jax.init(env, config, jax.random.key(0))
+    step = lambda: gasil_jax.iterate(env, config, first())[1]
+    listed = [
+        name.strip("`")
+        for name, agents, *_ in rows_of("data.md", "Metrics")
+        if agents.split(", ")[0] == "all" or agent in agents.split(", ")
+    ]
+    assert sorted(listed) == sorted(jax.eval_shape(step))
+
+
+def test_the_list_of_a_policys_arrays_is_complete(finished_hopper):
+    listed = [
+        name.strip("`")
+        for cell, *_ in rows_of("data.md", "Policies")
+        for name in cell.split(", ")
+        if name != "..."
+    ]
+    arrays = np.load("runs/hopper/policy.npz").files
+    assert {"kernel_0", "bias_1"} <= set(arrays)
+    assert set(listed) == {x for x in arrays if not x.endswith("_2")}
 
 
 def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):

@@ -3,11 +3,8 @@
 Mistakes that would stop training with a long trace are reported in one line beforehand.
 """
 
-import importlib
 import inspect
 import numbers
-import pathlib
-import traceback
 from collections.abc import Callable
 from typing import Any
 
@@ -15,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs import Env
 
-from gasil_envs import wrappers
+from gasil_envs import own_code, wrappers
 
 
 def find(name: str) -> Callable[[], Env]:
@@ -24,14 +21,7 @@ def find(name: str) -> Callable[[], Env]:
     Raises:
       ValueError: if it can't be imported or needs arguments.
     """
-    module, attribute = name.split(":", 1)
-    try:
-        constructor = getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"env {name!r} can't be imported: {error}") from None
-    except Exception as error:
-        why = _in_a_line(error)
-        raise ValueError(f"env {name!r} can't be imported: {why}") from None
+    constructor = own_code.find("env", name)
     try:
         inspect.signature(constructor).bind()
     except (TypeError, ValueError) as error:
@@ -51,7 +41,9 @@ def build(name: str) -> Env:
     try:
         env = constructor()
     except Exception as error:
-        raise ValueError(f"env {name!r} can't be built: {_in_a_line(error)}") from None
+        raise ValueError(
+            f"env {name!r} can't be built: {own_code.in_a_line(error)}"
+        ) from None
     for attribute in ("reset", "step", "observation_size", "action_size"):
         if not hasattr(env, attribute):
             raise ValueError(f"env {name!r} is no environment: it has no {attribute}")
@@ -79,7 +71,9 @@ def _check_states(name: str, env: Env) -> None:
         first = jax.eval_shape(limited.reset, jax.random.key(0))
         then = jax.eval_shape(limited.step, first, action)
     except Exception as error:
-        raise ValueError(f"env {name!r} can't be traced: {_in_a_line(error)}") from None
+        raise ValueError(
+            f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
+        ) from None
     for state, where in ((first, "reset"), (then, "step")):
         expected = {"obs": (env.observation_size,), "reward": (), "done": ()}
         for field, shape in expected.items():
@@ -105,19 +99,3 @@ def _check_states(name: str, env: Env) -> None:
 
 def _described(leaf: Any) -> str:
     return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"
-
-
-def _in_a_line(error: Exception) -> str:
-    """Return the message of an error in the user's code, and where it was raised."""
-    message = f"{type(error).__name__}: {error}".partition("\n")[0]
-    if isinstance(error, SyntaxError):
-        return message  # It names file and line already.
-    frames = reversed(traceback.extract_tb(error.__traceback__))
-    user_frames = (x for x in frames if not x.filename.startswith((_JAX, __file__)))
-    frame = next(user_frames, None)
-    if frame is None:
-        return message
-    return f"{message} ({frame.filename}, line {frame.lineno})"
-
-
-_JAX = str(pathlib.Path(jax.__file__).parent)

@@ -1,4 +1,4 @@
-"""Train members for a command line: in chunks, logged, saved and interruptible.
+"""Train members in chunks: logged, saved, evaluated, interruptible.
 
 The folder gets metrics.csv, checkpoints/ and, if policies are evaluated during
 training, evaluations.csv. A checkpoint records the sizes of the two tables. Training
@@ -6,14 +6,16 @@ that continues from it cuts the tables to these sizes and writes the same rows a
 """
 
 import dataclasses
+import functools
 import math
 import pathlib
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.host import checkpoint, command_line, metrics_files
@@ -23,6 +25,7 @@ from gasil_jax.host.members import Members
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker, log
+from gasil_jax.train import TrainState
 
 # The time between two calls of the compiled program. The display is updated and Ctrl-C
 # takes effect at this rate.
@@ -39,11 +42,40 @@ class CheckpointSchedule:
         iterations; None writes one every ten minutes.
       keep: number of newest checkpoints to keep. One more is kept: the one with the
         best evaluation or, without evaluations, with the best returns since the
-        checkpoint before it.
+        checkpoint before it. 0 writes none.
     """
 
     every: int | None
     keep: int
+
+
+@dataclasses.dataclass(frozen=True)
+class FitProgress:
+    """What training has come to after a chunk of iterations.
+
+    Attributes:
+      iteration: number of iterations so far.
+      env_steps: number of environment steps of each seed so far.
+      metrics: the metrics of the chunk, (seeds, iterations) each.
+      evaluation: columns of evaluations.csv, (seeds,) each; None if the policies were
+        not evaluated after this chunk.
+      copy_states: returns `states`.
+    """
+
+    iteration: int
+    env_steps: int
+    metrics: Mapping[str, np.ndarray]
+    evaluation: Mapping[str, np.ndarray] | None
+    copy_states: Callable[[], TrainState]
+
+    @functools.cached_property
+    def states(self) -> TrainState:
+        """A copy of the training states, (seeds, ...); only while training waits."""
+        return self.copy_states()
+
+
+#: Called after each chunk, on the host; training stops if it returns true.
+Callback = Callable[[FitProgress], bool | None]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +191,8 @@ class _Checkpoints:
 
     def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
         """Write a checkpoint, and delete those that are not to be kept."""
+        if not self._keep:
+            return
         checkpoint.write(self.root, done, self._members.trim(states), record)
         checkpoint.prune(self.root, self._keep)
         self._saved_at = time.monotonic()
@@ -209,6 +243,7 @@ def drive(
     evaluation_schedule: EvaluationSchedule | None = None,
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
+    callback: Callback | None = None,
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
@@ -223,6 +258,7 @@ def drive(
       evaluation_schedule: the times of evaluations; None for none.
       steps_before: environment steps that `progress` has already counted.
       trackers: trackers that also get the metrics; they are closed at the end.
+      callback: called after each chunk; if it returns true, training ends there.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
@@ -264,7 +300,8 @@ def drive(
         with progress.aside("saving a checkpoint"):
             checkpoints.save(done, states, tables.sizes() | {"score": score})
 
-    while done < last and interruption.signal is None:
+    stopped = False
+    while done < last and not stopped and interruption.signal is None:
         count = min(
             members.chunk,
             last - done,
@@ -279,19 +316,24 @@ def drive(
         tables.write(metrics)
         returns.append(metrics["episode_return"])
         progress.update(steps_before + steps_of(done), metrics["episode_return"])
-        due, evaluated = checkpoints.is_due(done), None
+        due, evaluated, scores = checkpoints.is_due(done), None, None
         if evaluation is not None and evaluation.is_due(done):
             with progress.aside("evaluating the policies"):
-                evaluated = evaluation.score(states, done)
+                scores = evaluation.score(states, done)
+            evaluated = float(scores["mean"].mean(dtype=np.float64))
             due |= evaluated > checkpoint.best_score(checkpoints.root)
         if due:
             save()
             returns = []
+        if callback is not None:
+            copy = lambda: jax.tree.map(jnp.copy, members.trim(states))  # noqa: B023
+            steps = done * config.batch_steps
+            stopped = bool(callback(FitProgress(done, steps, metrics, scores, copy)))
     train_seconds = time.monotonic() - started
     save()
     with progress.aside("closing the trackers"):
         tables.close()
-    if interruption.signal is not None and done < last:
+    if interruption.signal is not None and done < last and not stopped:
         raise Interrupted(interruption.signal)
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(

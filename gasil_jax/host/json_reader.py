@@ -9,7 +9,7 @@ import typing
 from collections.abc import Callable
 from typing import Any, get_args, get_origin, get_type_hints
 
-from gasil_jax.errors import InputError
+from gasil_jax.errors import InputError, NotImportable
 
 _WORDS = {
     str: "a text",
@@ -32,10 +32,13 @@ def read(path: pathlib.Path, kind: Any) -> Any:
 
     Raises:
       InputError: if the content is something else; the message names the field.
+      NotImportable: if it names an agent that can't be imported here.
       OSError: if there is no such file.
     """
     try:
         return _as(kind, json.loads(path.read_text()), "")
+    except NotImportable:
+        raise
     # Deeply nested brackets are a RecursionError.
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None
@@ -82,6 +85,8 @@ def _as(kind: Any, value: Any, name: str) -> Any:
 def _with_fields(kind: Any, value: dict[str, Any], name: str) -> Any:
     """Return an instance of a dataclass; fields that are missing have their default."""
     hints = get_type_hints(kind)
+    # The type of one field may depend on the value of another.
+    hints |= getattr(kind, "types_of", lambda value: {})(value)
     for key in value:
         if key not in hints:
             raise InputError(f"{_join(name, key)} is unknown")

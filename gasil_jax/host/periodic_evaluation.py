@@ -105,7 +105,7 @@ class PeriodicEvaluation:
         last = self._members.config.num_iterations
         return self._interval.is_due(done) or done == last
 
-    def score(self, states: Any, done: int) -> float:
+    def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
         """Evaluate the policies, write the scores and log them to the trackers.
 
         Args:
@@ -113,7 +113,7 @@ class PeriodicEvaluation:
           done: number of iterations so far.
 
         Returns:
-          The mean return over episodes and members.
+          The columns of evaluations.csv, (members,) each.
         """
         started = time.monotonic()
         episodes = jax.tree.map(np.asarray, self._score(states, self._seeds))
@@ -129,7 +129,7 @@ class PeriodicEvaluation:
         self._writer.write({name: x[:, None] for name, x in scores.items()})
         log_evaluation(self._trackers, self._labels, scores)
         self.seconds += time.monotonic() - started
-        return float(scores["mean"].mean(dtype=np.float64))
+        return scores
 
     def size(self) -> int:
         """Write everything to the disk; return the size of evaluations.csv in bytes."""

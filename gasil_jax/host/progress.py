@@ -51,16 +51,20 @@ class Progress:
       title: name of what is trained.
       total_steps: environment steps over all seeds.
       num_seeds: number of seeds; the steps that are shown are those of one seed.
+      shown: whether anything is shown at all.
     """
 
-    def __init__(self, title: str, total_steps: int, num_seeds: int = 1):
+    def __init__(
+        self, title: str, total_steps: int, num_seeds: int = 1, *, shown: bool = True
+    ):
         self._console = Console(stderr=True)
         self._title = title
         self._total = total_steps
         self._num_seeds = num_seeds
         seeds = f" x {num_seeds} seeds" if num_seeds > 1 else ""
         self._amount = f"{total_steps // num_seeds:,} steps{seeds}"
-        self._live = self._console.is_terminal
+        self._live = shown and self._console.is_terminal
+        self._in_lines = shown and not self._live
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = 0
         self._return: str | None = None
@@ -96,7 +100,7 @@ class Progress:
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = steps
         self._bar.update(self._task, status=name)
-        if not self._live:
+        if self._in_lines:
             _line(self._title, name)
 
     @contextlib.contextmanager
@@ -109,7 +113,7 @@ class Progress:
         status = self._bar.tasks[0].fields["status"]
         self._bar.update(self._task, status=name)
         with contextlib.ExitStack() as stack:
-            if not self._live:
+            if self._in_lines:
                 stack.enter_context(announced(self._title, name))
             yield
         self._bar.update(self._task, status=status)
@@ -137,7 +141,7 @@ class Progress:
         )
         self._bar.update(self._task, completed=steps, status=status)
         due = now - self._last_line > _SECONDS_BETWEEN_LINES or steps >= self._total
-        if not self._live and due:
+        if self._in_lines and due:
             self._last_line = now
             done = f"{steps // self._num_seeds:,}/{self._amount}"
             _line(self._title, f"{done}, {status}")

@@ -169,7 +169,8 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     """Return the content of config.json, "config" and "settings" as dataclasses.
 
     Raises:
-      InputError: if there is no such file or if it does not describe a run.
+      InputError: if there is no such file, if it does not describe a run, or if its
+        agent can't be imported here.
     """
     path = folder / _CONFIG
     try:

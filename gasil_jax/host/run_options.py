@@ -13,14 +13,14 @@ import tyro
 
 from gasil_jax import presets
 from gasil_jax import train as training
-from gasil_jax.config import Config, validate
+from gasil_jax.config import Config, own_names, validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, run_folder, trackers
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.imitation import AGENTS, unused
+from gasil_jax.imitation import agents, unused
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +119,7 @@ def parse(
                 "total_steps may differ, and grow"
             )
         return options
-    given = command_line.parse(kind, arguments, program)
+    given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
     with command_line.input_checked():
         config = presets.preset(
             given.env, given.config.agent, given.preset, given.settings.reward_delay
@@ -128,13 +128,36 @@ def parse(
     return command_line.parse(kind, arguments, program, default)
 
 
+def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
+    """Return default options with the agent that is given, whose numbers are flags.
+
+    Raises:
+      InputError: if there is no such agent, or if the name of a number of its own is an
+        option's.
+    """
+    first = _first_arguments(arguments)
+    agent = Config.agent if first is None or first.agent is None else first.agent
+    with command_line.input_checked():
+        own = own_names(agent)
+    taken = {
+        f.name for options in (kind, Settings) for f in dataclasses.fields(options)
+    }
+    for name in own:
+        if name in taken:
+            raise InputError(
+                f"agent {agent!r} has a hyperparameter {name!r}, a name that is "
+                "taken by an option: it must be a new one"
+            )
+    return kind(env=tyro.MISSING, config=Config(agent=agent))
+
+
 def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
     """Return the folder of the run that --resume continues, or None if there is none.
 
     Raises:
       InputError: if --resume is given without --out.
     """
-    given = _folder_arguments(arguments)
+    given = _first_arguments(arguments)
     if given is None or not given.resume:
         return None
     if given.out is None:
@@ -142,13 +165,14 @@ def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
     return given.out if run_folder.is_described(given.out) else None
 
 
-def _folder_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
-    """Parse --resume and --out alone; None leaves their error to the full parser."""
+def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
+    """Parse what decides the other options; None leaves errors to the full parser."""
     parser = argparse.ArgumentParser(
         add_help=False, allow_abbrev=False, exit_on_error=False
     )
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
+    parser.add_argument("--agent", nargs="?")
     try:
         return parser.parse_known_args(arguments)[0]
     except argparse.ArgumentError:
@@ -163,7 +187,7 @@ def check(options: Options) -> None:
     """
     with command_line.input_checked():
         environments.check(options.env, options.settings)
-        validate(options.config, tuple(AGENTS))
+        validate(options.config, agents())
         trackers.check(options.log)
     command_line.check_least(
         options,

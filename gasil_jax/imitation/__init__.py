@@ -1,9 +1,11 @@
 """The imitation methods, one file each, and the registry of agents.
 
-An agent is PPO plus one `Imitation`. To add an agent, write a file that defines one and
-add it to `AGENTS`.
+An agent is PPO plus one `Imitation`. To add an agent to the package, write a file that
+defines one and add it to `AGENTS`; one of your own is named MODULE:NAME (see
+`gasil_jax.registry`).
 """
 
+from gasil_jax import registry
 from gasil_jax.imitation import (
     adaptive,
     adversarial,
@@ -14,7 +16,8 @@ from gasil_jax.imitation import (
 )
 from gasil_jax.imitation.interface import Imitation
 
-AGENTS: dict[str, Imitation] = {
+AGENTS: dict[str, Imitation] = registry.AGENTS
+AGENTS |= {
     "ppo": none.PPO,
     "ppo+bonus": constant_bonus.PPO_BONUS,
     "ppo+bc": behavior_cloning.PPO_BC,
@@ -27,8 +30,17 @@ AGENTS: dict[str, Imitation] = {
 
 
 def agents() -> tuple[str, ...]:
-    """Return the names that `Config.agent` may have."""
+    """Return the names of the package's agents, which `Config.agent` may have."""
     return tuple(AGENTS)
+
+
+def find_agent(name: str) -> Imitation:
+    """Return an agent by its name, or by MODULE:NAME.
+
+    Raises:
+      ValueError: if there is none.
+    """
+    return registry.find(name)
 
 
 def unused(agent: str) -> frozenset[str]:
@@ -36,11 +48,11 @@ def unused(agent: str) -> frozenset[str]:
 
     The set is empty if the agent does not say which fields it uses.
     """
-    used = AGENTS[agent].fields
+    used = find_agent(agent).fields
     if used is None:
         return frozenset()
     every = {name for each in AGENTS.values() for name in each.fields or ()}
     return frozenset(every.difference(used))
 
 
-__all__ = ["AGENTS", "Imitation", "agents", "unused"]
+__all__ = ["AGENTS", "Imitation", "agents", "find_agent", "unused"]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax.config import Config, Hyperparameters, ranges, validate
+from gasil_jax.config import Config, Hyperparameters, own_names, ranges, validate
 from gasil_jax.errors import InputError, nearest
 from gasil_jax.host.command_line import whole_number
 from gasil_jax.imitation import agents, unused
@@ -35,34 +35,39 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 }
 
 
-def parse_grid(grid: Sequence[str]) -> dict[str, tuple[Any, ...]]:
-    """Return the values by name from entries NAME=VALUE,VALUE,...
+def kinds(agent: str) -> Mapping[str, type]:
+    """Return `KINDS` with the agent's own hyperparameters."""
+    return {**dict.fromkeys(own_names(agent), float), **KINDS}
+
+
+def parse_grid(grid: Sequence[str], agent: str) -> dict[str, tuple[Any, ...]]:
+    """Return the values by name from entries NAME=VALUE,VALUE,... for an agent.
 
     Raises:
       InputError: if a name is unknown or given twice, or if a value is not a number.
     """
-    values = {}
+    values, allowed = {}, kinds(agent)
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
-        if name not in KINDS:
-            raise InputError(f"grid: {_unknown_name(name)}")
+        if name not in allowed:
+            raise InputError(f"grid: {_unknown_name(name, allowed)}")
         if name in values:
             raise InputError(f"grid has {name} twice: all its values must be in one")
         try:
-            read = float if KINDS[name] is float else whole_number
+            read = float if allowed[name] is float else whole_number
             numbers = [read(value) for value in listed.split(",")]
             values[name] = tuple(dict.fromkeys(numbers))
         except ValueError:
-            kind = "numbers" if KINDS[name] is float else "whole numbers"
+            kind = "numbers" if allowed[name] is float else "whole numbers"
             raise InputError(
                 f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
             ) from None
     return values
 
 
-def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
-    """Return the points that a JSON file lists.
+def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
+    """Return the points that a JSON file lists, for an agent.
 
     Raises:
       InputError: if the file can't be read or holds something else.
@@ -81,9 +86,11 @@ def read_points(path: pathlib.Path) -> list[dict[str, Any]]:
         if not isinstance(point, dict):
             raise InputError(f"points_file is {path}: {point!r} is not a point")
         with _naming(f"points_file is {path}"):
-            check_point(point)
+            check_point(point, agent)
+    allowed = kinds(agent)
     read = [
-        {name: KINDS[name](value) for name, value in point.items()} for point in points
+        {name: allowed[name](value) for name, value in point.items()}
+        for point in points
     ]
     for index, point in enumerate(read):
         if point in read[:index]:
@@ -99,12 +106,13 @@ def _naming(where: str) -> Iterator[None]:
         raise InputError(f"{where}: {error}") from None
 
 
-def check_point(point: Point) -> None:
+def check_point(point: Point, agent: str) -> None:
     """Raise `InputError` if a name can't vary or a value is not of its type."""
+    allowed = kinds(agent)
     for name, value in point.items():
-        if name not in KINDS:
-            raise InputError(_unknown_name(name))
-        whole = KINDS[name] is int
+        if name not in allowed:
+            raise InputError(_unknown_name(name, allowed))
+        whole = allowed[name] is int
         if isinstance(value, bool) or not isinstance(
             value, int if whole else int | float
         ):
@@ -116,14 +124,14 @@ def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> 
     """Raise `InputError` if the points in a config.json do not fit its config."""
     with _naming(f"{path} is damaged or of another program: points"):
         for point in points:
-            check_point(point)
+            check_point(point, config.agent)
             validate(config.replace(**point), agents())
 
 
-def _unknown_name(name: str) -> str:
+def _unknown_name(name: str, allowed: Iterable[str]) -> str:
     return (
-        f"{name!r} can't vary: did you mean {nearest(name, tuple(KINDS))!r}? "
-        f"(one of {', '.join(KINDS)})"
+        f"{name!r} can't vary: did you mean {nearest(name, tuple(allowed))!r}? "
+        f"(one of {', '.join(allowed)})"
     )
 
 
@@ -131,10 +139,10 @@ def _refuse_unused(names: Iterable[str], agent: str) -> None:
     idle = unused(agent)
     for name in names:
         if name in idle:
-            kinds = [x for x in KINDS if x not in idle]
+            others = [x for x in kinds(agent) if x not in idle]
             raise InputError(
                 f"{name} can't vary: agent {agent!r} does not look at it (one of "
-                f"{', '.join(kinds)})"
+                f"{', '.join(others)})"
             )
 
 
@@ -162,10 +170,10 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file stands in place of grid and random")
-        points = read_points(pathlib.Path(points_file))
+        points = read_points(pathlib.Path(points_file), agent)
         _refuse_unused((name for point in points for name in point), agent)
         return points
-    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid)
+    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, agent)
     _refuse_unused(values, agent)
     if random is None:
         if not values:

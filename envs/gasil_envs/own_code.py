@@ -1,0 +1,48 @@
+"""Import what a user gives as MODULE:NAME, and tell of errors in it in one line."""
+
+import importlib
+import pathlib
+import traceback
+from typing import Any
+
+import jax
+
+
+def find(kind: str, name: str) -> Any:
+    """Return the object that MODULE:NAME names.
+
+    Args:
+      kind: what it is of, for the error message, such as "env".
+      name: MODULE:NAME.
+
+    Raises:
+      ValueError: if it can't be imported.
+    """
+    module, attribute = name.split(":", 1)
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        why = str(error)
+    except Exception as error:
+        why = in_a_line(error)
+    raise ValueError(f"{kind} {name!r} can't be imported: {why}")
+
+
+def in_a_line(error: Exception) -> str:
+    """Return the message of an error in the user's code, and where it was raised."""
+    message = f"{type(error).__name__}: {error}".partition("\n")[0]
+    if isinstance(error, SyntaxError):
+        return message  # It names file and line already.
+    frames = reversed(traceback.extract_tb(error.__traceback__))
+    user_frames = (x for x in frames if not x.filename.startswith(_NOT_THE_USERS))
+    frame = next(user_frames, None)
+    if frame is None:
+        return message
+    return f"{message} ({frame.filename}, line {frame.lineno})"
+
+
+_NOT_THE_USERS = (
+    str(pathlib.Path(jax.__file__).parent),
+    __file__,
+    str(pathlib.Path(__file__).with_name("own_environment.py")),
+)

@@ -1,0 +1,192 @@
+"""Train from Python as the command line does: `gasil_jax.fit`."""
+
+import contextlib
+import os
+import pathlib
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from gasil_jax.config import Config, Range
+from gasil_jax.errors import InputError
+from gasil_jax.host import driver, json_reader, metrics_files, run_folder
+from gasil_jax.host.driver import Callback, FitProgress
+from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.members import make_members
+from gasil_jax.host.periodic_evaluation import EvaluationSchedule
+from gasil_jax.host.progress import Progress
+from gasil_jax.train import TrainState
+
+__all__ = ["FitProgress", "FitResult", "fit"]
+
+_DESCRIPTION = "fit.json"
+_COUNT = Range(1, whole=True)
+
+
+class FitResult(NamedTuple):
+    """The result of `fit`.
+
+    Attributes:
+      states: the training states after the last iteration, (seeds, ...).
+      metrics: every metric from the first iteration on, (seeds, iterations) each.
+      evaluations: columns of evaluations.csv ("env_steps", and "mean", "min", "max" of
+        the returns, and "length"), (seeds, evaluations) each; empty without any.
+    """
+
+    states: TrainState
+    metrics: dict[str, np.ndarray]
+    evaluations: dict[str, np.ndarray]
+
+
+def fit(
+    env: Any,
+    config: Config,
+    *,
+    seeds: int | Sequence[int] = 1,
+    folder: str | os.PathLike[str] | None = None,
+    resume: bool = False,
+    checkpoint_every: int | None = None,
+    evaluate_every: int | None = None,
+    evaluate_episodes: int = 10,
+    callback: Callback | None = None,
+) -> FitResult:
+    """Train seeds side by side over all devices, in chunks, as the command line does.
+
+    A chunk is a compiled call of at most a fiftieth of all iterations, and takes about
+    five seconds at most. A seed's numbers are those of ``python -m gasil_jax.run``.
+
+    Args:
+      env: one environment.
+      config: the config that the seeds share.
+      seeds: number of seeds, from 0 on; or their numbers.
+      folder: folder of metrics.csv, evaluations.csv and checkpoints/, created if it is
+        missing; None keeps nothing.
+      resume: continue the training in the folder from its newest checkpoint; only
+        `total_steps` may differ, and only grow. The environment is not compared. If
+        the folder holds no training yet, a new one begins.
+      checkpoint_every: environment steps per seed between two checkpoints, rounded up
+        to whole iterations; default a checkpoint every ten minutes and at the end.
+      evaluate_every: environment steps per seed between two evaluations of the policy's
+        mean action, rounded up to whole iterations; default none.
+      evaluate_episodes: number of episodes of each seed in an evaluation.
+      callback: gets a `FitProgress` after each chunk, on the host. Training ends there
+        if it returns true; a checkpoint is written, from which it can be resumed.
+
+    Raises:
+      Interrupted: if a folder is given and SIGINT or SIGTERM was received; a checkpoint
+        was written first.
+      OSError: if the folder can't be written.
+      ValueError: if a value is not allowed, or if the folder holds something else.
+    """
+    members = make_members(env, config, _numbers(seeds))
+    for name, value in (
+        ("checkpoint_every", checkpoint_every),
+        ("evaluate_every", evaluate_every),
+        ("evaluate_episodes", evaluate_episodes),
+    ):
+        if value is not None and value not in _COUNT:
+            raise ValueError(f"{name} is {value!r}: it must be {_COUNT}")
+    if folder is None and (resume or checkpoint_every is not None):
+        name = "resume" if resume else "checkpoint_every"
+        raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")
+    schedule = driver.CheckpointSchedule(checkpoint_every, keep=2 if folder else 0)
+    evaluation_schedule = None
+    if evaluate_every is not None:
+        evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
+    interruption = Interruption()
+    with contextlib.ExitStack() as stack:
+        if folder is None:
+            # Ctrl-C ends training at once, because there is nothing to save.
+            where = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        else:
+            described = {"seeds": tuple(members.seeds), **run_folder.flat(vars(config))}
+            where = pathlib.Path(folder)
+            stack.enter_context(_opened(where, described, resume))
+            stack.enter_context(interruption)
+        outcome = driver.drive(
+            members,
+            where,
+            {"seed": members.seeds},
+            schedule=schedule,
+            progress=Progress("fit", config.total_steps, shown=False),
+            interruption=interruption,
+            evaluation_schedule=evaluation_schedule,
+            callback=callback,
+        )
+        return FitResult(
+            outcome.states,
+            _table(where / "metrics.csv", members.num_members),
+            _table(where / "evaluations.csv", members.num_members),
+        )
+
+
+def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
+    """Return the numbers of the seeds.
+
+    Raises:
+      ValueError: if they are none, not different or out of range.
+    """
+    if isinstance(seeds, int | np.integer):
+        run_folder.check_seeds(int(seeds), 0)
+        return range(int(seeds))
+    allowed = Range(0, 2**32 - 1, whole=True)
+    listed = isinstance(seeds, Sequence | np.ndarray) and all(
+        x in allowed for x in seeds
+    )
+    if not (listed and len(set(seeds)) == len(seeds) > 0):
+        raise ValueError(
+            f"seeds is {seeds!r}: it must be a number of seeds, or different whole "
+            f"numbers from 0 to {2**32 - 1}"
+        )
+    return tuple(int(seed) for seed in seeds)
+
+
+@contextlib.contextmanager
+def _opened(
+    folder: pathlib.Path, described: Mapping[str, Any], resume: bool
+) -> Iterator[None]:
+    """Create and lock a folder of `fit`, and write down what is trained in it.
+
+    Raises:
+      ValueError: if it can't be written, is in use, or holds something else.
+    """
+    path = folder / _DESCRIPTION
+    with contextlib.ExitStack() as stack:
+        try:
+            run_folder.create(folder, "")
+            stack.enter_context(run_folder.lock(folder))
+            begun = path.is_file()
+            if begun and not resume:
+                raise InputError(
+                    f"out is {folder}, where training has begun: give resume=True or "
+                    "another folder"
+                )
+            if not begun:
+                run_folder.refuse_used(folder)
+        except InputError as error:
+            # The command line's name of the folder is another one.
+            raise ValueError(str(error).replace("out is", "folder is", 1)) from None
+        # A function has no other form in JSON.
+        now = {x: "a function" if callable(y) else y for x, y in described.items()}
+        if begun:
+            before = json_reader.read(path, dict[str, Any])
+            if changes := run_folder.differences(before, now):
+                raise ValueError(
+                    f"resume goes on with {folder}, where {'; '.join(changes)}: only "
+                    "total_steps may differ, and grow"
+                )
+        metrics_files.write_json(path, now)
+        try:
+            yield
+        except Interrupted as interrupted:
+            interrupted.add_note("go on with the same arguments and resume=True")
+            raise
+
+
+def _table(path: pathlib.Path, num_members: int) -> dict[str, np.ndarray]:
+    """Return the columns of a table, (seeds, rows) each; empty if it has no rows."""
+    if not path.exists() or not path.stat().st_size:
+        return {}
+    return metrics_files.read_metrics(path, ("seed",), num_members)

@@ -1,0 +1,64 @@
+"""What the tests of an agent of one's own need."""
+
+from typing import Any
+
+import jax
+
+from gasil_envs.precision import full_precision
+from gasil_jax import schedules, train
+from gasil_jax.config import Config
+from gasil_jax.imitation.interface import Context
+from gasil_jax.networks import Policy, Value
+
+
+@full_precision
+def example_context(env: Any, config: Config, key: jax.Array) -> Context:
+    """Return what an agent's functions get in the first iteration with a key.
+
+    The batch is an untrained policy's. The buffer has the whole episodes that ended in
+    it, so it is empty if a batch is shorter than an episode.
+
+    Args:
+      env: one environment.
+      config: of the agent; its sizes decide the shapes.
+      key: random key; consumed.
+
+    Raises:
+      ValueError: if the config is not valid.
+    """
+    train.check(env, config)
+    state = train.init(env, config, key)
+    hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
+    # The networks are typed as Any, see `train`.
+    policy: Any = Policy(config.hidden_sizes, env.action_size)
+    value: Any = Value(config.hidden_sizes)
+    _, act_key, _, _, _, decompose_key = jax.random.split(state.key, 6)
+    _, batch = train.sample_trajectories(
+        env,
+        config,
+        state,
+        act_key,
+        policy=policy.apply,
+        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
+    )
+    history, buffer = train.remember(
+        state.history,
+        state.good_trajectories,
+        batch,
+        max_steps=hyperparameters.buffer_steps,
+        max_episodes=config.buffer_episodes,
+    )
+    rewards, _ = train.learner_rewards(
+        env, config, state, batch, history, decompose_key, hyperparameters
+    )
+    return Context(
+        rollout=rewards.batch,
+        history=rewards.history,
+        good_trajectories=buffer,
+        normalizer=state.normalizer,
+        reward_scale=rewards.scale,
+        hyperparameters=hyperparameters,
+        config=config,
+        policy=policy.apply,
+        value=value.apply,
+    )

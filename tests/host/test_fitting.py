@@ -1,0 +1,124 @@
+"""`gasil_jax.fit` trains as the command line does."""
+
+import os
+import signal
+
+import jax
+import numpy as np
+import pytest
+import test_members
+
+import gasil_jax
+from gasil_jax import run
+from gasil_jax.host import checkpoint, metrics_files
+from gasil_jax.host.interruption import Interrupted
+
+# Iterations, the longest of a chunk, and the config of both ways to train.
+ITERATIONS, CHUNK = 100, 2
+CONFIG = test_members.SMALL.replace(agent="ppo", total_steps=ITERATIONS * 128)
+FLAGS = (
+    *("--env", "point_mass", "--agent", "ppo", "--total-steps", str(ITERATIONS * 128)),
+    *("--num-envs", "4", "--batch-steps", "128", "--minibatch-size", "32"),
+    *("--num-epochs", "1", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+)
+EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
+
+
+@pytest.fixture(scope="module")
+def env():
+    return gasil_jax.make_env("point_mass")
+
+
+@pytest.fixture(scope="module")
+def commanded(tmp_path_factory):
+    """The folder of the same training by the command line."""
+    out = tmp_path_factory.mktemp("commanded") / "out"
+    evaluated = ("--evaluate-every", str(40 * 128), "--evaluate-episodes", "2")
+    assert run.main([*FLAGS, *evaluated, "--seeds", "2", "--out", str(out)]) == 0
+    return out
+
+
+def same(result, folder):
+    """Compare a result's tables with those of a folder, to the last digit."""
+    for found, name in (
+        (result.metrics, "metrics.csv"),
+        (result.evaluations, "evaluations.csv"),
+    ):
+        expected = metrics_files.read_metrics(folder / name, ("seed",), 2)
+        assert set(found) == set(expected)
+        for column in expected:
+            np.testing.assert_array_equal(found[column], expected[column])
+
+
+def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
+    seen = []
+    result = gasil_jax.fit(env, CONFIG, seeds=2, callback=seen.append, **EVALUATED)
+    same(result, commanded)
+    assert result.metrics["policy_loss"].shape == (2, ITERATIONS)
+    assert result.evaluations["mean"].shape == (2, 3)
+    np.testing.assert_array_equal(result.states.iteration, [ITERATIONS] * 2)
+    assert capsys.readouterr().err == ""
+
+    sizes = [progress.metrics["policy_loss"].shape[1] for progress in seen]
+    assert sum(sizes) == ITERATIONS and max(sizes) <= CHUNK
+    assert [progress.iteration for progress in seen] == list(np.cumsum(sizes))
+    assert seen[-1].env_steps == ITERATIONS * 128
+    scores = [progress.evaluation for progress in seen if progress.evaluation]
+    assert [x["env_steps"][0] // 128 for x in scores] == [40, 80, 100]
+    np.testing.assert_allclose(
+        [x["mean"] for x in scores], result.evaluations["mean"].T, rtol=1e-6
+    )
+
+
+def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
+    """What stops it is a state, which is still there when training has gone on."""
+    states, out = [], tmp_path / "out"
+
+    def callback(progress):
+        states.append(progress.states)
+        return progress.iteration >= 50
+
+    arguments = {"seeds": [0, 1], "folder": out, "checkpoint_every": 20 * 128}
+    first = gasil_jax.fit(env, CONFIG, callback=callback, **arguments, **EVALUATED)
+    assert first.metrics["policy_loss"].shape == (2, 50)
+    assert first.evaluations["mean"].shape == (2, 1)
+    assert [int(x.iteration[1]) for x in states][-2:] == [48, 50]
+    for last, result in zip(*map(jax.tree.leaves, (states[-1], first.states))):
+        if not jax.dtypes.issubdtype(last.dtype, jax.dtypes.prng_key):
+            np.testing.assert_array_equal(last, result)
+    assert checkpoint.latest(out / "checkpoints")[0].iteration == 50
+
+    with pytest.raises(ValueError, match=r"folder is .*: give resume=True"):
+        gasil_jax.fit(env, CONFIG, **arguments)
+    with pytest.raises(ValueError, match=r"alpha was 0.1, is 0.2: only total_steps"):
+        gasil_jax.fit(env, CONFIG.replace(alpha=0.2), resume=True, **arguments)
+    # A program that is interrupted continues like one that was stopped.
+    interrupt = lambda progress: os.kill(os.getpid(), signal.SIGTERM)
+    with pytest.raises(Interrupted) as interrupted:
+        gasil_jax.fit(
+            env, CONFIG, resume=True, callback=interrupt, **arguments, **EVALUATED
+        )
+    assert "resume=True" in interrupted.value.__notes__[0]
+    same(gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED), commanded)
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"seeds": 0}, "seeds is 0: it must be from 1"),
+        ({"seeds": []}, r"seeds is \[\]: it must be a number of seeds"),
+        ({"seeds": None}, "seeds is None: it must be a number of seeds"),
+        ({"seeds": [1, 1]}, "different whole numbers"),
+        ({"seeds": [-1]}, "different whole numbers"),
+        ({"evaluate_every": 0}, "evaluate_every is 0: it must be a whole number"),
+        ({"evaluate_episodes": 1.5}, "evaluate_episodes is 1.5"),
+        ({"checkpoint_every": 128}, "checkpoint_every is 128: it needs a folder"),
+        ({"resume": True}, "resume is True: it needs a folder"),
+        ({"config": CONFIG.replace(alpha=-1)}, "alpha is -1"),
+        ({"folder": "/proc/none"}, "folder is /proc/none"),
+        ({"folder": os.path.dirname(__file__)}, "which is not empty"),
+    ],
+)
+def test_what_is_wrong_is_refused_by_name(env, changes, why):
+    with pytest.raises(ValueError, match=why):
+        gasil_jax.fit(env, **{"config": CONFIG, **changes})
