@@ -1,12 +1,14 @@
-"""What MkDocs does beside its plugins when it builds the site: formulas, navigation."""
+"""What MkDocs does beside its plugins: formulas, notebooks, pages of results."""
 
 import html
+import json
 import logging
 import pathlib
 import re
 from typing import Any
 
 from latex2mathml import converter
+from mkdocs.structure.files import File
 
 _LOG = logging.getLogger("mkdocs.hooks.site")
 #: What pymdownx.arithmatex makes of a formula.
@@ -42,6 +44,20 @@ def on_page_content(content: str, page: Any, **_: Any) -> str:
         if "\\" in formula:  # as the converter writes what it does not know
             _LOG.warning("%s: a formula that is not known: %s", page.url, formula)
     return content
+
+
+def on_files(files: Any, config: Any, **_: Any) -> Any:
+    """Make a page of each notebook, without what its code prints and draws."""
+    docs = pathlib.Path(config.docs_dir)
+    for path in docs.glob("examples/*.ipynb"):
+        parts = []
+        for cell in json.loads(path.read_text())["cells"]:
+            text = "".join(cell["source"])
+            is_code = cell["cell_type"] == "code"
+            parts.append(f"```python\n{text}\n```" if is_code else text)
+        page = path.relative_to(docs).with_suffix(".md").as_posix()
+        files.append(File.generated(config, page, content="\n\n".join(parts)))
+    return files
 
 
 def on_config(config: Any) -> Any:
