@@ -45,7 +45,8 @@ class Options:
     Attributes:
       run: folder of the run or sweep, which need not be finished.
       out: file to write: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a
-        strip of moments; or, for locomotion, .html, to turn and zoom in a browser.
+        strip of eight moments in two rows; or, for locomotion, .html, to turn and zoom
+        in a browser.
       seed: seed of the policy; default the run's first seed.
       point: number of a sweep's point in results.csv; default the best by mean.
       checkpoint: checkpoint of the policy: last, or best, which has the best
@@ -156,13 +157,15 @@ def save(
     if path.suffix == _PAGE:
         path.write_text(locomotion_page(env, states))
         return len(states)
+    if path.suffix == ".png":
+        return write_strip(env, states, size, path)
     frames, fps = frames_of(env, states, size)
     write(frames, fps, path)
     return len(frames)
 
 
 def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
-    """Write frames as a film, or eight of them as a strip.
+    """Write frames as a film, .mp4 or .gif.
 
     Raises:
       OSError: if the file can't be written.
@@ -184,15 +187,50 @@ def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
         # The writer ignores the exit status of ffmpeg.
         if not (path.exists() and path.stat().st_size):
             raise OSError("ffmpeg wrote nothing")
-    elif path.suffix == ".gif":
+    else:
         images = [Image.fromarray(frame) for frame in frames]
         duration = 1000.0 / fps
         images[0].save(
             path, save_all=True, append_images=images[1:], duration=duration, loop=0
         )
-    else:
-        chosen = np.linspace(0, len(frames) - 1, min(8, len(frames))).astype(int)
-        Image.fromarray(np.concatenate([frames[i] for i in chosen], axis=1)).save(path)
+
+
+def write_strip(
+    env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
+) -> int:
+    """Write up to eight moments of an episode in two rows, each above its time.
+
+    The letters are as large as a column of a paper needs, four pictures wide.
+
+    Returns:
+      The number of moments.
+
+    Raises:
+      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
+      OSError: if the file can't be written.
+    """
+    from matplotlib import font_manager
+    from PIL import Image, ImageDraw, ImageFont
+
+    width, height = size
+    steps = np.unique(np.linspace(0, len(states) - 1, 8).round().astype(int)).tolist()
+    columns = -(-len(steps) // 2)
+    gap, letters = width // 24, max(8, width // 9)
+    below = 3 * letters // 2
+    strip = Image.new(
+        "RGB", (columns * (width + gap) - gap, 2 * (height + below)), "white"
+    )
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), letters)
+    pen = ImageDraw.Draw(strip)
+    with contextlib.closing(pictures.painter(env, size)) as painter:
+        for number, step in enumerate(steps):
+            x = number % columns * (width + gap)
+            y = number // columns * (height + below)
+            strip.paste(Image.fromarray(painter.draw(states[: step + 1])), (x, y))
+            middle = (x + width // 2, y + height + below // 2)
+            pen.text(middle, painter.moment(step), "black", font, anchor="mm")
+    strip.save(path)
+    return len(steps)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -39,15 +39,9 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
         state,
         act_key,
         policy=policy.apply,
-        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
+        hyperparameters=hyperparameters,
     )
-    history, buffer = train.remember(
-        state.history,
-        state.good_trajectories,
-        batch,
-        max_steps=hyperparameters.buffer_steps,
-        max_episodes=config.buffer_episodes,
-    )
+    history, buffer = train.remember(config, state, batch, hyperparameters)
     rewards, _ = train.learner_rewards(
         env, config, state, batch, history, decompose_key, hyperparameters
     )

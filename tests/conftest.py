@@ -32,7 +32,13 @@ _COMPILED_AS_FOR_USERS = {
     "test_resources",
 }
 # Modules with tests that take long by themselves.
-_LONG = {"test_figures", "test_point_mass_figures", "test_readme", "test_sweep"}
+_LONG = {
+    "test_examples",
+    "test_figures",
+    "test_point_mass_figures",
+    "test_readme",
+    "test_sweep",
+}
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -88,7 +88,7 @@ def test_no_module_imports_itself_by_way_of_others():
         visit(name)
 
 
-@pytest.mark.parametrize("package", ["envs/gasil_envs", "examples"])
+@pytest.mark.parametrize("package", ["envs/gasil_envs", "docs/examples"])
 def test_environments_and_examples_know_their_neighbours_alone(package):
     for path in (ROOT / package).rglob("*.py"):
         for imported in imports(path):

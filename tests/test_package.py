@@ -17,8 +17,8 @@ from gasil_jax import __main__ as package
 ROOT = pathlib.Path(__file__).parent.parent
 #: What only an extra installs, by the names of the modules.
 EXTRAS = (
-    "gymnax imageio_ffmpeg minari mkdocs optuna ray stable_baselines3 tensorboardX "
-    "wandb pytest hypothesis"
+    "gymnax imageio_ffmpeg latex2mathml minari mkdocs optuna ray stable_baselines3 "
+    "tensorboardX wandb pytest hypothesis"
 ).split()
 _RUN = """
 import sys

@@ -6,7 +6,6 @@ import pathlib
 import re
 import shlex
 import subprocess
-import sys
 
 import jax
 import numpy as np
@@ -16,7 +15,7 @@ import gasil_jax
 from gasil_jax import evaluate, merge, plot, render, run, sweep
 from gasil_jax import export_minari as export
 from gasil_jax.host import command_line, metrics_files, policy_file, run_options
-from gasil_jax.sweeps import saved_states, shards
+from gasil_jax.sweeps import shards
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
@@ -243,7 +242,7 @@ def test_options_in_the_table_exist():
 
 def test_the_agents_of_the_table_are_all_that_there_are():
     table = TEXT[TEXT.index("| `--agent` |") :].split("\n\n")[0]
-    agents = re.findall(r"^\| `([a-z+]+)` \|", table, re.MULTILINE)
+    agents = re.findall(r"^\| `([a-z][a-z+-]*)` \|", table, re.MULTILINE)
     assert sorted(agents) == sorted(gasil_jax.agents())
 
 
@@ -291,7 +290,7 @@ def test_the_python_of_the_readme_runs(finished_hopper):
 
 def test_the_python_of_the_documentation_runs(finished_hopper):
     names = run_python(DOCS / "python.md")
-    assert names["metrics"]["episode_return"].shape == (4, 2)  # alphas, iterations
+    assert names["metrics"]["episode_return"].shape == (2, 2)  # seeds, iterations
     assert names["state"].iteration.shape == (2,)
     assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
@@ -322,37 +321,11 @@ def test_the_caption_of_the_film_is_what_the_film_says():
     assert comment in " ".join(TEXT.split())
 
 
-def test_every_page_and_plot_can_be_reached():
-    """The navigation leads to all pages, and the pages show all plots."""
-    results = README.parent / "experiments" / "results"
-    navigation = (README.parent / "mkdocs.yml").read_text()
-    pages = [*DOCS.glob("*.md"), *results.glob("*.md")]
-    for page in pages:
-        below = "results/" if page.parent == results else ""
-        assert f": {below}{page.name}\n" in navigation, page.name
-    text = "".join(page.read_text() for page in pages)
-    for plot_ in results.glob("*.png"):
-        assert re.search(rf"\]\((results/)?{plot_.name}\)", text), plot_.name
-
-
 def test_the_links_of_the_readme_lead_somewhere():
     targets = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", TEXT)
     assert len(targets) > 15
     for target in targets:
         assert (README.parent / target).exists(), target
-
-
-def test_the_example_runs(untrained_hopper, tmp_path, monkeypatch, capsys):
-    import runpy
-
-    env, _, _, states = saved_states.load(untrained_hopper)
-    policy_file.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
-    script = README.parent / "examples" / "gymnasium_rollout.py"
-    arguments = [str(script), str(tmp_path), "Hopper-v5", "--episodes", "2"]
-    monkeypatch.setattr(sys, "argv", arguments)
-    runpy.run_path(str(script), run_name="__main__")
-    lines = capsys.readouterr().out.splitlines()
-    assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
 
 
 def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
@@ -442,15 +415,3 @@ def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
     )
     with pytest.raises(ValueError, match=r"metrics of agent 'bad'.*episode_return"):
         jax.eval_shape(train, jax.random.key(0))
-
-
-def test_the_documentation_builds(tmp_path):
-    pytest.importorskip("mkdocs")
-    import subprocess
-
-    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(tmp_path)]
-    result = subprocess.run(
-        command, cwd=README.parent, capture_output=True, text=True, timeout=200
-    )
-    assert result.returncode == 0, result.stderr[-3000:]
-    assert "make_train" in (tmp_path / "api" / "index.html").read_text()

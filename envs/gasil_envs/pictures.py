@@ -10,6 +10,9 @@ from brax.envs import Env
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.point_mass import PointMass
 
+#: How far the metres are marked, to both sides.
+_METRES = 5
+
 
 class NoOpenGL(RuntimeError):
     """There is no OpenGL for MuJoCo to draw with."""
@@ -33,7 +36,9 @@ class LocomotionPainter:
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
         self._data = mujoco.MjData(model)
         try:
-            self._renderer = mujoco.Renderer(model, size[1], size[0])
+            # MuJoCo's letters have sizes from 50% to 300%.
+            scale = mujoco.mjtFontScale(50 * min(6, max(1, size[0] // 96)))
+            self._renderer = mujoco.Renderer(model, size[1], size[0], font_scale=scale)
         # The GL library's own errors are of many types.
         except Exception as error:
             raise NoOpenGL(
@@ -47,7 +52,29 @@ class LocomotionPainter:
         self._data.qpos[:], self._data.qvel[:] = physics.qpos, physics.qvel
         mujoco.mj_forward(self._model, self._data)
         self._renderer.update_scene(self._data, 0 if self._model.ncam else -1)
+        self._mark_metres()
         return self._renderer.render().copy()
+
+    def _mark_metres(self) -> None:
+        """Lay a line across the ground at each whole metre near by, with its number."""
+        scene, floor = self._renderer.scene, self._model.geom("floor").pos[2]
+        x, y, _ = self._data.subtree_com[1]
+        for metre in range(round(x) - _METRES, round(x) + _METRES + 1):
+            geom = scene.geoms[scene.ngeom]
+            mujoco.mjv_initGeom(
+                geom,
+                mujoco.mjtGeom.mjGEOM_BOX,
+                np.array([0.02, 0.5, 0.002]),
+                np.array([metre, y + 1.0, floor]),
+                np.eye(3).ravel(),
+                np.array([0.9, 0.2, 0.1, 1.0], np.float32),
+            )
+            geom.label = f"{metre} m"
+            scene.ngeom += 1
+
+    def moment(self, step: int) -> str:
+        """Return the time of a step, to write it at its picture."""
+        return f"{step * self.seconds_per_step:.2f} s"
 
     def close(self) -> None:
         """Free the OpenGL context."""
@@ -71,7 +98,7 @@ class PointMassPainter:
         self._layout = env.layout
         figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
         self._canvas = FigureCanvasAgg(figure)
-        self._axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        self._axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
 
     def draw(self, episode: Sequence[Any]) -> np.ndarray:
         """Return a picture of the path so far, uint8 (height, width, 3)."""
@@ -84,6 +111,10 @@ class PointMassPainter:
         axes.set(xticks=[], yticks=[])
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+    def moment(self, step: int) -> str:
+        """Return the number of a step, to write it at its picture."""
+        return f"step {step}"
 
     def close(self) -> None:
         """Do nothing: there is nothing to free."""

@@ -1,6 +1,7 @@
 """Films of a run's policy."""
 
 import base64
+import itertools
 import json
 import pathlib
 import re
@@ -48,35 +49,64 @@ def point_mass(tmp_path_factory):
     return out
 
 
+def check_strip(image, width, height):
+    """Two rows of four pictures, each above the time that it shows."""
+    columns, rows = image.size
+    assert 4 * width < columns < 4.3 * width
+    assert 2 * height < rows < 2.6 * height
+    pixels = np.asarray(image.convert("L"), int)
+    below = rows // 2 - height
+    times = [
+        pixels[top : top + below, left : left + width]
+        for top in (height, rows // 2 + height)
+        for left in range(0, columns, (columns - width) // 3)
+    ]
+    assert len(times) == 8
+    for time in times:
+        # Black letters in a white margin.
+        assert time.min() < 50
+        assert (time[[0, -1]] > 250).all() and (time[:, [0, -1]] > 250).all()
+    for first, second in itertools.combinations(times, 2):
+        assert (first != second).any()
+
+
 @pytest.mark.parametrize("suffix", [".gif", ".png", ".mp4"])
 def test_the_point_mass_is_drawn(point_mass, suffix, tmp_path, capsys):
     path = tmp_path / f"film{suffix}"
     size = ("--width", "161", "--height", "120")
     assert render.main([str(point_mass), "--out", str(path), *size]) == 0
-    assert "51 frames" in capsys.readouterr().out
+    count = "8 frames" if suffix == ".png" else "51 frames"
+    assert count in capsys.readouterr().out
     if suffix == ".mp4":
         assert b"ftyp" in path.read_bytes()[:12]
         return
     image = Image.open(path)
-    assert image.size == ((162, 120) if suffix == ".gif" else (8 * 162, 120))
-    if suffix == ".gif":
+    if suffix == ".png":
+        check_strip(image, 162, 120)
+    else:
+        assert image.size == (162, 120)
         first = np.asarray(image.convert("RGB"), int)
         image.seek(image.n_frames - 1)
         assert np.abs(np.asarray(image.convert("RGB"), int) - first).max() > 50
 
 
 def test_locomotion_is_drawn(untrained_hopper, tmp_path):
-    out, path = untrained_hopper, tmp_path / "film.gif"
+    film, strip = tmp_path / "film.gif", tmp_path / "strip.png"
     # In a process of its own: MuJoCo chooses its OpenGL when it is imported.
-    command = [sys.executable, "-m", "gasil_jax.render", str(out), "--steps", "40"]
-    result = subprocess.run(
-        [*command, "--out", str(path)], capture_output=True, text=True
-    )
+    run = f"render.main([{str(untrained_hopper)!r}, '--steps', '40', '--out', path])"
+    code = f"""
+import sys
+from gasil_jax import render
+sys.exit(max({run} for path in sys.argv[1:]))
+"""
+    command = [sys.executable, "-c", code, str(film), str(strip)]
+    result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode == 1:
         assert "no OpenGL for MuJoCo" in result.stderr
         pytest.skip("no OpenGL here")
     assert result.returncode == 0, result.stderr
-    image = Image.open(path)
+    check_strip(Image.open(strip), 480, 360)
+    image = Image.open(film)
     assert image.size == (480, 360)
     # Not one colour, as where nothing is drawn.
     assert np.asarray(image.convert("RGB")).std() > 10

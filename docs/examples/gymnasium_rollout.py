@@ -1,6 +1,6 @@
 """Run a trained policy in Gymnasium, without JAX.
 
-    python examples/gymnasium_rollout.py runs/hopper Hopper-v5 --episodes 5
+    python docs/examples/gymnasium_rollout.py runs/hopper Hopper-v5 --episodes 5
 
 The first argument is the folder of a finished run, or its policy.npz.
 """

@@ -1,0 +1,70 @@
+"""What MkDocs does beside its plugins: formulas, notebooks, pages of results."""
+
+import html
+import json
+import logging
+import pathlib
+import re
+from typing import Any
+
+from latex2mathml import converter
+from mkdocs.structure.files import File
+
+_LOG = logging.getLogger("mkdocs.hooks.site")
+#: What pymdownx.arithmatex makes of a formula.
+_FORMULA = re.compile(
+    r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL
+)
+#: TeX's spaces that the converter leaves out: around a function's name, and none behind
+#: a minus that is a sign.
+_SPACES = (
+    (r"(?<=</mi>)(?=<mi>(?:log|tanh)</mi>)", '<mspace width="0.167em" />'),
+    (r"(<mi>(?:log|tanh)</mi>)(?=<mi>)", r'\1<mspace width="0.167em" />'),
+    (r"(<mo[^>]*>[=(,\[]</mo>)<mo>−</mo>", r'\1<mo form="prefix">−</mo>'),
+)
+
+
+def _mathml(match: re.Match[str]) -> str:
+    display = "block" if match[2] == "[" else "inline"
+    tex = html.unescape(match[3])
+    written = re.sub(
+        r"&#x(\w+);",
+        lambda code: html.escape(chr(int(code[1], 16))),
+        converter.convert(tex, display=display),
+    )
+    for pattern, replacement in _SPACES:
+        written = re.sub(pattern, replacement, written)
+    return written
+
+
+def on_page_content(content: str, page: Any, **_: Any) -> str:
+    """Turn a page's TeX into MathML, which browsers draw without a script."""
+    content = _FORMULA.sub(_mathml, content)
+    for formula in re.findall(r"<math.*?</math>", content, re.DOTALL):
+        if "\\" in formula:  # as the converter writes what it does not know
+            _LOG.warning("%s: a formula that is not known: %s", page.url, formula)
+    return content
+
+
+def on_files(files: Any, config: Any, **_: Any) -> Any:
+    """Make a page of each notebook, without what its code prints and draws."""
+    docs = pathlib.Path(config.docs_dir)
+    for path in docs.glob("examples/*.ipynb"):
+        parts = []
+        for cell in json.loads(path.read_text())["cells"]:
+            text = "".join(cell["source"])
+            is_code = cell["cell_type"] == "code"
+            parts.append(f"```python\n{text}\n```" if is_code else text)
+        page = path.relative_to(docs).with_suffix(".md").as_posix()
+        files.append(File.generated(config, page, content="\n\n".join(parts)))
+    return files
+
+
+def on_config(config: Any) -> Any:
+    """Put pages of results that the navigation does not name below its last section."""
+    docs = pathlib.Path(config.docs_dir)
+    (results,) = config.nav[-1].values()
+    named = {path for entry in results for path in entry.values()}
+    paths = (path.relative_to(docs).as_posix() for path in docs.glob("results/*.md"))
+    results += sorted(set(paths) - named)
+    return config

@@ -1,0 +1,208 @@
+"""The site that MkDocs builds of the documentation needs nothing but itself."""
+
+import functools
+import http.server
+import json
+import os
+import pathlib
+import queue
+import re
+import shutil
+import subprocess
+import sys
+import threading
+import urllib.parse
+from html.parser import HTMLParser
+
+import pytest
+
+pytest.importorskip("mkdocs")
+
+ROOT = pathlib.Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+RESULTS = ROOT / "experiments" / "results"
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+
+
+class Page(HTMLParser):
+    """What a page refers to, what can be referred to in it, and what is read."""
+
+    def __init__(self, path):
+        super().__init__()
+        self.loaded, self.images, self.links = [], [], []
+        self.ids, self.text, self._code = set(), "", 0
+        self.feed(path.read_text())
+
+    def handle_starttag(self, tag, attributes):
+        values = dict(attributes)
+        self.ids.add(values.get("id"))
+        self._code += tag in ("code", "pre", "script", "style")
+        if tag == "a":
+            self.links.append(values.get("href"))
+        elif tag == "img":
+            self.images.append(values["src"])
+        else:
+            self.loaded += [values[x] for x in ("href", "src") if x in values]
+
+    def handle_endtag(self, tag):
+        self._code -= tag in ("code", "pre", "script", "style")
+
+    def handle_data(self, data):
+        if not self._code:
+            self.text += data
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    out = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(out)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    result = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=200
+    )
+    assert result.returncode == 0, result.stderr[-3000:]
+    return out
+
+
+@pytest.fixture(scope="module")
+def pages(site):
+    return {path: Page(path) for path in site.rglob("*.html")}
+
+
+def target(site, path, link):
+    """Return the file that a page's link leads to, and the place in it."""
+    address = urllib.parse.urlsplit(link)
+    if not address.path:
+        return path, address.fragment
+    below = site if address.path.startswith("/") else path.parent
+    found = (below / urllib.parse.unquote(address.path).lstrip("/")).resolve()
+    return (found / "index.html" if found.is_dir() else found), address.fragment
+
+
+def test_all_that_is_public_is_there(site):
+    assert "make_train" in (site / "api" / "index.html").read_text()
+
+
+def test_nothing_is_loaded_from_outside(site, pages):
+    for path, page in pages.items():
+        for link in (*page.loaded, *page.images):
+            assert not urllib.parse.urlsplit(link).netloc, (path, link)
+            assert target(site, path, link)[0].is_file(), (path, link)
+    styles = "".join(path.read_text() for path in site.rglob("*.css"))
+    assert not re.search(r"@import|url\(\W?(https?:)?//", styles)
+
+
+def test_links_lead_somewhere(site, pages):
+    for path, page in pages.items():
+        for link in filter(None, page.links):
+            address = urllib.parse.urlsplit(link)
+            if address.netloc or address.scheme == "mailto":
+                continue
+            file, fragment = target(site, path, link)
+            assert file.is_file(), (path, link)
+            if fragment and file in pages:
+                assert fragment in pages[file].ids, (path, link)
+
+
+def test_formulas_are_rendered(site, pages):
+    for path, page in pages.items():
+        found = re.search(r"\\[(\[]|\\[a-z]{2,}|\$\$", page.text)
+        assert not found, (path, page.text[found.start() :][:80])
+    assert (site / "algorithm" / "index.html").read_text().count("<math") > 30
+
+
+def test_every_page_and_picture_can_be_reached(site, pages):
+    """The navigation leads to all pages, and the pages show all pictures."""
+    home = site / "index.html"
+    listed = {target(site, home, link)[0] for link in pages[home].links if link}
+    for path in (*DOCS.glob("*.md"), *RESULTS.glob("*.md")):
+        folder = site / "results" if path.parent == RESULTS else site
+        name = "" if path.stem in ("index", "README") else path.stem
+        assert folder / name / "index.html" in listed, path
+    shown = {
+        target(site, path, link)[0] for path in pages for link in pages[path].images
+    }
+    pictures = [*RESULTS.glob("*.png"), *DOCS.glob("*.gif")]
+    assert {path.name for path in pictures} <= {path.name for path in shown}
+    # The home page shows a film and a figure.
+    assert len(pages[home].images) >= 2
+
+
+#: Opens pages one after another, and posts what is seen of each.
+_VISIT = """
+<body><script>
+async function visit(address) {
+  const frame = document.createElement("iframe");
+  frame.width = 1200;
+  const loaded = new Promise((done) => (frame.onload = done));
+  frame.src = address;
+  document.body.append(frame);
+  await loaded;
+  const page = frame.contentDocument;
+  await page.fonts.ready;
+  const box = (element) => element.getBoundingClientRect();
+  const seen = {
+    formulas: page.querySelectorAll("math").length,
+    flat: [...page.querySelectorAll("math")].filter((m) => !box(m).height).length,
+    raised: [...page.querySelectorAll("msub")].filter(
+      (m) => box(m.lastChild).bottom <= box(m.firstChild).bottom).length,
+    unseen: [...page.images].filter((i) => !i.naturalWidth).map((i) => i.src),
+    outside: frame.contentWindow.performance.getEntriesByType("resource")
+      .map((r) => r.name).filter((name) => !name.startsWith(location.origin)),
+    fonts: [...page.fonts].filter((f) => f.status == "loaded").map((f) => f.family),
+  };
+  frame.remove();
+  return seen;
+}
+(async () => {
+  const seen = {};
+  for (const address of ADDRESSES) seen[address] = await visit(address);
+  await fetch("/", {method: "POST", body: JSON.stringify(seen)});
+})();
+</script></body>
+"""
+
+
+def test_a_browser_without_network_shows_all_pages(site, pages, tmp_path):
+    browser = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if browser is None:
+        pytest.skip("no Chromium here")
+    posted = queue.Queue()
+
+    class Handler(http.server.SimpleHTTPRequestHandler):
+        def do_POST(self):
+            posted.put(self.rfile.read(int(self.headers["Content-Length"])))
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_):
+            pass
+
+    addresses = [f"/{path.relative_to(site)}" for path in pages]
+    visit = _VISIT.replace("ADDRESSES", json.dumps(addresses))
+    (site / "visit.html").write_text(visit)
+    handler = functools.partial(Handler, directory=str(site))
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        command = [
+            *(browser, "--headless", "--no-sandbox", "--disable-gpu"),
+            f"--user-data-dir={tmp_path}",
+            # Only this site can be reached.
+            "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
+            f"http://127.0.0.1:{server.server_port}/visit.html",
+        ]
+        with (tmp_path / "browser.log").open("w") as log:
+            process = subprocess.Popen(command, stdout=log, stderr=log)
+        try:
+            seen = json.loads(posted.get(timeout=100))
+        finally:
+            process.terminate()
+            process.wait(20)
+            server.shutdown()
+            (site / "visit.html").unlink()
+    assert len(seen) == len(pages) > 20
+    for address, page in seen.items():
+        assert not page["unseen"] + page["outside"], (address, page)
+        assert not page["flat"] + page["raised"], (address, page)
+    algorithm = seen["/algorithm/index.html"]
+    assert algorithm["formulas"] > 30 and "Formulas" in algorithm["fonts"]
