@@ -7,10 +7,12 @@ import os
 import pathlib
 import queue
 import re
+import runpy
 import shutil
 import subprocess
 import sys
 import threading
+import types
 import urllib.parse
 from html.parser import HTMLParser
 
@@ -126,6 +128,27 @@ def test_every_page_and_picture_can_be_reached(site, pages):
     assert {path.name for path in pictures} <= {path.name for path in shown}
     # The home page shows a film and a figure.
     assert len(pages[home].images) >= 2
+
+
+def test_a_new_page_of_results_follows_those_with_a_title(tmp_path):
+    hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
+    (tmp_path / "results").mkdir()
+    for name in ("old", "new"):
+        (tmp_path / "results" / f"{name}.md").touch()
+    nav = [{"Home": "index.md"}, {"Results": [{"Old": "results/old.md"}]}]
+    config = types.SimpleNamespace(docs_dir=str(tmp_path), nav=nav)
+    (results,) = hooks["on_config"](config).nav[-1].values()
+    assert results == [{"Old": "results/old.md"}, "results/new.md"]
+
+
+def test_a_formula_that_is_not_known_is_told(caplog):
+    hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
+    page = types.SimpleNamespace(url="algorithm/")
+    for tex, known in ((r"-\log D(s)", True), (r"\unheard D", False)):
+        content = rf'<span class="arithmatex">\({tex}\)</span>'
+        assert hooks["on_page_content"](content, page).startswith("<math")
+        assert (caplog.text == "") is known
+    assert r"algorithm/: a formula that is not known" in caplog.text
 
 
 #: Opens pages one after another, and posts what is seen of each.
