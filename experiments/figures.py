@@ -460,11 +460,12 @@ FIGURES: Mapping[str, Figure] = {
     "adaptive_imitation": Figure(
         "Delayed rewards with adaptive imitation, beyond the paper",
         "",
-        grid(
-            ("walker2d", "halfcheetah", "swimmer"),
-            (*PAIR, "ppo+gasil-adaptive"),
-            (DELAY,),
-            panel="{env}",
+        joined(
+            grid(tasks, (*agents, "ppo+gasil-adaptive"), (DELAY,), panel="{env}")
+            for tasks, agents in (
+                (("hopper",), ("ppo",)),
+                (("walker2d", "halfcheetah", "swimmer"), PAIR),
+            )
         ),
         favourite="ppo+gasil-adaptive",
     ),
