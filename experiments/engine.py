@@ -170,7 +170,7 @@ def train(program: Program) -> dict[Run, Record]:
                 on_finished=lambda job, batch, outcome: None,
             )
         except Interrupted as interrupted:
-            interrupted.add_note("go on with: the same command and --resume")
+            interrupted.add_note("continue with: the same command and --resume")
             raise
         metrics = read("metrics.csv")
         evaluations = read("evaluations.csv") if episodes else {}

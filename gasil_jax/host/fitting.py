@@ -181,7 +181,7 @@ def _opened(
         try:
             yield
         except Interrupted as interrupted:
-            interrupted.add_note("go on with the same arguments and resume=True")
+            interrupted.add_note("continue with the same arguments and resume=True")
             raise
 
 

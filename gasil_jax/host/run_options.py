@@ -161,7 +161,7 @@ def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
     if given is None or not given.resume:
         return None
     if given.out is None:
-        raise InputError("resume needs --out and the folder of the run to go on with")
+        raise InputError("resume needs --out and the folder of the run to continue")
     return given.out if run_folder.is_described(given.out) else None
 
 
@@ -275,7 +275,7 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
         except Interrupted as interrupted:
             where = shlex.quote(str(folder))
             interrupted.add_note(
-                f"go on with: python -m {program} --resume --out {where}"
+                f"continue with: python -m {program} --resume --out {where}"
             )
             raise
 
