@@ -168,19 +168,6 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
         np.savez_compressed(partial, allow_pickle=False, **arrays)
 
 
-def _with_evaluations(arrays: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the arrays of an older file, which has one evaluation of a run or none."""
-    evaluated = np.isfinite(arrays["final_evaluation"])
-    return {
-        **arrays,
-        "evaluations": evaluated.astype(int),
-        "evaluation_steps": arrays["env_steps"][np.cumsum(arrays["rows"]) - 1][
-            evaluated
-        ],
-        "evaluation_return": arrays["final_evaluation"][evaluated],
-    }
-
-
 def read(path: pathlib.Path) -> dict[Run, Record]:
     """Return the runs of a file.
 
@@ -190,8 +177,6 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
     records = {}
     try:
         arrays = npz.read(path)
-        if "evaluations" not in arrays:
-            arrays = _with_evaluations(arrays)
         index = json.loads(str(arrays["index"]))
         experiments = list(map(_experiment, index["experiments"]))
         columns = {
