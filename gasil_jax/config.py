@@ -404,7 +404,7 @@ def _validate_number(
 def _validate_sizes(config: Config) -> None:
     for name, allowed in ranges(Config).items():
         value = getattr(config, name)
-        if value is None and name in ("max_episode_steps", "buffer_episodes"):
+        if value is None and getattr(Config, name) is None:
             continue
         if name.endswith("_sizes"):
             if not isinstance(value, tuple):

@@ -39,7 +39,7 @@ def evaluate(
       "episode_return" and "episode_length", (num_episodes,) each.
     """
     network: Any = Policy(config.hidden_sizes, env.action_size)
-    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    low, high = wrappers.action_range(env)
     reset_key, act_key = jax.random.split(key)
 
     def act(observation: jax.Array, key: jax.Array) -> jax.Array:

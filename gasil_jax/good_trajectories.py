@@ -60,6 +60,10 @@ class History(struct.PyTreeNode):
     ended: jax.Array
     cursor: jax.Array
 
+    def in_time(self, ring: jax.Array) -> jax.Array:
+        """Return a ring (N, H, ...) of this history in time order, oldest first."""
+        return jnp.roll(ring, -self.cursor, axis=1)
+
 
 class Episodes(struct.PyTreeNode):
     """Ended episodes offered to the buffer; entries with ``length == 0`` are empty.

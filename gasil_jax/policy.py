@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
 
@@ -19,7 +20,7 @@ def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
     """
     params = jax.tree.map(np.asarray, state.actor_critic.policy.params["params"])
     layers = params["MLP_0"]
-    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    low, high = wrappers.action_range(env)
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
     mean, scale = normalization.moments(state.normalizer)
     arrays = {

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 import chex
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from gasil_jax import good_trajectories, learner, normalization
@@ -83,11 +82,6 @@ def _network(config: Config) -> Any:
     return StepReward(config.decomposition_hidden_sizes)
 
 
-def _optimizer() -> optax.GradientTransformation:
-    # One vector of parameters is faster, see `ppo.optimizer`.
-    return optax.flatten(optax.scale_by_adam())
-
-
 def init(
     key: jax.Array, config: Config, history: History, action_size: int
 ) -> Decomposition:
@@ -105,7 +99,7 @@ def init(
         key, observation, jnp.zeros(action_size), observation
     )
     return Decomposition(
-        network=learner.init(params, _optimizer()),
+        network=learner.init(params, learner.adam()),
         rates=normalization.init(1),
         next_observation=jnp.zeros((num_envs, steps, observation_size), jnp.float32),
         reward=jnp.zeros((num_envs, steps), jnp.float32),
@@ -130,8 +124,7 @@ def windows(history: History, recorded_steps: jax.Array) -> Windows:
       history: the history, with NaN rewards where a payout is not known.
       recorded_steps: int32 (), how many of the history's steps were ever recorded.
     """
-    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
-    reward, ended = in_time(history.reward), in_time(history.ended)
+    reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     steps = reward.shape[1]
     index = jnp.arange(steps, dtype=jnp.int32)
     recorded = index >= steps - recorded_steps
@@ -346,7 +339,7 @@ def _train(
         )
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
         gradient = jax.grad(objective)(network.params, rows, weight, target)
-        return learner.descend(network, gradient, _optimizer(), step_size), None
+        return learner.descend(network, gradient, learner.adam(), step_size), None
 
     trained, _ = jax.lax.scan(
         step, network, jax.random.split(key, config.decomposition_updates)

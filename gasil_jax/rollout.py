@@ -125,11 +125,6 @@ def init(
     )
 
 
-def action_range(env: Any) -> tuple[Any, Any]:
-    """Return the lowest and the highest action; Brax's environments have -1 and 1."""
-    return getattr(env, "action_range", (-1.0, 1.0))
-
-
 def is_finite(tree: Any) -> jax.Array:
     """Return whether every number of every leaf is finite, bool ()."""
     leaves = jax.tree.leaves(tree)
@@ -167,7 +162,7 @@ def collect(
     marked in ``cut_short``. PPO learns from its steps, but its return is not reported.
     """
     num_envs = environments.episode_length.shape[0]
-    low, high = action_range(env)
+    low, high = wrappers.action_range(env)
 
     def step_one(state: Any, action: jax.Array, reset_key: jax.Array) -> Any:
         stepped = env.step(state, jnp.clip(action, low, high))

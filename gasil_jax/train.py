@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     good_trajectories,
@@ -345,7 +346,7 @@ def learner_rewards(
             key,
             config=config,
             hyperparameters=hyperparameters,
-            action_range=rollout.action_range(env),
+            action_range=wrappers.action_range(env),
         )
         # What is not a number in the history marks an episode without a return.
         unknown = jnp.isnan(history.reward)

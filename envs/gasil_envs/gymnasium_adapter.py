@@ -27,7 +27,7 @@ _NAMESPACE = "gasil_envs"
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     """Return the spaces of observations and actions."""
-    low, high = getattr(env, "action_range", (-1.0, 1.0))
+    low, high = wrappers.action_range(env)
     shape = (env.action_size,)
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), shape).copy()
     return (

@@ -85,7 +85,7 @@ class GymnaxEnv:
 
     def action_space(self, params: Params | None = None) -> Any:
         """Return a ``gymnax.environments.spaces.Box`` of shape (action,)."""
-        low, high = getattr(self._env, "action_range", (-1.0, 1.0))
+        low, high = wrappers.action_range(self._env)
         return _box(low, high, self._env.action_size)
 
 

@@ -5,6 +5,8 @@ below it alone. Order, innermost first: `EpisodeLimit` (it decides when an episo
 ends), `RewardDelay` (it must see that end), `ObservationNoise`, `AutoReset`.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from brax.envs import Env, State, Wrapper
@@ -16,6 +18,11 @@ def truncated(state: State) -> jax.Array:
     It is false if the environment has no ``info["truncation"]``.
     """
     return state.info.get("truncation", jnp.zeros_like(state.done)) > 0
+
+
+def action_range(env: Any) -> tuple[Any, Any]:
+    """Return the lowest and the highest action; Brax's environments have -1 and 1."""
+    return getattr(env, "action_range", (-1.0, 1.0))
 
 
 class EpisodeLimit(Wrapper):

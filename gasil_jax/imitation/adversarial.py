@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from gasil_jax import good_trajectories, learner, normalization
 from gasil_jax.config import Config, Hyperparameters
@@ -130,11 +129,6 @@ def _network(config: Config) -> Any:
     return Discriminator(config.discriminator_hidden_sizes)
 
 
-def _optimizer() -> optax.GradientTransformation:
-    # One vector of parameters is faster, see `ppo.optimizer`.
-    return optax.flatten(optax.scale_by_adam())
-
-
 def init(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> Learner:
@@ -142,7 +136,7 @@ def init(
     params = _network(config).init(
         key, jnp.zeros(observation_size), jnp.zeros(action_size)
     )
-    return learner.init(params, _optimizer())
+    return learner.init(params, learner.adam())
 
 
 class Source(NamedTuple):
@@ -184,15 +178,15 @@ def _input(
     context: Context,
 ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
     """Return the function from pairs to what the discriminator sees of them."""
-    batch = normalization.init(context.rollout.action.shape[-1])
-    batch = normalization.update(batch, context.rollout.action)
-
-    def enter(observation: jax.Array, action: jax.Array) -> tuple[jax.Array, jax.Array]:
-        if context.config.discriminator_normalizes_actions:
-            action = normalization.normalize(batch, action)
-        return normalization.normalize(context.normalizer, observation), action
-
-    return enter
+    normalize = lambda x: normalization.normalize(context.normalizer, x)
+    if not context.config.discriminator_normalizes_actions:
+        return lambda observation, action: (normalize(observation), action)
+    actions = context.rollout.action
+    batch = normalization.update(normalization.init(actions.shape[-1]), actions)
+    return lambda observation, action: (
+        normalize(observation),
+        normalization.normalize(batch, action),
+    )
 
 
 def _train_discriminator(
@@ -205,7 +199,7 @@ def _train_discriminator(
     """
     config: Config = context.config
     hyperparameters: Hyperparameters = context.hyperparameters
-    network, transform = _network(config), _optimizer()
+    network, transform = _network(config), learner.adam()
     rollout = context.rollout
     observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
     action = rollout.action.reshape(-1, rollout.action.shape[-1])

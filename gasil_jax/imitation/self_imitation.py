@@ -92,8 +92,7 @@ def returns_to_go(
       discounted return from the step on, and a mask of the steps whose episode ended
       in the last batch and whose return is finite.
     """
-    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
-    reward, ended = in_time(history.reward), in_time(history.ended)
+    reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     length = reward.shape[1]
 
     def backward(carry: Any, step: Any) -> Any:
@@ -119,7 +118,6 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
     highest priority in the replay, so that each is drawn soon.
     """
     return_, complete = returns_to_go(history, num_steps, gamma)
-    in_time = lambda x: jnp.roll(x, -history.cursor, axis=1)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     capacity = replay.return_.shape[0]
     complete = flat(complete)
@@ -133,8 +131,10 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
     highest = jnp.maximum(jnp.max(replay.priority), _LEAST_PRIORITY)
     highest = jnp.where(jnp.any(replay.priority > 0), highest, 1.0)
     return Replay(
-        observation=write(replay.observation, flat(in_time(history.observation))),
-        action=write(replay.action, flat(in_time(history.action))),
+        observation=write(
+            replay.observation, flat(history.in_time(history.observation))
+        ),
+        action=write(replay.action, flat(history.in_time(history.action))),
         return_=write(replay.return_, flat(return_)),
         priority=write(replay.priority, highest),
         cursor=(replay.cursor + count) % capacity,
