@@ -1,5 +1,6 @@
 """The agents by name: the package's own, and those that MODULE:NAME names."""
 
+import importlib
 from typing import Any
 
 from gasil_jax.errors import NotImportable, unknown
@@ -22,6 +23,7 @@ def find(name: Any) -> Any:
     if not isinstance(name, str):
         raise ValueError(f"agent is {name!r}: it must be a text")
     if ":" not in name:
+        importlib.import_module("gasil_jax.imitation")  # It fills the table.
         if name not in AGENTS:
             raise ValueError(unknown("agent", name, tuple(AGENTS)))
         return AGENTS[name]

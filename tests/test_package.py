@@ -42,6 +42,11 @@ def test_the_commands_are_listed(capsys):
     assert "did you mean python -m gasil_jax.evaluate?" in capsys.readouterr().err
 
 
+def test_a_config_can_be_made_before_anything_else():
+    make = "import gasil_jax; gasil_jax.Config(agent='ppo+gasil').replace(num_envs=8)"
+    subprocess.run([sys.executable, "-c", make], check=True)
+
+
 def test_the_wheel_alone_trains(tmp_path):
     major = int(importlib.metadata.version("setuptools").partition(".")[0])
     if major < 77:
