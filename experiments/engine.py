@@ -20,7 +20,6 @@ import jax
 import numpy as np
 
 from experiments.store import Record, Run, Store
-from gasil_jax.config import Hyperparameters
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.environments import Settings
@@ -114,7 +113,8 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     for run in runs:
         # Only counts decide shapes, so only they need separate programs.
         counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
-        config = run.config.replace(hyperparameters=Hyperparameters(**counts))
+        kind = type(run.config.hyperparameters)
+        config = run.config.replace(hyperparameters=kind(**counts))
         shared = dataclasses.replace(run, config=config, seed=0)
         groups.setdefault(shared, []).append(run)
     ordered = lambda group: tuple(sorted(group, key=lambda run: run.key))

@@ -509,6 +509,12 @@ def fill(note: str, value: Callable[..., str]) -> str:
     return re.sub(r"{{(.+?)}}", lambda x: value(*shlex.split(x[1])), note)
 
 
+def fill_blocks(text: str, value: Callable[..., str]) -> str:
+    """Replace what is between ``<!-- begin SLOT -->`` and ``<!-- end -->``."""
+    block = re.compile(r"(<!-- begin (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
+    return block.sub(lambda x: f"{x[1]}\n{value(*shlex.split(x[2]))}\n\n{x[3]}", text)
+
+
 def _draw(page: Page) -> matplotlib.figure.Figure:
     """Return a plot with axes for each panel."""
     panels = list(dict.fromkeys(panel for panel, _ in page.results))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import npz
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config, hyperparameters_of
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
 
@@ -24,7 +24,7 @@ from gasil_jax.host import output_file, run_folder
 #: their environments in step, and were converted from an earlier format of results.
 ALGORITHM_VERSION = 2
 
-_DEFAULTS, _NONE = Hyperparameters(), np.empty(0)
+_NONE = np.empty(0)
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 
@@ -53,8 +53,9 @@ class Run:
                 raise InputError(f"{name} is a function: a stored run needs points")
             if name.endswith("_schedule"):
                 values[name] = [[float(x) for x in point] for point in value]
+        defaults = type(self.config.hyperparameters)()
         values["hyperparameters"] = {
-            name: type(getattr(_DEFAULTS, name))(value)
+            name: type(getattr(defaults, name))(value)
             for name, value in vars(self.config.hyperparameters).items()
         }
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
@@ -77,7 +78,8 @@ def _tuples(value: Any) -> Any:
 def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return a `Run`'s fields without its seed; newer `Config` fields have defaults."""
     values = {name: _tuples(value) for name, value in fields["config"].items()}
-    values["hyperparameters"] = Hyperparameters(**values["hyperparameters"])
+    kind = hyperparameters_of(values["agent"])
+    values["hyperparameters"] = kind(**values["hyperparameters"])
     return {**fields, "config": Config(**values)}
 
 

@@ -1,11 +1,9 @@
 """The page of all claims, and the blocks of the README that are generated.
 
-A block stands between ``<!-- begin SLOT -->`` and ``<!-- end -->``. A claim's verdict
-is a rule on the comparisons of its figure's page.
+A claim's verdict is a rule on the comparisons of its figure's page.
 """
 
 import pathlib
-import re
 import shlex
 from collections.abc import Mapping, Sequence
 
@@ -172,15 +170,9 @@ class Summary:
         parts = [title, *([report.IN_STEP] if in_step else []), body.strip()]
         return "\n\n".join(parts) + "\n"
 
-    def fill_blocks(self, text: str) -> str:
-        """Return a document with its generated blocks replaced by new ones."""
-        block = re.compile(r"(<!-- begin (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
-        made = lambda match: self.value(*shlex.split(match[2]))
-        return block.sub(lambda x: f"{x[1]}\n{made(x)}\n\n{x[3]}", text)
-
     def write(self) -> None:
         """Write the page of all claims and the README's blocks."""
-        text = self.fill_blocks(README.read_text())
+        text = report.fill_blocks(README.read_text(), self.value)
         for path, content in ((RESULTS / "README.md", self.text()), (README, text)):
             with output_file.whole(path) as partial:
                 partial.write_text(content)

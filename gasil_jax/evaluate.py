@@ -13,13 +13,11 @@ import numpy as np
 import tyro
 
 from gasil_jax import numpy_policy, policy
-from gasil_jax.config import Config
 from gasil_jax.errors import InputError
-from gasil_jax.evaluation import evaluate
+from gasil_jax.evaluation import run_episodes
 from gasil_jax.host import command_line, environments, output_file, resources
-from gasil_jax.host.members import member
 from gasil_jax.host.progress import announced
-from gasil_jax.sweeps.saved_states import load
+from gasil_jax.sweeps.saved_states import Policies, load_policies
 
 
 def evaluate_in_gymnasium(
@@ -65,7 +63,7 @@ class Options:
     """Evaluate the policies of a run, or of a point of a sweep.
 
     Attributes:
-      run: folder of the run or sweep.
+      run: folder of the run or sweep, or zoo:NAME, one of the package's policies.
       point: number of a sweep's point in results.csv; default the best by mean.
       checkpoint: checkpoint of the policies: last, or best, which has the best
         evaluation or, without evaluations, the best mean return in training.
@@ -89,38 +87,33 @@ class Options:
     out: pathlib.Path | None = None
 
 
-def _score(
-    options: Options, env: Any, config: Config, states: Any, seeds: Sequence[int]
-) -> dict[str, np.ndarray]:
-    score = jax.jit(
-        jax.vmap(
-            lambda state, key: evaluate(
-                env,
-                config,
-                state,
-                key,
-                num_episodes=options.episodes,
-                deterministic=not options.stochastic,
-            )
+def _score(options: Options, policies: Policies) -> dict[str, np.ndarray]:
+    def score(weights: Any, key: jax.Array) -> dict[str, jax.Array]:
+        return run_episodes(
+            policies.env,
+            policy.make(weights),
+            key,
+            num_episodes=options.episodes,
+            num_steps=policies.num_steps,
+            deterministic=not options.stochastic,
         )
-    )
+
     # A seed has the same starts and draws whether evaluated alone or with others.
     fold = lambda seed: jax.random.fold_in(jax.random.key(options.key), seed)
-    keys = jax.vmap(fold)(jnp.array(seeds, jnp.uint32))
-    return jax.tree.map(np.asarray, score(states, keys))
+    keys = jax.vmap(fold)(jnp.array(policies.seeds, jnp.uint32))
+    weights = jax.tree.map(lambda *x: jnp.stack(x), *policies.weights)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(score))(weights, keys))
 
 
-def _score_in_gymnasium(
-    options: Options, env: Any, gymnasium_id: str, states: Any, seeds: Sequence[int]
-) -> dict[str, np.ndarray]:
+def _score_in_gymnasium(options: Options, policies: Policies) -> dict[str, np.ndarray]:
     scores = [
         evaluate_in_gymnasium(
-            gymnasium_id,
-            numpy_policy.make(policy.weights(member(states, index), env)),
+            policies.env.unwrapped.task.gymnasium_id,
+            numpy_policy.make(weights),
             num_episodes=options.episodes,
             seed=options.key,
         )
-        for index in range(len(seeds))
+        for weights in policies.weights
     ]
     return jax.tree.map(lambda *x: np.stack(x), *scores)
 
@@ -136,9 +129,10 @@ def _main(arguments: Sequence[str] | None) -> None:
     command_line.check_key(options.key)
     if options.out is not None:
         output_file.check(options.out, (".csv",))
-    env, config, seeds, states = load(
+    policies = load_policies(
         options.run, options.checkpoint, options.point, options.seed
     )
+    env, seeds = policies.env, policies.seeds
     locomotion = environments.is_locomotion(env)
     if options.gymnasium and not (locomotion and not options.stochastic):
         raise InputError(
@@ -152,11 +146,8 @@ def _main(arguments: Sequence[str] | None) -> None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")
     with announced("evaluate", f"scoring {len(seeds)} policies"):
-        if options.gymnasium:
-            name = env.unwrapped.task.gymnasium_id
-            scores = _score_in_gymnasium(options, env, name, states, seeds)
-        else:
-            scores = _score(options, env, config, states, seeds)
+        score = _score_in_gymnasium if options.gymnasium else _score
+        scores = score(options, policies)
     print("seed  episodes      return     spread  length")
     for i, seed in enumerate(seeds):
         returns, length = scores["episode_return"][i], scores["episode_length"][i]

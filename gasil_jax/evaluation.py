@@ -1,5 +1,6 @@
 """Evaluate the policy of a training state in complete episodes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -7,9 +8,8 @@ import jax.numpy as jnp
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import normalization, train
+from gasil_jax import normalization, policy, train
 from gasil_jax.config import Config
-from gasil_jax.networks import Policy
 
 
 @full_precision
@@ -38,20 +38,42 @@ def evaluate(
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
     """
-    network: Any = Policy(config.hidden_sizes, env.action_size)
-    low, high = wrappers.action_range(env)
-    reset_key, act_key = jax.random.split(key)
+    return run_episodes(
+        env,
+        policy.from_state(state, env),
+        key,
+        num_episodes=num_episodes,
+        num_steps=train.max_episode_steps(env, config),
+        deterministic=deterministic,
+    )
 
-    def act(observation: jax.Array, key: jax.Array) -> jax.Array:
-        observation = normalization.normalize(state.normalizer, observation)
-        mean, log_std = network.apply(state.actor_critic.policy.params, observation)
-        noise = jax.random.normal(key, mean.shape, mean.dtype)
-        action = mean if deterministic else mean + jnp.exp(log_std) * noise
-        return jnp.clip(action, low, high)
+
+@full_precision
+def run_episodes(
+    env: Any,
+    act: Callable[..., jax.Array],
+    key: jax.Array,
+    *,
+    num_episodes: int,
+    num_steps: int,
+    deterministic: bool = True,
+) -> dict[str, jax.Array]:
+    """Run complete episodes with a policy; `evaluate` describes what is returned.
+
+    Args:
+      env: one environment.
+      act: (observation, key) -> action, a policy as from `policy.load_policy`.
+      key: random key; consumed.
+      num_episodes: number of episodes, which run in parallel.
+      num_steps: steps after which an episode is truncated, at the latest.
+      deterministic: whether to act with the policy's mean; else actions are drawn.
+    """
+    reset_key, act_key = jax.random.split(key)
 
     def step(carry: Any, key: jax.Array) -> Any:
         states, running, return_, length = carry
-        states = jax.vmap(env.step)(states, act(states.obs, key))
+        action = act(states.obs, None if deterministic else key)
+        states = jax.vmap(env.step)(states, action)
         reward = states.info.get("true_reward", states.reward)
         sound = normalization.is_sound(states.obs).all(axis=-1)
         sound &= normalization.is_sound(reward)
@@ -68,6 +90,6 @@ def evaluate(
         jnp.zeros(num_episodes),
         jnp.zeros(num_episodes, jnp.int32),
     )
-    keys = jax.random.split(act_key, train.max_episode_steps(env, config))
+    keys = jax.random.split(act_key, num_steps)
     _, _, return_, length = jax.lax.scan(step, start, keys)[0]
     return {"episode_return": return_, "episode_length": length}

@@ -3,15 +3,18 @@
     act = gasil_jax.numpy_policy.load("runs/hopper")
     action = act(observation)
 
-The file is an ``.npz`` of plain arrays, never unpickled:
+"zoo:NAME" names one of the trained policies that the package comes with. The file is an
+``.npz`` of plain arrays, never unpickled:
 
     seeds (S,)  final_return (S,)  mean, scale (S, obs)  log_std (S, action)
     kernel_0 (S, obs, width), bias_0 (S, width), kernel_1 ...  low, high (action,)
+    about (), JSON, only in the zoo: see `about`
 
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
 the last is followed by tanh; the output is the mean of a Gaussian.
 """
 
+import json
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,6 +22,10 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import npz
+from gasil_jax.errors import unknown
+
+#: Folder of the trained policies that come with the package, and how they are named.
+ZOO, ZOO_PREFIX = pathlib.Path(__file__).with_name("zoo"), "zoo:"
 
 #: Normalized observations are clipped to plus and minus this number.
 CLIP = 10.0
@@ -36,19 +43,49 @@ _REQUIRED = (
 )
 
 
+def zoo() -> tuple[str, ...]:
+    """Return the names of the trained policies that come with the package."""
+    return tuple(sorted(path.stem for path in ZOO.glob("*.npz")))
+
+
+def _file(path: str | pathlib.Path) -> pathlib.Path:
+    """Return the file of a saved policy."""
+    prefix, name = str(path)[: len(ZOO_PREFIX)], str(path)[len(ZOO_PREFIX) :]
+    if prefix == ZOO_PREFIX:
+        if name not in zoo():
+            raise ValueError(unknown("policy of the zoo", name, zoo()))
+        return ZOO / f"{name}.npz"
+    path = pathlib.Path(path)
+    return path / "policy.npz" if path.is_dir() else path
+
+
+def about(name: str) -> dict[str, Any]:
+    """Return what is known of a policy of the zoo.
+
+    Args:
+      name: one of `zoo()`, as "zoo:NAME".
+
+    Returns:
+      "env", "reward_delay", "agent", "seed" and "env_steps" of its training; "mean",
+      "deviation" and "episodes" of its returns in Gymnasium.
+
+    Raises:
+      ValueError: if there is no such policy.
+    """
+    return json.loads(str(npz.read(_file(name))["about"]))
+
+
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
     """Return the arrays of one seed's policy.
 
     Args:
-      path: the file ``policy.npz``, or the folder of a finished run.
+      path: the file ``policy.npz``, the folder of a finished run, or "zoo:NAME".
       seed: number of the seed; default the one with the highest final return.
 
     Raises:
       ValueError: if it is not a saved policy, or has no such seed.
     """
-    path = pathlib.Path(path)
-    if path.is_dir():
-        path = path / "policy.npz"
+    path = _file(path)
     try:
         arrays = npz.read(path)
         if missing := [name for name in _REQUIRED if name not in arrays]:
@@ -56,6 +93,7 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
     except ValueError as error:
         raise ValueError(f"{path} is not a saved policy ({error})") from None
     seeds = arrays.pop("seeds").tolist()
+    arrays.pop("about", None)
     returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
     shared = {name: arrays.pop(name) for name in ("low", "high")}
     if seed is None:

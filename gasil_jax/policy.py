@@ -1,7 +1,7 @@
 """Turn training states and saved policies into JAX functions."""
 
 import pathlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -13,19 +13,19 @@ from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
 
 
-def weights(state: Any, env: Any) -> dict[str, np.ndarray]:
+def weights(state: Any, env: Any) -> dict[str, Any]:
     """Return a `TrainState`'s policy as the arrays that `numpy_policy` describes.
 
     From a batch of states every array but "low" and "high" is (seeds, ...).
     """
-    params = jax.tree.map(np.asarray, state.actor_critic.policy.params["params"])
+    params = state.actor_critic.policy.params["params"]
     layers = params["MLP_0"]
     low, high = wrappers.action_range(env)
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
     mean, scale = normalization.moments(state.normalizer)
     arrays = {
-        "mean": np.asarray(mean),
-        "scale": np.asarray(scale),
+        "mean": mean,
+        "scale": scale,
         "log_std": params["log_std"],
         "low": wide(low),
         "high": wide(high),
@@ -46,22 +46,24 @@ def load_policy(
     key it is drawn from the policy. The key is consumed.
 
     Args:
-      path: the folder of a finished run, or its file ``policy.npz``.
+      path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
+        the policies that come with the package.
       seed: number of the seed; default the one with the highest final return.
 
     Raises:
       ValueError: if it is not a saved policy, or has no such seed.
     """
-    return _make(numpy_policy.read(path, seed))
+    return make(numpy_policy.read(path, seed))
 
 
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
     """Return the policy of a single `TrainState`, as `load_policy` does for a file."""
-    return _make(weights(state, env))
+    return make(weights(state, env))
 
 
-def _make(arrays: dict[str, np.ndarray]) -> Callable[..., jax.Array]:
-    arrays = jax.tree.map(jnp.asarray, arrays)
+def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
+    """Return the policy with these arrays, as `load_policy` does for a file."""
+    arrays = jax.tree.map(jnp.asarray, dict(weights))
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:

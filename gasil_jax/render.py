@@ -25,12 +25,11 @@ import numpy as np
 import tyro
 
 from gasil_envs import pictures, wrappers
-from gasil_jax import policy, train
+from gasil_jax import policy
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, output_file
-from gasil_jax.host.members import member
 from gasil_jax.host.progress import announced
-from gasil_jax.sweeps import saved_states
+from gasil_jax.sweeps.saved_states import load_policies
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
@@ -43,7 +42,8 @@ class Options:
     """Draw an episode of a run's policy.
 
     Attributes:
-      run: folder of the run or sweep, which need not be finished.
+      run: folder of the run or sweep, which need not be finished, or zoo:NAME, one of
+        the package's policies.
       out: file to write: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a
         strip of eight moments in two rows; or, for locomotion, .html, to turn and zoom
         in a browser.
@@ -256,7 +256,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     command_line.check_key(options.key)
     # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
-    env, config, seeds, states = saved_states.load(
+    env, num_steps, seeds, weights = load_policies(
         options.run, options.checkpoint, options.point, options.seed
     )
     locomotion = environments.is_locomotion(env)
@@ -268,9 +268,9 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"must end in {', '.join(_PICTURES)}"
         )
     output_file.make_parent(options.out)
-    drawn = policy.from_state(member(states, 0), env)
+    drawn = policy.make(weights[0])
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
-    steps = min(options.steps, train.max_episode_steps(env, config))
+    steps = min(options.steps, num_steps)
     with announced("render", "compiling and running the episode"):
         path, total = episode(env, act, jax.random.key(options.key), steps)
     try:

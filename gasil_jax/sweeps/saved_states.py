@@ -1,4 +1,4 @@
-"""Find and load the training states that a run or a sweep has saved."""
+"""Find and load the training states and policies that a run or a sweep has saved."""
 
 import contextlib
 import dataclasses
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_jax import train
+from gasil_jax import numpy_policy, policy, train
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
@@ -21,6 +21,7 @@ from gasil_jax.host import (
     json_reader,
     run_folder,
 )
+from gasil_jax.host.members import member
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.shards import Program
@@ -171,3 +172,50 @@ def load(
     if len(indices) < count:
         states = jax.tree.map(lambda x: x[indices], states)
     return env, config, seeds, states
+
+
+class Policies(NamedTuple):
+    """Saved policies.
+
+    Attributes:
+      env: the environment that they were trained in.
+      num_steps: steps after which an episode is truncated, at the latest.
+      seeds: numbers of their seeds.
+      weights: the arrays of each, which `numpy_policy` describes.
+    """
+
+    env: Any
+    num_steps: int
+    seeds: Sequence[int]
+    weights: Sequence[Mapping[str, np.ndarray]]
+
+
+def load_policies(
+    folder: pathlib.Path,
+    which: str = "last",
+    point: int | None = None,
+    seed: int | None = None,
+) -> Policies:
+    """Return the policies of a run, or one that comes with the package.
+
+    Args:
+      folder: folder of the run or sweep, or zoo:NAME.
+      which: see `load`; a policy of the zoo has no checkpoints.
+      point: see `load`.
+      seed: see `load`.
+
+    Raises:
+      InputError: as `load` does, or if the zoo has no such policy.
+    """
+    if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
+        env, config, seeds, states = load(folder, which, point, seed)
+        states = jax.device_get(states)
+        weights = [policy.weights(member(states, i), env) for i in range(len(seeds))]
+        return Policies(env, train.max_episode_steps(env, config), seeds, weights)
+    if point is not None or which != "last":
+        raise InputError(f"run is {folder}: it has no points and no checkpoints")
+    with command_line.input_checked():
+        arrays = numpy_policy.read(folder, seed)
+        about = numpy_policy.about(str(folder))
+        env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
+    return Policies(env, int(env.episode_length), [about["seed"]], [arrays])

@@ -9,7 +9,7 @@ import pytest
 from brax.envs import Wrapper
 
 import gasil_jax
-from gasil_jax import evaluate, numpy_policy, policy, run
+from gasil_jax import evaluate, evaluation, numpy_policy, policy, run
 from gasil_jax.host import checkpoint
 
 # With the other tests that use it, so that it is trained once.
@@ -44,9 +44,9 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
     env, config, states = trained_point_mass
     state = gasil_jax.member(states, 1)
     key = jax.random.key(3)
-    scores = jax.jit(lambda s: evaluate.evaluate(env, config, s, key, num_episodes=3))(
-        state
-    )
+    scores = jax.jit(
+        lambda s: evaluation.evaluate(env, config, s, key, num_episodes=3)
+    )(state)
     act = numpy_policy.make(policy.weights(state, env))
     step = jax.jit(env.step)
     for i, reset_key in enumerate(jax.random.split(jax.random.split(key)[0], 3)):
@@ -61,7 +61,7 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
 
 def test_stochastic_scores_vary_more(trained_point_mass):
     env, config, states = trained_point_mass
-    score = lambda deterministic: evaluate.evaluate(
+    score = lambda deterministic: evaluation.evaluate(
         env,
         config,
         gasil_jax.member(states, 0),
@@ -124,7 +124,7 @@ def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
             info = {**stepped.info, "time": time, "truncation": cut_off}
             return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
 
-    scores = evaluate.evaluate(
+    scores = evaluation.evaluate(
         CutOff(env),
         config,
         gasil_jax.member(states, 0),

@@ -238,7 +238,7 @@ def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
     made = summary.Summary(STORE)
     assert (RESULTS / "README.md").read_text() == made.text()
     text = summary.README.read_text()
-    assert made.fill_blocks(text) == text
+    assert report.fill_blocks(text, made.value) == text
     assert text.count("<!-- begin ") == text.count("<!-- end -->") > 0
     # Said as long as it is so.
     guide = summary.README.parent / "docs" / "reproducing.md"
@@ -255,11 +255,11 @@ def test_seeds_in_words():
 def test_a_block_is_made_anew():
     made = summary.Summary(STORE)
     text = "before\n<!-- begin tuned -->\nold\n<!-- end -->\nafter"
-    filled = made.fill_blocks(text)
+    filled = report.fill_blocks(text, made.value)
     assert filled == text.replace("old\n", f"\n{made.tuned()}\n\n")
-    assert made.fill_blocks(filled) == filled
+    assert report.fill_blocks(filled, made.value) == filled
     with pytest.raises(InputError, match="slot is nonsense: it must be one of claims"):
-        made.fill_blocks(text.replace("tuned", "nonsense"))
+        report.fill_blocks(text.replace("tuned", "nonsense"), made.value)
 
 
 #: Settings, and names: what may stand in a note in digits.

@@ -7,6 +7,7 @@ import threading
 import numpy as np
 import pytest
 
+from experiments import engine
 from experiments.store import RESULTS, Record, Run, Store, merge, read, write
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.errors import InputError
@@ -91,6 +92,24 @@ def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
     # What was read is written as it was.
     write(other, back)
     assert one.read_bytes() == other.read_bytes()
+
+
+def test_an_agent_of_ones_own_keeps_its_numbers(tmp_path, monkeypatch):
+    (tmp_path / "stored_agent.py").write_text(
+        "import gasil_jax\n"
+        "from gasil_jax.config import number\n"
+        "from gasil_jax.imitation import none\n"
+        "class Own(gasil_jax.Hyperparameters):\n"
+        "    my_weight: float = number(0.5, 0.0, 1.0)\n"
+        "OWN = none.PPO._replace(hyperparameters=Own)\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    config = Config(agent="stored_agent:OWN")
+    own = [Run("hopper", config.replace(my_weight=x), 0) for x in (0.5, 0.25)]
+    assert own[0].key != own[1].key
+    write(tmp_path / "hopper.npz", {own[1]: record()})
+    assert list(read(tmp_path / "hopper.npz")) == own[1:]
+    assert [len(x.runs) for x in engine.programs(own, engine.Setup())] == [2]
 
 
 def test_a_field_that_a_file_has_not_is_the_default(tmp_path, monkeypatch):

@@ -1,0 +1,113 @@
+"""The trained policies that the package comes with: ``python -m experiments zoo RUN``.
+
+Of each run the seed with the highest return in training is taken and scored in
+Gymnasium. It replaces the task's policy if its score is higher. The table in docs/zoo.md
+is written from the policies.
+"""
+
+import dataclasses
+import json
+import pathlib
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from experiments import report
+from experiments.figures import name_of
+from gasil_jax import npz, numpy_policy
+from gasil_jax.errors import InputError
+from gasil_jax.evaluate import evaluate_in_gymnasium
+from gasil_jax.host import command_line, environments, output_file, run_folder
+
+TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Score runs' best policies and add them to the package's.
+
+    Attributes:
+      runs: folders of finished runs on locomotion tasks.
+      episodes: number of episodes of each score.
+    """
+
+    runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
+    episodes: int = 100
+
+
+def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
+    """Score the best policy of a run, keep it if it is its task's best, and say so.
+
+    Raises:
+      InputError: if it is not the folder of a finished run on a locomotion task.
+    """
+    described = run_folder.read(folder)
+    delay = described["settings"].reward_delay
+    with command_line.input_checked():
+        weights = numpy_policy.read(folder)
+        env = environments.make_env(described["env"])
+    if not environments.is_locomotion(env):
+        raise InputError(f"run is {folder}: it must be of a locomotion task")
+    saved = npz.read(folder / "policy.npz")
+    seed = int(saved["seeds"][np.nanargmax(saved["final_return"])])
+    returns = evaluate_in_gymnasium(
+        env.unwrapped.task.gymnasium_id,
+        numpy_policy.make(weights),
+        num_episodes=episodes,
+    )["episode_return"]
+    about = {
+        "env": described["env"],
+        "reward_delay": delay,
+        "agent": described["config"].agent,
+        "seed": seed,
+        "env_steps": described["config"].total_steps,
+        "mean": round(float(returns.mean()), 1),
+        "deviation": round(float(returns.std()), 1),
+        "episodes": episodes,
+    }
+    path = zoo / f"{name_of(described['env'], delay)}.npz"
+    words = f"{path.stem}: {about['mean']} in Gymnasium"
+    if path.exists():
+        before = json.loads(str(npz.read(path)["about"]))["mean"]
+        if before >= about["mean"]:
+            return f"{words}; the stored policy has {before} and stays"
+        words += f", before {before}"
+    arrays: dict[str, Any] = {
+        "about": np.array(json.dumps(about)),
+        "seeds": np.array([seed]),
+        "final_return": np.array([np.nanmax(saved["final_return"])]),
+        **{x: v if x in ("low", "high") else v[None] for x, v in weights.items()},
+    }
+    zoo.mkdir(exist_ok=True)
+    with output_file.whole(path) as partial, partial.open("wb") as file:
+        np.savez_compressed(file, **arrays)
+    return words
+
+
+def table() -> str:
+    """Return a table of the policies that the package comes with."""
+    rows = []
+    for name in numpy_policy.zoo():
+        about = numpy_policy.about(f"{numpy_policy.ZOO_PREFIX}{name}")
+        score = f"{about['mean']:,.0f} ± {about['deviation']:,.0f}"
+        steps = f"{about['env_steps']:,}"
+        rows.append([f"`zoo:{name}`", about["agent"], steps, score])
+    head = ["policy", "trained with", "steps", "return in Gymnasium"]
+    return report.markdown_table(head, rows)
+
+
+def write_table() -> None:
+    """Write the table into docs/zoo.md."""
+    text = report.fill_blocks(TABLE.read_text(), lambda name: {"zoo": table}[name]())
+    with output_file.whole(TABLE) as partial:
+        partial.write_text(text)
+
+
+def run(options: Options) -> None:
+    """Add the best policies of runs, and write the table."""
+    command_line.check_least(options, episodes=1)
+    for folder in options.runs:
+        print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
+    write_table()
+    print(f"in {TABLE}")
