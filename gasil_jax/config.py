@@ -12,6 +12,7 @@ import numbers
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from flax import struct
 
 from gasil_jax import registry
@@ -374,7 +375,9 @@ def validate(config: Config, agents: Sequence[str]) -> None:
         raise _refusal("hyperparameters", config.hyperparameters, "Hyperparameters")
     for name, allowed in ranges(type(config.hyperparameters)).items():
         value = getattr(config.hyperparameters, name)
-        is_array = hasattr(value, "shape") and not isinstance(value, numbers.Number)
+        # NumPy's bool has a shape and is not a `Number`.
+        scalar = isinstance(value, numbers.Number | np.bool_)
+        is_array = hasattr(value, "shape") and not scalar
         if not is_array:
             _validate_number(name, value, allowed)
 

@@ -1,7 +1,7 @@
 """Merge the shards of a sweep: ``python -m gasil_jax.merge OUT``.
 
 Writes the same files as a sweep without shards: config.json, results.csv, curves.npz,
-summary.json and sweep.png. The shards are only read.
+summary.json and the plots. The shards are only read.
 """
 
 import dataclasses

@@ -64,8 +64,8 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     described = run_folder.read(folder)
     if "points" in described:
         raise InputError(
-            f"run is {folder}, a sweep: its plot is sweep.png, and its curves are in "
-            "curves.npz"
+            f"run is {folder}, a sweep: its plots are sweep.png and "
+            "hyperparameters.png, and its curves are in curves.npz"
         )
     read_table = lambda name, column: metrics_files.read_metrics(
         folder / name, ("seed",), described["seeds"], (column,)

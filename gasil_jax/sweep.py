@@ -6,10 +6,12 @@ discriminator updates) are grouped, and each group compiles once. With --share-c
 points with different buffer sizes or discriminator updates share a program.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
-curves.npz (every metric, (points, seeds, iterations)), summary.json and sweep.png. Each
-program has a folder under programs/ with its metrics.csv and checkpoints. With
---evaluate-every there is an evaluations.csv beside each metrics.csv, and curves.npz
-also holds its columns, (points, seeds, evaluations), as evaluation_mean and so on.
+curves.npz (every metric, (points, seeds, iterations)), summary.json, sweep.png (the
+final returns of each point) and hyperparameters.png (the same over each hyperparameter
+that varies). Each program has a folder under programs/ with its metrics.csv and
+checkpoints. With --evaluate-every there is an evaluations.csv beside each metrics.csv,
+and curves.npz also holds its columns, (points, seeds, evaluations), as evaluation_mean
+and so on.
 
 With --shard 3/8 an eighth of all points and seeds is trained in the folder
 shards/3-of-8, without tables. `gasil_jax.merge` makes the tables from all shards.

@@ -1,13 +1,19 @@
-"""Draw learning curves."""
+"""Draw learning curves, and the returns of a sweep over its hyperparameters."""
 
 import pathlib
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gasil_envs.pictures import point_mass_layout as point_mass_layout
-from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.figures.statistics import (
+    are_numbers,
+    bootstrap_interval,
+    groups,
+    interquartile_mean,
+)
 
 #: Okabe and Ito's colours, which colour-blind readers can distinguish.
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -134,3 +140,95 @@ def learning_curve(
     axes.set_title(title)
     write_caption(figure, [len(returns)], "; grey: each seed")
     save(figure, path, dpi=150)
+
+
+def marginals(
+    path: pathlib.Path,
+    values: Mapping[str, Sequence[Any]],
+    returns: np.ndarray,
+    importance: Mapping[str, float | None],
+    *,
+    best: int | None,
+    left_out: int,
+) -> None:
+    """Save a panel for each hyperparameter: the points' returns over its values.
+
+    Args:
+      path: the image file.
+      values: each point's value of every hyperparameter that varies, by name.
+      returns: each point's mean final return, (points,), all finite.
+      importance: `statistics.importance` of each hyperparameter.
+      best: index of the point that is marked as the best; None for none.
+      left_out: number of points without a return, which are not among these.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    columns = min(len(values), 3)
+    rows = -(-len(values) // columns)
+    figure, grid = plt.subplots(
+        rows,
+        columns,
+        figsize=(0.8 + 3.6 * columns, 1.4 + 2.8 * rows),
+        layout="constrained",
+        sharey=True,
+        squeeze=False,
+    )
+    for axes, name in zip(grid.flat, values):
+        _draw_marginal(axes, values[name], returns, best)
+        share = importance[name]
+        title = "" if share is None else f"importance {share:.0%}"
+        axes.set(xlabel=name.replace("_", " "), title=title)
+    for axes in grid.flat[len(values) :]:
+        axes.remove()
+    for axes in grid[:, 0]:
+        axes.set_ylabel("final return")
+    handles, labels = grid[0, 0].get_legend_handles_labels()
+    above: dict[str, Any] = {"loc": "outside upper center", "ncols": len(labels)}
+    figure.legend(handles, labels, frameon=False, **above)
+    text = "point: mean over its seeds; mean: over the points of each value"
+    if any(len(groups(x)) < len(set(x)) for x in values.values()):
+        text += ", or of neighbouring values where most differ"
+    if any(share is not None for share in importance.values()):
+        text += "; importance: share of the points' variance that these means explain, "
+        text += "corrected for their number"
+    if left_out:
+        text += f"; left out for a seed without a return: {left_out} of "
+        text += f"{len(returns) + left_out} points"
+    text = textwrap.fill(text, 10 + 50 * columns)
+    figure.supxlabel(text, fontsize="small", color="0.3")
+    save(figure, path, dpi=150)
+
+
+def _draw_marginal(
+    axes: Any, values: Sequence[Any], returns: np.ndarray, best: int | None
+) -> None:
+    """Draw the points' returns over one hyperparameter, and the means of its groups."""
+    parts = groups(values)
+    if are_numbers(values):
+        places, style = np.array(values, float), "-D"
+        positive = places[places > 0.0]
+        # In floats 3e-4 / 3e-5 is less than 10.
+        if positive.size and positive.max() > 9.99 * positive.min():
+            # Values that are not positive lie on the linear part about 0.
+            linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
+            axes.set_xscale("symlog" if linear else "log", **linear)
+        distinct = np.unique(places)
+        shown = axes.xaxis.get_transform().transform(distinct)
+        if np.diff(shown).min(initial=np.inf) > 0.15 * np.ptp(shown):
+            axes.set_xticks(distinct, [f"{value:g}" for value in distinct])
+            axes.set_xticks([], minor=True)
+    else:
+        names = list(dict.fromkeys(values))
+        places, style = np.array([names.index(x) for x in values]), "D"
+        axes.set_xticks(range(len(names)), [str(name) for name in names])
+    centres = [np.median(places[part]) for part in parts]
+    means = [returns[part].mean() for part in parts]
+    axes.plot(centres, means, style, color=COLORS[0], markersize=6, label="mean")
+    axes.plot(places, returns, "o", color="0.3", markersize=3, label="point")
+    axes.margins(x=0.1)
+    if best is not None:
+        marked = {"color": COLORS[1], "markersize": 13, "label": "best point"}
+        axes.plot(places[best], returns[best], "*", **marked)

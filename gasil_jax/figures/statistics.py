@@ -1,6 +1,17 @@
-"""Interquartile means and their intervals over seeds (Agarwal et al. 2021)."""
+"""Interquartile means and their intervals over seeds (Agarwal et al. 2021).
+
+And, of a sweep, how much of its points' returns one hyperparameter explains.
+"""
+
+import numbers
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+
+#: Fewer points of a sweep tell nothing of a hyperparameter's importance.
+_FEWEST_POINTS = 8
+_MOST_GROUPS = 8
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -70,3 +81,60 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
     newest = np.take_along_axis(returns, last_ended[:, None], axis=1)[:, 0]
     newest = np.where(ended.any(axis=1), newest, np.nan)
     return np.where(count > 0, mean, newest)
+
+
+def are_numbers(values: Sequence[Any]) -> bool:
+    """Return whether all values are numbers, which a bool is not."""
+    return all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in values)
+
+
+def groups(values: Sequence[Any]) -> list[np.ndarray]:
+    """Return the groups of points that have the same value, or neighbouring ones.
+
+    Neighbouring numbers are a group where most of them differ: if there are eight
+    points or more, and fewer than two for each value. A group then has about three
+    values, or more, so that there are at most eight groups.
+
+    Args:
+      values: each point's value of one hyperparameter.
+
+    Returns:
+      The indices of each group's points. Groups are in the order of their values, which
+      is that of their first points if they are not all numbers.
+    """
+    distinct = list(dict.fromkeys(values))
+    count = len(distinct)
+    if are_numbers(values):
+        distinct.sort()
+        if _FEWEST_POINTS <= len(values) < 2 * len(distinct):
+            count = min(_MOST_GROUPS, -(-len(distinct) // 3))
+    group_of = {x: i * count // len(distinct) for i, x in enumerate(distinct)}
+    of_point = np.array([group_of[x] for x in values], int)
+    return [np.flatnonzero(of_point == group) for group in range(count)]
+
+
+def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
+    """Return the share of the points' variance that one hyperparameter explains alone.
+
+    It is epsilon squared, 1 - (S / (n - k)) / (T / (n - 1)), with n points in k groups
+    (`groups`), and S and T the sums of squared distances of their returns to the mean
+    of their group and to the mean of all. It is near 0 on average for a hyperparameter
+    without effect, however many groups there are; below 0 it is given as 0, and it is 0
+    if all returns are equal. What hyperparameters do only together counts for none.
+
+    Args:
+      values: each point's value of the hyperparameter.
+      returns: each point's return, (points,), all finite.
+
+    Returns:
+      The share, from 0 to 1; None with fewer than eight points, or than two for each
+      group.
+    """
+    parts = groups(values)
+    if len(values) < max(_FEWEST_POINTS, 2 * len(parts)):
+        return None
+    if np.ptp(returns) == 0.0:
+        return 0.0
+    within = sum(np.var(returns[part]) * len(part) for part in parts)
+    rest = within / (len(values) - len(parts))
+    return max(0.0, 1.0 - rest / np.var(returns, ddof=1))

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gasil_jax.config import Config, Range
-from gasil_jax.errors import InputError
 from gasil_jax.host import driver, json_reader, metrics_files, run_folder
 from gasil_jax.host.driver import Callback, FitProgress
 from gasil_jax.host.interruption import Interrupted, Interruption
@@ -154,28 +153,24 @@ def _opened(
     """
     path = folder / _DESCRIPTION
     with contextlib.ExitStack() as stack:
-        try:
-            run_folder.create(folder, "")
-            stack.enter_context(run_folder.lock(folder))
-            begun = path.is_file()
-            if begun and not resume:
-                raise InputError(
-                    f"out is {folder}, where training has begun: give resume=True or "
-                    "another folder"
-                )
-            if not begun:
-                run_folder.refuse_used(folder)
-        except InputError as error:
-            # The command line's name of the folder is another one.
-            raise ValueError(str(error).replace("out is", "folder is", 1)) from None
+        run_folder.create(folder, "", option="folder")
+        stack.enter_context(run_folder.lock(folder, option="folder"))
+        begun = path.is_file()
+        if begun and not resume:
+            raise ValueError(
+                f"folder is {folder}, where training has begun: give resume=True or "
+                "another folder"
+            )
+        if not begun:
+            run_folder.refuse_used(folder, option="folder")
         # A function has no other form in JSON.
         now = {x: "a function" if callable(y) else y for x, y in described.items()}
         if begun:
             before = json_reader.read(path, dict[str, Any])
             if changes := run_folder.differences(before, now):
                 raise ValueError(
-                    f"resume goes on with {folder}, where {'; '.join(changes)}: only "
-                    "total_steps may differ, and grow"
+                    f"resume continues with {folder}, where {'; '.join(changes)}: "
+                    "only total_steps may differ, and grow"
                 )
         metrics_files.write_json(path, now)
         try:

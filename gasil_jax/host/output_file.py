@@ -8,11 +8,11 @@ from collections.abc import Iterator, Sequence
 from gasil_jax.errors import InputError
 
 
-def unwritable(path: pathlib.Path, error: OSError) -> str:
-    """Return the error message for a folder or file that can't be written."""
+def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
+    """Return the error message for an option's folder or file that can't be written."""
     # Errors that libraries raise may have no `strerror`, and several lines.
     why = error.strerror or str(error).partition("\n")[0]
-    return f"out is {path}, which can't be written: {why}"
+    return f"{option} is {path}, which can't be written: {why}"
 
 
 def check(path: pathlib.Path, endings: Sequence[str]) -> None:

@@ -45,8 +45,13 @@ def check(out: pathlib.Path, resume: bool) -> None:
         raise InputError(unwritable(out, error)) from None
 
 
-def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
+def create(out: pathlib.Path | None, name: str, *, option: str = "out") -> pathlib.Path:
     """Create the folder `out` or, if it is None, a new folder `name` under runs/.
+
+    Args:
+      out: the folder.
+      name: name of the new folder.
+      option: what the error message calls the folder.
 
     Raises:
       InputError: if it can't be written.
@@ -67,11 +72,11 @@ def create(out: pathlib.Path | None, name: str) -> pathlib.Path:
             number += 1
     except OSError as error:
         where = folder if out is None else out
-        raise InputError(unwritable(where, error)) from None
+        raise InputError(unwritable(where, error, option)) from None
 
 
 @contextlib.contextmanager
-def lock(folder: pathlib.Path) -> Iterator[None]:
+def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
     """Lock the folder against other processes inside the `with` block.
 
     The operating system frees the lock when the process ends, however it ends.
@@ -85,7 +90,7 @@ def lock(folder: pathlib.Path) -> Iterator[None]:
         except BlockingIOError:
             file.seek(0)
             raise InputError(
-                f"out is {folder}, which {file.read() or 'another process'} is "
+                f"{option} is {folder}, which {file.read() or 'another process'} is "
                 "writing to: name another folder or wait"
             ) from None
         file.truncate(0)
@@ -114,7 +119,7 @@ def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]
         yield
 
 
-def refuse_used(folder: pathlib.Path) -> None:
+def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
     """Raise `InputError` unless the folder is empty.
 
     The lock file does not count, nor does the file by which another process tests for a
@@ -122,7 +127,9 @@ def refuse_used(folder: pathlib.Path) -> None:
     """
     names = (path.name for path in folder.iterdir())
     if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
-        message = f"out is {folder}, which is not empty: name a new or an empty folder"
+        message = (
+            f"{option} is {folder}, which is not empty: name a new or an empty folder"
+        )
         if is_described(folder):
             message += ", or continue the run in it with --resume"
         raise InputError(message)

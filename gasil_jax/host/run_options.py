@@ -115,8 +115,8 @@ def parse(
         changed = run_folder.differences(vars(before), vars(options))
         if changed:
             raise InputError(
-                f"resume goes on with {began}, where {'; '.join(changed)}: only "
-                "total_steps may differ, and grow"
+                f"resume continues with {began}, where {'; '.join(changed)}: "
+                "only total_steps may differ, and grow"
             )
         return options
     given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))

@@ -16,7 +16,8 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.figures.statistics import final_returns
+from gasil_jax.figures import plotting
+from gasil_jax.figures.statistics import final_returns, importance
 from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point, check_saved
@@ -171,9 +172,11 @@ def write(
     seeds: Sequence[int],
     parts: Sequence[Trained],
 ) -> dict[str, Any]:
-    """Write results.csv, curves.npz, summary.json and sweep.png; return the summary.
+    """Write results.csv, curves.npz, summary.json and the plots; return the summary.
 
     A cell of results.csv is empty if the point keeps the sweep's own value.
+    hyperparameters.png is written if a hyperparameter varies among the points that have
+    a final return.
 
     Args:
       folder: folder to write to.
@@ -219,11 +222,15 @@ def write(
     trainings = [training for part in parts for training in part.trainings()]
     fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
     best = lambda scores: int(fine[scores[fine].argmax()]) if fine.size else None
+    mean = final.mean(axis=1)
+    ended = [i for i in range(len(points)) if math.isfinite(mean[i])]
+    varied = _varied(parts, names, ended)
+    shares = {name: importance(values, mean[ended]) for name, values in varied.items()}
     summary = {
         "points": [
             {
                 **point,
-                "mean": _finite(final[i].mean()),
+                "mean": _finite(mean[i]),
                 "worst_seed": _finite(final[i].min()),
                 **{
                     name: _finite(values[i].mean())
@@ -234,14 +241,37 @@ def write(
             }
             for i, point in enumerate(points)
         ],
-        "best_by_mean": best(final.mean(axis=1)),
+        "best_by_mean": best(mean),
         "best_by_worst_seed": best(final.min(axis=1)),
+        "importance": shares,
         **speed(trainings),
         "versions": _joined([training["versions"] for training in trainings]),
     }
     metrics_files.write_json(folder / "summary.json", summary)
-    _plot(folder / "sweep.png", points, final, summary["best_by_mean"])
+    chosen = summary["best_by_mean"]
+    _plot(folder / "sweep.png", points, final, chosen)
+    if varied:
+        plotting.marginals(
+            folder / "hyperparameters.png",
+            varied,
+            mean[ended],
+            shares,
+            best=None if chosen is None else ended.index(chosen),
+            left_out=len(points) - len(ended),
+        )
     return summary
+
+
+def _varied(
+    parts: Sequence[Trained], names: Sequence[str], points: Sequence[int]
+) -> dict[str, list[Any]]:
+    """Return the values that points trained with, of the names in which they differ."""
+    trained: dict[int, dict[str, Any]] = {}
+    for program in (program for part in parts for program in part.programs):
+        for (point, _), own in zip(program.members, program.hyperparameters):
+            trained[point] = vars(program.config) | vars(own)
+    values = {name: [trained[point][name] for point in points] for name in names}
+    return {name: listed for name, listed in values.items() if len(set(listed)) > 1}
 
 
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -317,7 +347,9 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
             f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
             f"worst seed {scores['worst_seed']:.1f})"
         )
-    return lines
+    shares = summary["importance"].items()
+    shown = [f"{name} {share:.0%}" for name, share in shares if share is not None]
+    return lines + ([f"importance: {', '.join(shown)}"] if shown else [])
 
 
 def _label(point: Point) -> str:

@@ -69,6 +69,49 @@ def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
     plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, "hopper")
 
 
+def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
+    alphas, rules = (0.02, 0.1, 1.0), ("gap", "both", True)
+    points = [(x, y) for x in alphas for y in rules]
+    values = dict(zip(("alpha", "imitation_rule"), zip(*points)))
+    values["gamma"] = tuple(np.linspace(0.9, 0.99, 9))
+    returns = np.arange(9.0)
+    shares = {name: statistics.importance(x, returns) for name, x in values.items()}
+    plotting.marginals(tmp_path / "x.png", values, returns, shares, best=8, left_out=2)
+    (figure,) = figures
+    alpha, rule, gamma = figure.axes
+    assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
+    assert alpha.get_title() == f"importance {shares['alpha']:.0%}"
+    assert rule.get_xlabel() == "imitation rule" and gamma.get_xscale() == "linear"
+    assert [x.get_text() for x in alpha.get_xticklabels()] == ["0.02", "0.1", "1"]
+    assert [x.get_text() for x in rule.get_xticklabels()] == ["gap", "both", "True"]
+    means, dots, star = alpha.get_lines()
+    np.testing.assert_allclose(means.get_ydata(), [1.0, 4.0, 7.0])
+    np.testing.assert_array_equal(dots.get_xdata(), values["alpha"])
+    assert (star.get_xdata(), star.get_ydata()) == (1.0, 8.0)
+    np.testing.assert_allclose(rule.get_lines()[0].get_ydata(), [3.0, 4.0, 5.0])
+    # All values of gamma differ: three neighbours have a mean.
+    np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), [1.0, 4.0, 7.0])
+    caption = figure.get_supxlabel().replace("\n", " ")
+    assert "left out for a seed without a return: 2 of 11 points" in caption
+    assert "neighbouring values" in caption and "share of the points' var" in caption
+
+
+def test_too_few_points_have_no_importance(figures, tmp_path):
+    plotting.marginals(
+        tmp_path / "x.png",
+        {"alpha": (0.0, 0.02, 1.0)},
+        np.arange(3.0),
+        {"alpha": None},
+        best=None,
+        left_out=0,
+    )
+    (axes,) = figures[0].axes
+    assert axes.get_title() == "" and axes.get_xscale() == "symlog"
+    assert figures[0].get_supxlabel() == (
+        "point: mean over its seeds; mean: over the points of each\nvalue"
+    )
+
+
 def test_a_sweeps_labels_are_what_varies(monkeypatch, tmp_path):
     import matplotlib.figure
 

@@ -150,7 +150,7 @@ def schedules_at_fault():
 
 
 WRONG = [
-    *[("gamma", x) for x in (None, [1], True, 1j, math.nan, 2**2000, {})],
+    *[("gamma", x) for x in (None, [1], True, np.True_, 1j, math.nan, 2**2000, {})],
     *[("agent", x) for x in (3, None, [], "")],
     *[("hidden_sizes", x) for x in (3, (2**62,), [3], ("a",), (None,), (True,))],
     *[

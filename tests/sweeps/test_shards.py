@@ -113,7 +113,7 @@ def train(folder, shard=None, *arguments):
     return tables.Trained(folder, programs), points
 
 
-TABLES = ("results.csv", "curves.npz", "sweep.png")
+TABLES = ("results.csv", "curves.npz", "sweep.png", "hyperparameters.png")
 
 
 @pytest.mark.parametrize("count", [1, 5, 12])

@@ -13,6 +13,7 @@ import pytest
 from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
+from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, run_options
 from gasil_jax.host.members import Members
 from gasil_jax.sweeps import saved_states, shards, tables
@@ -71,7 +72,7 @@ def test_random_points_are_distinct_and_of_the_papers_ranges():
         assert all(value in PAPER_RANGES[name] for name, value in point.items())
 
 
-def test_points_that_vary_in_different_things_have_a_table(tmp_path):
+def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch):
     def metrics(value):
         returns = np.array([np.nan, value, np.nan])
         return {
@@ -83,14 +84,26 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path):
 
     training = {"env_steps": 9, "compile_seconds": 1.0, "train_seconds": 1.0}
     training |= {"device": "cpu", "device_count": 1, "versions": {}}
+    points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
     trained = types.SimpleNamespace(
         members=lambda: {(0, 5): metrics(1.0), (1, 5): metrics(2.0)},
         evaluations=lambda: {},
         trainings=lambda: [training],
+        programs=shards.programs(Config(), points, [5], share_counts=True),
     )
-    points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    drawn = []
+    monkeypatch.setattr(plotting, "marginals", lambda *x, **_: drawn.append(x))
     summary = tables.write(tmp_path, points, [5], [trained])
     assert summary["best_by_mean"] == 1
+    # A point that does not name a value has the sweep's own.
+    ((_, values, returns, importance),) = drawn
+    assert values == {
+        "alpha": [1.0, 0.1],
+        "buffer_steps": [500, 1000],
+        "learning_rate": [3e-4, 1e-4],
+    }
+    assert list(returns) == [1.0, 2.0]
+    assert summary["importance"] == importance == dict.fromkeys(values)
     header, *rows = (tmp_path / "results.csv").read_text().splitlines()
     assert header == (
         "point,seed,alpha,buffer_steps,learning_rate,final_return,final_length,diverged"
@@ -164,7 +177,8 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["best_by_mean"] in (0, 1)
     assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
-    assert (out / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    for name in ("sweep.png", "hyperparameters.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
 
     alone = tmp_path / "alone"
     more = ("--discriminator-updates", "3", "--out", str(alone))
