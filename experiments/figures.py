@@ -334,6 +334,9 @@ _GEOMETRY = [
     )
     for agent, drawn, num_envs in itertools.product(PAIR, _AGES, _NUM_ENVS)
 ]
+_ADAPTIVE, _RULES = "ppo+gasil-adaptive", ("agreement", "gap", "fixed")
+#: What is stored of ant and humanoid: environments that were reset together.
+_IN_STEP = [Arm(f"{agent}, in step", agent) for agent in PAIR]
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
     "on most of them."
@@ -461,12 +464,29 @@ FIGURES: Mapping[str, Figure] = {
         "Delayed rewards with adaptive imitation, beyond the paper",
         "",
         joined(
-            grid(tasks, (*agents, "ppo+gasil-adaptive"), (DELAY,), panel="{env}")
-            for tasks, agents in (
-                (("hopper",), ("ppo",)),
-                (("walker2d", "halfcheetah", "swimmer"), PAIR),
-            )
+            [
+                grid(TASKS[:4], (*PAIR, _ADAPTIVE), (DELAY,), panel="{env}"),
+                grid(TASKS[4:], _IN_STEP, (DELAY,), panel="{env}", base=searched),
+                grid(TASKS[4:], (_ADAPTIVE,), (DELAY,), panel="{env}"),
+            ]
         ),
-        favourite="ppo+gasil-adaptive",
+        favourite=_ADAPTIVE,
+    ),
+    "adaptive_ablation": Figure(
+        "Adaptive imitation, with each of its parts taken away",
+        "",
+        grid(
+            TASKS[:4],
+            [
+                Arm("whole", _ADAPTIVE),
+                Arm("rewards not decomposed", _ADAPTIVE, {"decompose_rewards": False}),
+                Arm("no imitation", _ADAPTIVE, {"imitation_weight": 0.0}),
+                *(Arm(f"rule {x}", _ADAPTIVE, {"imitation_rule": x}) for x in _RULES),
+                Arm("deviation 1", _ADAPTIVE, {"initial_deviation": 1.0}),
+            ],
+            (DELAY,),
+            panel="{env}",
+        ),
+        favourite="whole",
     ),
 }

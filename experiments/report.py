@@ -530,8 +530,15 @@ def _draw(page: Page) -> matplotlib.figure.Figure:
     for axes, panel in zip(grid.flat, panels, strict=False):
         (_draw_over if page.figure.over else _draw_curves)(page, panel, axes)
         axes.set_title(panel)
-        if axes.get_lines():
-            axes.legend(frameon=False, fontsize=7)
+    shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
+    if count > 1 and len(shown[0][1]) > 4 and all(x[1] == shown[0][1] for x in shown):
+        # So many names would hide the curves.
+        place: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
+        figure.legend(*shown[0], frameon=False, **place)
+    else:
+        for axes, (_, labels) in zip(grid.flat, shown, strict=False):
+            if labels:
+                axes.legend(frameon=False, fontsize=7)
     for row in grid:
         row[0].set_ylabel("episode return")
     return figure
@@ -539,14 +546,19 @@ def _draw(page: Page) -> matplotlib.figure.Figure:
 
 def _draw_curves(page: Page, panel: str, axes: Any) -> None:
     """Draw learning curves: interquartile mean and 95% interval over seeds."""
-    # Fixed colors for agents, dark to light ones for values.
-    curves = list(page.figure.panels[panel])
+    # Fixed colors for agents, dark to light ones for values and for many curves.
+    curves = page.figure.panels[panel]
     shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
     color_of = dict(zip(curves, shades, strict=True))
-    if set(curves) & set(AGENTS):
-        names = list(dict.fromkeys([*AGENTS, *curves]))
-        names = curves if len(names) > len(plotting.COLORS) else names
-        color_of |= dict(zip(names, plotting.COLORS, strict=False))
+    names = [curve.agent for curve in curves.values()]
+    if len(set(names)) == len(names):
+        order = list(dict.fromkeys([*AGENTS, *names]))
+        color_of |= {
+            label: plotting.COLORS[order.index(name) % len(plotting.COLORS)]
+            for label, name in zip(curves, names, strict=True)
+        }
+    elif len(names) <= len(plotting.COLORS) and not all(map(str.isdecimal, curves)):
+        color_of = dict(zip(curves, plotting.COLORS, strict=False))
     for label in curves:
         if (panel, label) not in page.results:
             continue

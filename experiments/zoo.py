@@ -1,8 +1,8 @@
 """The trained policies that the package comes with: ``python -m experiments zoo RUN``.
 
 Of each run the seed with the highest return in training is taken and scored in
-Gymnasium. It replaces the task's policy if its score is higher. The table in docs/zoo.md
-is written from the policies.
+Gymnasium. It replaces the task's policy if its score is higher. The table in
+docs/zoo.md is written from the policies.
 """
 
 import dataclasses

@@ -38,7 +38,7 @@ Metrics = dict[str, jax.Array]
 
 
 class TrainState(struct.PyTreeNode):
-    """All that a run needs to go on, and nothing that it can do without.
+    """All that a run needs to continue, and nothing that it can do without.
 
     Attributes:
       actor_critic: policy and values, with their optimizers' states.

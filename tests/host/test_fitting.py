@@ -116,9 +116,12 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         ({"resume": True}, "resume is True: it needs a folder"),
         ({"config": CONFIG.replace(alpha=-1)}, "alpha is -1"),
         ({"folder": "/proc/none"}, "folder is /proc/none"),
-        ({"folder": os.path.dirname(__file__)}, "folder is .* not empty"),
+        ({"folder": "full"}, "folder is .* not empty"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(env, changes, why):
+def test_what_is_wrong_is_refused_by_name(env, changes, why, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").touch()
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(env, **{"config": CONFIG, **changes})
