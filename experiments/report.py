@@ -467,19 +467,20 @@ class Page:
 
     @property
     def in_step(self) -> bool:
-        """Whether environments of locomotion were reset together in some runs."""
+        """Whether environments of locomotion were reset together in all runs."""
         runs = [run for results in self.results.values() for run in results.records]
         for search in self.figure.searches.values():
             for stage in search.stages(self.searched)[:1]:
                 runs += [seeds[0] for seeds in search.runs(stage)]
-        return any(
-            run.env != "point_mass" and not run.config.stagger_episodes for run in runs
-        )
+        ages_drawn = {
+            run.config.stagger_episodes for run in runs if run.env != "point_mass"
+        }
+        return ages_drawn == {False}
 
     def text(self) -> str:
         """Return the page as Markdown."""
         parts = [f"# {self.figure.title}"]
-        if self.in_step and self.figure.over is None:
+        if self.in_step:
             parts.append(IN_STEP)
         if self.figure.claim:
             parts.append(f"**The paper's claim.** {self.figure.claim}")
