@@ -14,12 +14,13 @@ import tyro
 from experiments import (
     benchmark,
     engine,
+    matrix,
     point_mass_layouts,
     point_mass_moments,
     store,
     zoo,
 )
-from experiments.figures import FIGURES, Figure
+from experiments.figures import FIGURES, Figure, name_of
 from experiments.report import Page
 from experiments.store import RESULTS, Store
 from experiments.summary import Summary
@@ -137,6 +138,25 @@ def _merge(options: MergeOptions) -> None:
 
 
 @dataclasses.dataclass(frozen=True)
+class CoverageOptions:
+    """Print how much of the plan of all agents and tasks is stored.
+
+    The exit status is 1 while runs are missing.
+    """
+
+
+def _coverage(options: CoverageOptions) -> int:
+    curves = [curve for *_, curve in FIGURES["matrix"].curves()]
+    rows = matrix.coverage(Store(RESULTS / "runs"), curves)
+    print("task               agent                   search    seeds")
+    for x in rows:
+        task = f"{name_of(x.cell.env, x.cell.reward_delay):18} {x.cell.agent:20}"
+        search = f"{x.searched} of {x.to_search}"
+        print(f"{task} {search:>9} {f'{x.trained} of {x.to_train}':>8}")
+    return int(not all(x.complete for x in rows))
+
+
+@dataclasses.dataclass(frozen=True)
 class ReportOptions:
     """Write all pages and plots, and the README's tables, from the stored runs."""
 
@@ -144,14 +164,16 @@ class ReportOptions:
 def _report(options: ReportOptions) -> None:
     stored = Store(RESULTS / "runs")
     for name in FIGURES:
-        Page(name, stored).write(RESULTS)
+        if (page := Page(name, stored)).begun:
+            page.write(RESULTS)
     Summary(stored).write()
     print(f"in {RESULTS}")
 
 
 #: Commands that are no figures: their options, and what they do.
-COMMANDS: Mapping[str, tuple[Any, Callable[[Any], None]]] = {
+COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "report": (ReportOptions, _report),
+    "coverage": (CoverageOptions, _coverage),
     "merge": (MergeOptions, _merge),
     "benchmark": (benchmark.Options, benchmark.run),
     "zoo": (zoo.Options, zoo.run),
@@ -165,7 +187,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return command_line.exit_status(lambda: _main(arguments))
 
 
-def _main(arguments: Sequence[str] | None) -> None:
+def _main(arguments: Sequence[str] | None) -> int | None:
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print("python -m experiments NAME (--help for its options)\n")
@@ -178,9 +200,10 @@ def _main(arguments: Sequence[str] | None) -> None:
         _train(name, command_line.parse(Options, rest, f"experiments {name}"))
     elif name in COMMANDS:
         options, function = COMMANDS[name]
-        function(command_line.parse(options, rest, f"experiments {name}"))
+        return function(command_line.parse(options, rest, f"experiments {name}"))
     else:
         raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
+    return None
 
 
 if __name__ == "__main__":

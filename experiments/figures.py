@@ -17,8 +17,8 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from experiments import matrix
 from experiments.search import AGENTS, DELAY, NOISE, PAIR, TASKS, Point, Search
-from experiments.search import ALGORITHM_VERSION as SEARCHED_VERSION
 from experiments.store import ALGORITHM_VERSION, Run, Store
 from gasil_jax import presets
 from gasil_jax.config import Config
@@ -52,12 +52,12 @@ class Curve:
     changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
     obs_noise: float = 0.0
-    base: str | Callable[..., Search] | None = "tuned"
+    base: str | Callable[..., Search | matrix.Cell] | None = "tuned"
     seeds: int = 10
     total_steps: int = 1_000_000
 
     @property
-    def _search(self) -> Search | None:
+    def _search(self) -> Search | matrix.Cell | None:
         task = (self.env, self.agent, self.reward_delay, self.obs_noise)
         return self.base(*task) if callable(self.base) else None
 
@@ -75,7 +75,7 @@ class Curve:
             return ()
         config, version = Config(agent=self.agent), ALGORITHM_VERSION
         if self._search:
-            config, version = self._search.config({}), SEARCHED_VERSION
+            config, version = self._search.config({}), self._search.version
         elif isinstance(self.base, str):
             config = presets.preset(self.env, self.agent, self.base, self.reward_delay)
         config = config.replace(**{"total_steps": self.total_steps, **point})
@@ -112,7 +112,9 @@ class Figure:
     panels: Panels = dataclasses.field(default_factory=dict)
     favourite: str | None = "ppo+gasil"
     comparisons: Comparisons | None = None
-    searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
+    searches: Mapping[str, Search | matrix.Cell] = dataclasses.field(
+        default_factory=dict
+    )
     over: tuple[str, str] | None = None
     early: int | None = None
 
@@ -470,6 +472,30 @@ FIGURES: Mapping[str, Figure] = {
                 grid(TASKS[4:], (_ADAPTIVE,), (DELAY,), panel="{env}"),
             ]
         ),
+        favourite=_ADAPTIVE,
+    ),
+    "matrix": Figure(
+        "All agents on all tasks, tuned alike",
+        f"{_DELAYED} {_DENSE}",
+        joined(
+            grid(
+                (env,),
+                matrix.AGENTS,
+                (delay,),
+                base=matrix.Cell,
+                seeds=matrix.seeds(env, delay),
+            )
+            for delay, env in itertools.product((DELAY, 1), TASKS)
+        ),
+        searches={
+            f"{name_of(env, delay)} {agent}": matrix.Cell(env, agent, delay)
+            for (env, delay), agent in itertools.product(matrix.CELLS, matrix.AGENTS)
+        },
+    ),
+    "single_setting": Figure(
+        "All agents on delayed tasks, each with a single setting",
+        "",
+        grid(TASKS, matrix.AGENTS, (DELAY,), panel="{env}", base=matrix.Single),
         favourite=_ADAPTIVE,
     ),
     "adaptive_ablation": Figure(

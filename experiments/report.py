@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from experiments.figures import FIGURES, Comparisons, Curve, Figure
-from experiments.search import AGENTS, SPACES, by_value, means
+from experiments.search import AGENTS, SPACES, Search, by_value, means
 from experiments.store import Record, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
@@ -425,8 +425,9 @@ class Page:
         """
         space, rows = SPACES["ppo+gasil"], []
         for label, search in self.figure.searches.items():
-            stage = search.first(self.searched)
-            if search.space != space or stage is None:
+            if not isinstance(search, Search) or search.space != space:
+                continue
+            if (stage := search.first(self.searched)) is None:
                 continue
             if (scores := search.scores(stage, self.searched)) is not None:
                 cells = [label]
@@ -464,6 +465,12 @@ class Page:
             f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
             f"one of {', '.join(self.SLOTS)}, of complete curves"
         )
+
+    @property
+    def begun(self) -> bool:
+        """Whether there is anything to show: a stored run, or a complete search."""
+        searches = self.figure.searches.values()
+        return bool(self.results) or any(x.best(self.searched) for x in searches)
 
     @property
     def in_step(self) -> bool:

@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -137,6 +137,8 @@ class Search:
     normalize_rewards: bool = False
     after: "Search | None" = None
     free: tuple[str, ...] = ()
+    #: The version of the algorithm that its runs are of.
+    version: ClassVar[int] = ALGORITHM_VERSION
 
     @property
     def space(self) -> Space:

@@ -145,7 +145,8 @@ class Summary:
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""
-        return "\n".join(f"- [{x.figure.title}]({n}.md)" for n, x in self.pages.items())
+        begun = {name: page for name, page in self.pages.items() if page.begun}
+        return "\n".join(f"- [{x.figure.title}]({n}.md)" for n, x in begun.items())
 
     def value(self, name: str, *arguments: str) -> str:
         """Return what stands in a slot: one of these, or a figure's name and its slot.

@@ -20,7 +20,9 @@ def test_every_run_of_a_figure_is_valid(name):
     runs = FIGURES[name].requested(STORE)
     for config in {run.config for run in runs}:
         validate(config, gasil_jax.agents())
-    assert runs and len(set(runs)) == len(runs)
+    assert len(set(runs)) == len(runs)
+    # The points of a search decide for the single setting.
+    assert runs or name == "single_setting"
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -36,11 +38,14 @@ def test_a_figure_names_what_it_has(name):
         assert sum(weight for weight, _, _ in terms) == 0
 
 
-@pytest.mark.parametrize(
-    "name", [x for x in FIGURES if x not in ("batch_geometry", "wider_search")]
-)
+#: Their pages say how many of their runs are stored.
+INCOMPLETE = ("batch_geometry", "wider_search")
+
+
+@pytest.mark.parametrize("name", [x for x in FIGURES if x not in INCOMPLETE])
 def test_what_is_published_is_complete(name):
-    assert not STORE.missing(FIGURES[name].requested(STORE))
+    if (RESULTS / f"{name}.md").exists():
+        assert not STORE.missing(FIGURES[name].requested(STORE))
 
 
 def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
