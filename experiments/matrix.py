@@ -18,6 +18,7 @@ import numpy as np
 from experiments.search import DELAY, TASKS, Point, Space, Stage, means
 from experiments.store import ALGORITHM_VERSION, Run, Store
 from gasil_jax.config import Config
+from gasil_jax.figures import statistics
 
 #: Points of each agent's search; their seeds.
 _POINTS, _SEEDS = 18, range(1000, 1002)
@@ -192,6 +193,24 @@ class Single(Cell):
 def seeds(env: str, reward_delay: int) -> int:
     """Return the number of seeds of a figure; delayed, three tasks are bimodal."""
     return 20 if reward_delay > 1 and env in TASKS[:3] else 10
+
+
+def importance(agent: str, store: Store) -> dict[str, float]:
+    """Return how much of its points' variance each hyperparameter explains alone.
+
+    It is the mean over the tasks, dense and delayed, of `statistics.importance`; empty
+    while a task's search is incomplete.
+    """
+    points, shares = draw(agent), dict.fromkeys(SPACES[agent], 0.0)
+    for env, delay in CELLS:
+        scores = Cell(env, agent, delay).scores(Stage(points, _SEEDS), store)
+        if scores is None:
+            return {}
+        for name in shares:
+            values = [point[name] for point in points]
+            share = statistics.importance(values, scores.mean(axis=1))
+            shares[name] += (share or 0.0) / len(CELLS)
+    return shares
 
 
 class Coverage(NamedTuple):

@@ -22,6 +22,7 @@ import matplotlib.figure
 import numpy as np
 from PIL import Image
 
+from experiments import matrix
 from experiments.figures import FIGURES, Comparisons, Curve, Figure
 from experiments.search import AGENTS, SPACES, Search, by_value, means
 from experiments.store import Record, Run, Store
@@ -239,7 +240,7 @@ class Page:
 
     SLOTS = (
         *("table", "compared", "differences", "tally", "added", "best"),
-        *("geometry", "geometry_tally", "searches", "effects"),
+        *("geometry", "geometry_tally", "searches", "effects", "importance"),
     )
 
     def __init__(
@@ -436,6 +437,16 @@ class Page:
                     cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in values))
                 rows.append(cells)
         return markdown_table(["task", *space], rows)
+
+    def importance(self) -> str:
+        """Return how much each hyperparameter of the matrix matters to each agent."""
+        shares = {x: matrix.importance(x, self.searched) for x in matrix.AGENTS}
+        names = list(dict.fromkeys(name for x in shares.values() for name in x))
+        rows = [
+            [agent, *(f"{x[name]:.0%}" if name in x else "" for name in names)]
+            for agent, x in shares.items()
+        ]
+        return markdown_table(["agent", *names], rows)
 
     def settings(self) -> str:
         """Return what each curve was trained with, beyond the appendix's values."""

@@ -8,6 +8,7 @@ import pytest
 from experiments import __main__, matrix
 from experiments.figures import FIGURES
 from experiments.matrix import AGENTS, SPACES, Cell, Single
+from experiments.report import Page
 from experiments.store import Record, Store
 
 
@@ -69,6 +70,21 @@ def test_one_point_for_all_tasks_has_the_best_mean_rank(tmp_path):
         scores[0] = 1e6 if number == 0 else -1.0
         fill(store, cell, cell.stages(store)[0], scores)
     assert single.chosen(store) == points[1]
+
+
+def test_what_matters_is_told(tmp_path):
+    store, points = Store(tmp_path), matrix.draw("ppo")
+    assert matrix.importance("ppo", store) == {}
+    for env, delay in matrix.CELLS:
+        cell = Cell(env, "ppo", delay)
+        fill(store, cell, cell.stages(store)[0], [1e4 * x["gamma"] for x in points])
+    shares = matrix.importance("ppo", store)
+    assert shares["gamma"] == pytest.approx(1.0)
+    assert max(shares["gae_lambda"], shares["initial_deviation"]) < 0.3
+    row = next(
+        x for x in Page("matrix", store).importance().splitlines() if "| ppo |" in x
+    )
+    assert "| 100% |" in row
 
 
 def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
