@@ -20,6 +20,7 @@ import jax
 import numpy as np
 
 from experiments.store import Record, Run, Store
+from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.environments import Settings
@@ -44,6 +45,8 @@ class Setup:
       devices: number of host devices to shard members over; default one per core.
       evaluate_episodes: episodes of each of the ten evaluations during training; 0
         for no evaluations.
+      share_counts: train runs that differ in buffer_steps or discriminator_updates in
+        one program: it compiles once, and each run costs what the largest does.
       commit: commit of the code, to be recorded if there is no repository.
     """
 
@@ -52,6 +55,7 @@ class Setup:
     physics: str = "mjx"
     devices: int | None = None
     evaluate_episodes: int = 10
+    share_counts: bool = False
     commit: str | None = None
 
 
@@ -91,6 +95,13 @@ class Program:
     setup: Setup
 
     @property
+    def config(self) -> Config:
+        """The members' config, with the largest of their counts."""
+        members = [run.config.hyperparameters for run in self.runs]
+        counts = {x: max(getattr(of, x) for of in members) for x in shards.COUNTS}
+        return self.runs[0].config.replace(**counts)
+
+    @property
     def folder(self) -> pathlib.Path:
         """The program's scratch folder."""
         # With other physics or evaluations, checkpoints and tables hold other things.
@@ -111,10 +122,11 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     """Divide runs into as few programs as possible."""
     groups: dict[Run, list[Run]] = {}
     for run in runs:
-        # Only counts decide shapes, so only they need separate programs.
+        # Only counts decide shapes, so only they may need separate programs.
         counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
         kind = type(run.config.hyperparameters)
-        config = run.config.replace(hyperparameters=kind(**counts))
+        own = kind() if setup.share_counts else kind(**counts)
+        config = run.config.replace(hyperparameters=own)
         shared = dataclasses.replace(run, config=config, seed=0)
         groups.setdefault(shared, []).append(run)
     ordered = lambda group: tuple(sorted(group, key=lambda run: run.key))
@@ -151,11 +163,11 @@ def train(program: Program) -> dict[Run, Record]:
         evaluate_episodes=episodes,
         devices=setup.devices,
         settings=settings,
-        config=run.config,
+        config=program.config,
     )
     seeds = tuple(run.seed for run in program.runs)
-    hyperparameters = tuple(run.config.hyperparameters for run in program.runs)
-    members = shards.Program(0, run.config, tuple(enumerate(seeds)), hyperparameters)
+    points = tuple(run.config.hyperparameters for run in program.runs)
+    members = shards.Program(0, program.config, tuple(enumerate(seeds)), points)
     labels = dict(zip(_LABELS, (range(len(seeds)), seeds), strict=True))
     env = assembly.prepare(options, [members], [members])
     read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))

@@ -66,6 +66,16 @@ def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
     assert Program(same.runs, Setup(evaluate_episodes=0)).folder not in folders
 
 
+def test_runs_with_other_counts_share_a_program_on_request():
+    few, many = run(buffer_steps=64), run(discriminator_updates=7)
+    assert len(engine.programs([few, many], Setup())) == 2
+    (shared,) = engine.programs([few, many], Setup(share_counts=True))
+    largest = shared.config.hyperparameters
+    assert largest.discriminator_updates == 7
+    assert largest.buffer_steps == many.config.hyperparameters.buffer_steps > 64
+    assert set(shared.runs) == {few, many}
+
+
 def test_parts_are_all_runs_once_whatever_is_there_already():
     runs = [run(seed) for seed in range(10)]
     parts = [engine.part_of(runs, Shard(number, 3)) for number in (1, 2, 3)]
