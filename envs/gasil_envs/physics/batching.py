@@ -4,8 +4,8 @@ With 5 to 30 degrees of freedom the batch is the only axis of a simulation that 
 enough to fill vector units, so it is the last, the one that is contiguous in memory.
 """
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ _identity = jax.jit(lambda tree: tree)
 
 
 def materialize(tree: Any) -> Any:
-    """Return a tree of arrays that is computed once and stored, however often it's used.
+    """Make arrays be computed once and stored, however often they are used.
 
     XLA's CPU backend fuses a chain of elementwise operations into each of its users and
     computes it again in each. It removes optimization barriers before it does, but
@@ -31,6 +31,12 @@ def materialize(tree: Any) -> Any:
         return jax.lax.optimization_barrier(tree)
     with set_xla_metadata(inlineable="false"):
         return _identity(tree)
+
+
+def add(terms: Iterable[jax.Array]) -> jax.Array:
+    """Sum at least one array, spelled out."""
+    # The type of `sum` does not express that there is one.
+    return cast(jax.Array, sum(terms))
 
 
 def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -71,7 +77,7 @@ def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 # A CPU's caches hold the data of no more simulations than this.
-_MOST_IN_A_TILE = 64
+_MOST_IN_A_TILE = 128
 
 
 def in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:

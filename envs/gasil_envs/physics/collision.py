@@ -96,7 +96,12 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 
 
 class Segments(NamedTuple):
-    """The lines at the hearts of geoms: (G, 3, B) their middles and half lengths."""
+    """The lines along the middle of geoms, metres.
+
+    Attributes:
+      middle: (geom, 3, B), their centres.
+      half: (geom, 3, B), from there to one end.
+    """
 
     middle: jax.Array
     half: jax.Array
@@ -110,17 +115,12 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
         origin = at.xpos[model.geom_bodyid[geom]]
         middle.append(origin + tree.rotate(columns, model.geom_pos[geom]))
         if model.geom_type[geom] == _CAPSULE:
-            half.append(tree.rotate(columns, _axis(model, geom, scaled=True)))
+            matrix = np.zeros(9)
+            mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+            half.append(tree.rotate(columns, matrix[2::3] * model.geom_size[geom, 1]))
         else:
             half.append(jnp.zeros_like(origin))
     return Segments(*materialize((jnp.stack(middle), jnp.stack(half))))
-
-
-def _axis(model: mujoco.MjModel, geom: int, scaled: bool = False) -> np.ndarray:
-    """Return a geom's own z axis in its body's frame, times half its length or 1."""
-    matrix = np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
-    return matrix[2::3] * (model.geom_size[geom, 1] if scaled else 1.0)
 
 
 def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
@@ -132,13 +132,11 @@ def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
         parts.append(_touch_each_other(model, pairs, lines))
     if len(parts) == 1:
         return parts[0]
-    shapes = [(*part.distance.shape, *part.axes.shape[1:3]) for part in parts]
-    axes = [
-        jnp.broadcast_to(part.axes, (c, a, x, b))
-        for part, (c, b, a, x) in zip(parts, shapes, strict=True)
-    ]
-    joined = [jnp.concatenate(x) for x in zip(*(part[:2] for part in parts))]
-    return Touch(joined[0], joined[1], jnp.concatenate(axes))
+    distance = jnp.concatenate([part.distance for part in parts])
+    position = jnp.concatenate([part.position for part in parts])
+    shape = lambda x: (x.position.shape[0], x.axes.shape[1], *x.position.shape[1:])
+    axes = [jnp.broadcast_to(part.axes, shape(part)) for part in parts]
+    return Touch(distance, position, jnp.concatenate(axes))
 
 
 def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
@@ -157,16 +155,16 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     if pairs.num_tangents == 0:
         return Touch(distance, position, constant(normal[:, None]))
     if pairs.flat is not None:
-        axes = np.stack([normal, np.cross(pairs.flat, normal)], axis=1)
-        return Touch(distance, position, constant(axes))
+        tangent = np.cross(pairs.flat, normal)
+        return Touch(distance, position, constant(np.stack([normal, tangent], axis=1)))
     # mjc_PlaneCapsule gives the capsule's axis, mju_makeFrame projects it.
-    axis, normal = lines.half[geom], constant(normal)
-    tangent = axis - normal * jnp.sum(axis * normal, axis=1, keepdims=True)
-    length = jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True))
-    other = jnp.asarray(_orthogonal(normal))
-    tangent = jnp.where(length > 1e-15, tangent / jnp.maximum(length, 1e-15), other)
-    normal = jnp.broadcast_to(normal, tangent.shape)
-    axes = [normal, tangent, tree.cross(normal, tangent)]
+    up, axis = constant(normal), lines.half[geom]
+    across = axis - up * jnp.sum(axis * up, axis=1, keepdims=True)
+    length = jnp.sqrt(jnp.sum(across**2, axis=1, keepdims=True))
+    along = across / jnp.maximum(length, 1e-15)
+    along = jnp.where(length > 1e-15, along, _orthogonal(up))
+    up = jnp.broadcast_to(up, along.shape)
+    axes = [up, along, tree.cross(up, along)]
     return Touch(distance, position, jnp.stack(axes, axis=1))
 
 
@@ -185,7 +183,7 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
         model.geom_type[i] == _CAPSULE, model.geom_size[i, 1], 0.0
     ).astype(np.float32)[:, None]
     near_a, near_b = _nearest_points(a, b, length(first), length(second))
-    radius = [model.geom_size[i, 0].astype(np.float32)[:, None] for i in pairs.between]
+    radius = model.geom_size[pairs.between, 0].astype(np.float32)[..., None]
     away = materialize(near_b - near_a)
     apart = jnp.sqrt(jnp.sum(away**2, axis=1))
     normal = jnp.where(
@@ -223,14 +221,11 @@ def _nearest_points(
     # 1e-6 is for parallel lines.
     at_a = (cosine * from_b - from_a) / (1.0 - cosine**2 + 1e-6)
     at_b = from_b + at_a * cosine
-    at_a, at_b = (
-        jnp.clip(at_a, -length_a, length_a),
-        jnp.clip(at_b, -length_b, length_b),
-    )
-    at_a, at_b = materialize((at_a, at_b))
+    on_a = lambda x: jnp.clip(x, -length_a, length_a)
+    on_b = lambda x: jnp.clip(x, -length_b, length_b)
+    at_a, at_b = materialize((on_a(at_a), on_b(at_b)))
     # Of each segment the point that is nearest to the other's point.
-    other_a = jnp.clip(at_b * cosine - from_a, -length_a, length_a)
-    other_b = jnp.clip(at_a * cosine + from_b, -length_b, length_b)
+    other_a, other_b = on_a(at_b * cosine - from_a), on_b(at_a * cosine + from_b)
     point = lambda line, along, at: line.middle + along * at[:, None]
     one = point(a, along_a, other_a), point(b, along_b, at_b)
     two = point(a, along_a, at_a), point(b, along_b, other_b)

@@ -19,7 +19,7 @@ from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import collision, newton, tree
-from gasil_envs.physics.batching import materialize
+from gasil_envs.physics.batching import add, materialize
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
@@ -190,8 +190,8 @@ def layout(model: mujoco.MjModel) -> Layout:
     )
     # Which geoms collide, and with which parameters, is for MJX to say.
     with jax.ensure_compile_time_eval():
-        collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
         mjx_model = mjx.put_model(model)
+        collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
         contact = jax.tree.map(np.asarray, collide(mjx.make_data(model)))
     flat = _plane(model)
     pyramid = _PYRAMID if flat is None else _FLAT_PYRAMID
@@ -290,7 +290,7 @@ def contact_rows(
     wrench = jnp.concatenate([torque, jnp.broadcast_to(axes, torque.shape)], axis=2)
     wrench = materialize(wrench)
     # cdof is (rotation, translation) of a point at the root's centre of mass.
-    along = tree.add(wrench[:, :, k, None] * at.cdof[:, k] for k in range(6))
+    along = add(wrench[:, :, k, None] * at.cdof[:, k] for k in range(6))
     along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
     scale = [along[:, :1], along[:, 1:] * constants.friction[:, None, None]]
     along = materialize(jnp.concatenate(scale, axis=1))  # (C, A, V, B)

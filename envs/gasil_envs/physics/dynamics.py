@@ -205,9 +205,8 @@ def step(
     """Advance `frame_skip` time steps; the fields are of the last evaluation."""
     control = jnp.clip(control, *dynamics.control_range)
     actuation = jnp.broadcast_to(dynamics.motor @ control, state.qvel.shape)
-    integrate = _euler
-    if dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        integrate = _runge_kutta
+    is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    integrate = _euler if is_euler else _runge_kutta
     one = functools.partial(integrate, dynamics, actuation)
     carry = (state, kinematics(dynamics, state))
     return jax.lax.scan(lambda x, _: (one(*x), None), carry, length=frame_skip)[0]
@@ -250,7 +249,7 @@ def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: float) -> jax.Array:
 
 
 def _euler(
-    dynamics: Dynamics, actuation: jax.Array, state: PhysicsState, _: Fields
+    dynamics: Dynamics, actuation: jax.Array, state: PhysicsState, fields: Fields
 ) -> tuple[PhysicsState, Fields]:
     """Semi-implicit Euler, with the joints' damping taken implicitly."""
     model = dynamics.model
@@ -278,21 +277,24 @@ def _runge_kutta(
     qpos, qvel = state.qpos, state.qvel
 
     def stage(carry: Any, coefficients: Any) -> Any:
-        state, qacc, velocity_sum, acceleration_sum, _ = carry
+        state, velocity_sum, acceleration_sum, _ = carry
         ahead, weight = coefficients
         # Both are replaced at once: positions use the velocity of the previous stage.
         position = _integrate_positions(model, qpos, ahead * state.qvel)
-        state = state.replace(qpos=position, qvel=qvel + dt * ahead * qacc)
+        state = state.replace(
+            qpos=position, qvel=qvel + dt * ahead * state.qacc_warmstart
+        )
         now = forward(dynamics, state, actuation)
+        state = state.replace(qacc_warmstart=now.qacc)
         velocity_sum = velocity_sum + weight * state.qvel
         acceleration_sum = acceleration_sum + weight * now.qacc
-        return (state, now.qacc, velocity_sum, acceleration_sum, now.fields), None
+        return (state, velocity_sum, acceleration_sum, now.fields), None
 
     stages = np.array(
         [[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], np.float32
     )
     zero = jnp.zeros_like(qvel)
-    carry = (state, zero, zero, zero, fields)
-    (_, qacc, velocity, acceleration, fields), _ = jax.lax.scan(stage, carry, stages)
+    carry = (state, zero, zero, fields)
+    (state, velocity, acceleration, fields), _ = jax.lax.scan(stage, carry, stages)
     qpos = _integrate_positions(model, qpos, velocity)
-    return PhysicsState(qpos, qvel + dt * acceleration, qacc), fields
+    return PhysicsState(qpos, qvel + dt * acceleration, state.qacc_warmstart), fields

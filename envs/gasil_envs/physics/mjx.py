@@ -96,7 +96,7 @@ class MjxPhysics:
         """Advance `frame_skip` time steps under one control (nu,)."""
         if self._small is not None:
             small = self._small
-            many = lambda x: dynamics.step(small, *x, frame_skip)
+            many = lambda x: dynamics.step(small, x[0], x[1], frame_skip)
             return batch_last(in_tiles(many))((state, control))
         data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(

@@ -9,15 +9,15 @@ vector (6, B) is a rotation and then a translation of the point at the tree's ce
 mass; a rotation matrix is the list of its columns, (3, B) each.
 """
 
-from collections.abc import Iterable, Sequence
-from typing import NamedTuple, cast
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import materialize
+from gasil_envs.physics.batching import add, materialize
 
 FREE, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -69,12 +69,6 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     ):
         return "its springs, dampers or gravity are disabled"
     return None
-
-
-def add(terms: Iterable[jax.Array]) -> jax.Array:
-    """Sum at least one array, spelled out."""
-    # The type of `sum` does not express that there is one.
-    return cast(jax.Array, sum(terms))
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -326,9 +320,8 @@ def smooth(
     gravity = np.concatenate([np.zeros(3), model.opt.gravity]).astype(np.float32)
     acceleration = _sum_down(model, change)[1] - gravity[:, None]
     momentum = materialize(_momentum(cinert, cvel))
-    of_body = _momentum(cinert, materialize(acceleration)) + _cross_force(
-        cvel, momentum
-    )
+    of_body = _momentum(cinert, materialize(acceleration))
+    of_body = of_body + _cross_force(cvel, momentum)
     if model.opt.density > 0 or model.opt.viscosity > 0:
         of_body = of_body - _drag(model, at, cvel)
     in_subtree = _sum_up(model, materialize(jnp.concatenate([cinert, of_body], axis=1)))
