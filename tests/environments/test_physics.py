@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gasil_envs
-from gasil_envs.physics import constraints, dynamics, native, newton
+from gasil_envs.physics import batching, constraints, dynamics, native, newton
 from gasil_envs.physics.interface import PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics
 from gasil_jax import rollout
@@ -130,6 +130,19 @@ def test_linear_solve_against_numpy():
     result = jax.jit(jax.vmap(newton.linear_solve))(problem.inertia, problem.force)
     expected = np.linalg.solve(arrays["inertia"], arrays["force"][..., None])[..., 0]
     np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA's CPU backend")
+def test_a_materialized_value_is_no_part_of_its_users_loops():
+    def num_loops(hold):
+        def many_uses(x):
+            y = hold(jnp.sin(x) + x)
+            return y[1:] * y[:-1] + y[:1]
+
+        compiled = jax.jit(many_uses).lower(jnp.ones((8, 16))).compile()
+        return compiled.as_text().count(" fusion(")
+
+    assert num_loops(batching.materialize) > num_loops(lambda x: x) > 0
 
 
 BALL = """<mujoco><option cone="{cone}" timestep="0.01"/><worldbody>

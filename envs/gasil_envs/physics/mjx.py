@@ -35,9 +35,9 @@ class MjxPhysics:
     Args:
       model: the model; its solver options are overwritten.
       fields: names of the ``mjData`` arrays to return.
-      solver: "small" uses our constraint rows and our Newton's method for small dense
-        problems (`dynamics`). For a model that these do not support it falls back to
-        "mjx" and logs a warning. "mjx" uses MJX's own step.
+      solver: "small" uses our own dynamics and Newton's method for small dense problems
+        (`dynamics`). For a model that these do not support it falls back to "mjx" and
+        logs a warning. "mjx" uses MJX's own step.
       iterations: Newton iterations of either solver.
       ls_iterations: line-search steps of MJX's solver. Float32 never meets MuJoCo's
         tolerance, which is meant for float64, so that all of its 100 iterations would
