@@ -1,42 +1,33 @@
 """Joint limits and contacts as one-sided constraints for `newton`.
 
 The numbers are those of MJX's rows (``mjx.make_constraint``), which are C MuJoCo's.
-Everything that does not depend on the state is computed once, in NumPy. Two things
-differ from MJX:
+Everything that does not depend on the state is computed once, in NumPy. Every array has
+the batch as its last axis; of a NumPy array it is 1.
 
-- The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
-  C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
-  therefore the motion, depends on the tangent.
-- In a model that can only move in a plane, the tangent across the plane is left out.
-  Nothing moves along it, so its two edges would both equal the normal.
+Shape letters: C contacts, A axes (normal and tangents), V degrees of freedom, N bodies,
+B batch.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from flax import struct
 from mujoco import mjx
 
-from gasil_envs.physics import newton
+from gasil_envs.physics import collision, newton, tree
+from gasil_envs.physics.batching import add, materialize
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1,), (-1,), (0,))
 
-#: Joint types with one degree of freedom.
-SLIDE_AND_HINGE = [int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)]
-_PLANE_AND_CAPSULE = [
-    int(mujoco.mjtGeom.mjGEOM_PLANE),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
-]
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Impedance:
-    """The coefficients that follow from MuJoCo's solref and solimp, (n,) each.
+class Impedance(struct.PyTreeNode):
+    """The coefficients that follow from MuJoCo's solref and solimp, (n or 1, 1) each.
 
     See https://mujoco.readthedocs.io/en/stable/modeling.html#solver-parameters.
     """
@@ -79,10 +70,10 @@ class Impedance:
             midpoint,
             np.maximum(power, 1.0),
         )
-        return cls(*(x.astype(np.float32) for x in arrays))
+        return cls(*(_constant(x) for x in arrays))
 
     def __call__(self, distance: jax.Array) -> jax.Array:
-        """Return the impedance d(r), in (0, 1), at each distance: (n,) -> (n,)."""
+        """Return the impedance d(r), in (0, 1), at each distance: (n, B) -> (n, B)."""
         x = jnp.abs(distance) / self.width
         below = _power(x, self.power) / self.midpoint ** (self.power - 1)
         above = 1.0 - _power(jnp.maximum(1.0 - x, 0.0), self.power) / (
@@ -93,11 +84,19 @@ class Impedance:
         return jnp.where(x > 1.0, self.highest, value)
 
 
-def _power(x: jax.Array, power: np.ndarray) -> jax.Array:
+def _power(x: Any, power: np.ndarray | jax.Array) -> Any:
     # A general power is an exponential and a logarithm for every row.
-    if np.all(power == 2.0):
+    if isinstance(power, np.ndarray) and np.all(power == 2.0):
         return x * x
-    return x if np.all(power == 1.0) else jnp.power(x, power)
+    if isinstance(power, np.ndarray) and np.all(power == 1.0):
+        return x
+    return x**power
+
+
+def _constant(x: np.ndarray) -> np.ndarray:
+    """(n, ...) to float32 (n, ..., 1), or (1, ..., 1) if all n are equal."""
+    x = x[..., None].astype(np.float32)
+    return x[:1] if len(x) and (x == x[:1]).all() else x
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,42 +112,47 @@ class Limits:
     impedance: Impedance
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Contacts:
-    """The possible contacts with the same condim.
+class Constants(struct.PyTreeNode):
+    """What does not depend on the state of the contacts of a group, (C or 1, ..., 1).
 
-    `edges` are those of `newton.Contacts`, and `index` (n,) are the contacts' indices
-    in MJX's contacts. `mask` (n, nv) is 1 where a degree of
-    freedom moves the second body, -1 where it moves the first and 0 where it moves both
-    or none; `root` is the body whose subtree's centre of mass the motion is expressed
-    about.
+    Attributes:
+      chain: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it
+        moves the first and 0 where it moves both or none.
+      body: (C, N, 1), 1 for the second body and -1 for the first, 0 for the world.
+      friction: of sliding.
+      margin: distance from which a contact is in play.
+      inverse_weight: of an edge of the pyramid.
+      impedance: of an edge.
     """
 
-    edges: tuple[tuple[int, ...], ...]
-    index: np.ndarray
-    root: np.ndarray
-    mask: np.ndarray
+    chain: np.ndarray
+    body: np.ndarray
     friction: np.ndarray
     margin: np.ndarray
     inverse_weight: np.ndarray
     impedance: Impedance
 
 
-class Layout(NamedTuple):
-    """The parts of a model's constraint rows that do not depend on the state.
+class Group(NamedTuple):
+    """The possible contacts with the same condim; `edges` as in `newton.Contacts`."""
 
-    Attributes:
-      limits: the limits of joints.
-      contacts: a group of contacts for each condim.
-      capsule_on_plane: (2, n), indices in MJX's contacts of those between a capsule
-        and a plane, and the capsules' geoms.
-      plane: (3,), the normal of the plane that all motion is in, or None.
-    """
+    edges: tuple[tuple[int, ...], ...]
+    pairs: collision.Pairs
+    constants: Constants
+
+
+class Layout(NamedTuple):
+    """The parts of a model's constraint rows that do not depend on the state."""
 
     limits: Limits
-    contacts: tuple[Contacts, ...]
-    capsule_on_plane: np.ndarray
-    plane: np.ndarray | None
+    groups: tuple[Group, ...]
+
+
+class Contacts(NamedTuple):
+    """The contacts of a group in their present state."""
+
+    touch: collision.Touch
+    constants: Constants
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -161,54 +165,41 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         return "it has friction loss"
     if model.tendon_limited.any():
         return "it has limited tendons"
-    limited = model.jnt_type[model.jnt_limited.astype(bool)]
-    if not np.isin(limited, SLIDE_AND_HINGE).all():
-        return "it has limited ball joints"
     if not np.isin(model.geom_condim, [1, 3]).all() or model.npair:
         return "it has contacts with torsional or rolling friction, or named pairs"
-    if np.unique(model.body_rootid[1:]).size > 1:
-        return "it has more than one kinematic tree"
     flags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
     if model.opt.disableflags & (flags | mujoco.mjtDisableBit.mjDSBL_LIMIT):
         return "its constraints are disabled"
-    return None
+    return collision.unsupported(model)
 
 
-def layout(model: mujoco.MjModel, mjx_model: mjx.Model) -> Layout:
+def layout(model: mujoco.MjModel) -> Layout:
     """Compute everything that does not depend on the state."""
     limited = np.flatnonzero(model.jnt_limited)
     dof = model.jnt_dofadr[limited]
     limits = Limits(
         qpos=model.jnt_qposadr[limited],
         dof=dof,
-        low=model.jnt_range[limited, 0].astype(np.float32),
-        high=model.jnt_range[limited, 1].astype(np.float32),
-        margin=model.jnt_margin[limited].astype(np.float32),
-        inverse_weight=model.dof_invweight0[dof].astype(np.float32),
+        low=_constant(model.jnt_range[limited, 0]),
+        high=_constant(model.jnt_range[limited, 1]),
+        margin=_constant(model.jnt_margin[limited]),
+        inverse_weight=_constant(model.dof_invweight0[dof]),
         impedance=Impedance.of(
             model, model.jnt_solref[limited], model.jnt_solimp[limited]
         ),
     )
-    # MJX orders its contacts itself; which geoms they are does not change.
+    # Which geoms collide, and with which parameters, is for MJX to say.
     with jax.ensure_compile_time_eval():
+        mjx_model = mjx.put_model(model)
         collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
-        contact = collide(mjx.make_data(model))
-    condim = np.asarray(contact.dim).reshape(-1)
-    plane = _plane(model)
-    pyramid = _PYRAMID if plane is None else _FLAT_PYRAMID
-    contacts = [
-        _contacts(model, contact, condim, dim, edges)
+        contact = jax.tree.map(np.asarray, collide(mjx.make_data(model)))
+    flat = _plane(model)
+    pyramid = _PYRAMID if flat is None else _FLAT_PYRAMID
+    groups = [
+        _group(model, contact, dim, edges, flat)
         for dim, edges in ((1, ((),)), (3, pyramid))
     ]
-    geom = np.asarray(contact.geom).reshape(-1, 2)
-    kind = model.geom_type[geom]
-    index = np.flatnonzero((kind == _PLANE_AND_CAPSULE).all(axis=1))
-    return Layout(
-        limits,
-        tuple(c for c in contacts if c.index.size),
-        np.stack([index, geom[index, 1]]),
-        plane,
-    )
+    return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
 
 
 def _plane(model: mujoco.MjModel) -> np.ndarray | None:
@@ -226,56 +217,38 @@ def _plane(model: mujoco.MjModel) -> np.ndarray | None:
     return normal.astype(np.float32) if flat else None
 
 
-def _contacts(
+def _group(
     model: mujoco.MjModel,
     contact: mjx.Contact,
-    condims: np.ndarray,
     condim: int,
     edges: tuple[tuple[int, ...], ...],
-) -> Contacts:
-    index = np.flatnonzero(condims == condim)
-    geom = np.asarray(contact.geom).reshape(-1, 2)[index]
-    body = model.geom_bodyid[geom]
+    flat: np.ndarray | None,
+) -> Group:
+    index = np.flatnonzero(contact.dim.reshape(-1) == condim)
+    geom = contact.geom.reshape(-1, 2)
+    on_plane = model.geom_type[geom[index, 0]] == mujoco.mjtGeom.mjGEOM_PLANE
+    index = np.concatenate([index[on_plane], index[~on_plane]])
+    body = model.geom_bodyid[geom[index]]
     moves = np.zeros((model.nbody, model.nv))
     for i in range(1, model.nbody):
         moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
-    friction = np.asarray(contact.friction).reshape(-1, 5)[index, 0]
+    is_body = np.eye(model.nbody) * (np.arange(model.nbody) > 0)
+    friction = contact.friction.reshape(-1, 5)[index, 0]
     inverse_weight = model.body_invweight0[body, 0].sum(axis=1)
     if condim > 1:
         inverse_weight = inverse_weight * (1 + friction**2)
         inverse_weight = inverse_weight * 2 * friction**2 / model.opt.impratio
-    at = lambda x, width: np.asarray(x).reshape(-1, width)[index]
-    return Contacts(
-        edges=edges,
-        index=index,
-        root=model.body_rootid[body].max(axis=1),
-        mask=(moves[body[:, 1]] - moves[body[:, 0]]).astype(np.float32),
-        friction=friction.astype(np.float32),
-        margin=np.asarray(contact.includemargin).reshape(-1)[index],
-        inverse_weight=inverse_weight.astype(np.float32),
+    at = lambda x, width: x.reshape(-1, width)[index]
+    constants = Constants(
+        chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
+        body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),
+        friction=_constant(friction),
+        margin=_constant(contact.includemargin.reshape(-1)[index]),
+        inverse_weight=_constant(inverse_weight),
         impedance=Impedance.of(model, at(contact.solref, 2), at(contact.solimp, 5)),
     )
-
-
-def make(
-    layout: Layout, data: mjx.Data
-) -> tuple[newton.Limits, tuple[newton.Contacts, ...]]:
-    """Return the constraints at the state of `data`, after MJX's collision."""
-    return (
-        _make_limits(layout.limits, data),
-        tuple(_make_contacts(group, layout.plane, data) for group in layout.contacts),
-    )
-
-
-def row_forces(layout: Layout, solution: newton.Solution) -> jax.Array:
-    """Return the forces of all rows in the order of MJX and C MuJoCo, (R,)."""
-    forces = [solution.limit_force[layout.limits.dof]]
-    for group, force in zip(layout.contacts, solution.edge_forces, strict=True):
-        if group.edges == _FLAT_PYRAMID:
-            half = 0.5 * force[:, 2:]
-            force = jnp.concatenate([force[:, :2], half, half], axis=1)
-        forces.append(force.ravel())
-    return jnp.concatenate(forces)
+    pairs = collision.pairs(model, geom[index], len(edges[0]), flat)
+    return Group(edges, pairs, constants)
 
 
 def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
@@ -283,76 +256,123 @@ def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
     return 1.0 / jnp.maximum(resistance, mujoco.mjMINVAL)
 
 
-def _make_limits(limits: Limits, data: mjx.Data) -> newton.Limits:
-    qpos = data.qpos[limits.qpos]
-    above_low, below_high = qpos - limits.low, limits.high - qpos
+def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limits:
+    """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
+    joint = qpos[limits.qpos]
+    above_low, below_high = joint - limits.low, limits.high - joint
     distance = jnp.minimum(above_low, below_high) - limits.margin
     inside = jnp.where(above_low < below_high, 1.0, -1.0)
     sign = jnp.where(distance < 0.0, inside, 0.0)
     distance = jnp.minimum(distance, 0.0)
     impedance = limits.impedance(distance)
     pull = limits.impedance.stiffness * impedance * distance
-    damp = limits.impedance.damping * sign * data.qvel[limits.dof]
+    damp = limits.impedance.damping * sign * qvel[limits.dof]
     of_limit = (sign, -damp - pull, _weight(impedance, limits.inverse_weight))
     # Put each limit at the index of its degree of freedom, without a scatter.
-    index = np.full(data.qvel.shape[0], limits.dof.size)
+    index = np.full(qvel.shape[0], limits.dof.size)
     index[limits.dof] = np.arange(limits.dof.size)
-    spread = lambda x: jnp.concatenate([x, jnp.zeros(1, jnp.float32)])[index]
-    return newton.Limits(*map(spread, of_limit))
+    none = jnp.zeros((1, qvel.shape[1]), jnp.float32)
+    return newton.Limits(*(jnp.concatenate([x, none])[index] for x in of_limit))
 
 
-def align_frames(layout: Layout, data: mjx.Data) -> mjx.Data:
-    """Return `data` with the contact frames that C MuJoCo chooses, after collision."""
-    index, capsule = layout.capsule_on_plane
-    if not index.size:
-        return data
-    # mjc_PlaneCapsule gives the capsule's axis, mju_makeFrame projects it.
-    contact = data._impl.contact
-    frame = contact.frame[index]
-    normal = frame[:, 0]
-    axis = data.geom_xmat[capsule].reshape(-1, 3, 3)[:, :, 2]
-    tangent = axis - normal * jnp.sum(normal * axis, axis=-1, keepdims=True)
-    length = jnp.sqrt(jnp.sum(tangent**2, axis=-1, keepdims=True))
-    tangent = tangent / jnp.maximum(length, 1e-15)
-    aligned = jnp.stack([normal, tangent, jnp.cross(normal, tangent)], axis=1)
-    aligned = jnp.where(length[..., None] > 1e-15, aligned, frame)
-    contact = contact.replace(frame=contact.frame.at[index].set(aligned))
-    return data.tree_replace({"_impl.contact": contact})
-
-
-def _make_contacts(
-    contacts: Contacts, plane: np.ndarray | None, data: mjx.Data
+def contact_rows(
+    edges: tuple[tuple[int, ...], ...],
+    contacts: Contacts,
+    at: tree.Kinematics,
+    qvel: jax.Array,
 ) -> newton.Contacts:
-    contact, index = data._impl.contact, contacts.index
-    num_tangents = len(contacts.edges[0])
-    gap = contact.dist[index] - contacts.margin
+    """Return the rows of a group of contacts at qvel (V, B)."""
+    (distance, position, axes), constants = contacts
+    gap = distance - constants.margin
     active = gap < 0.0
-    arm = contact.pos[index] - data.subtree_com[contacts.root]
-    axes = contact.frame[index][:, : 1 + num_tangents]
-    if num_tangents and plane is not None:
-        # Which of MJX's two tangents is in the plane depends on the state.
-        axes = jnp.stack([axes[:, 0], jnp.cross(plane, axes[:, 0])], axis=1)
+    arm = (position - at.com)[:, None]
+    torque = tree.cross(*jnp.broadcast_arrays(arm, axes))
+    wrench = jnp.concatenate([torque, jnp.broadcast_to(axes, torque.shape)], axis=2)
+    wrench = materialize(wrench)
     # cdof is (rotation, translation) of a point at the root's centre of mass.
-    wrench = jnp.concatenate([jnp.cross(arm[:, None], axes), axes], axis=-1)
-    along = wrench @ data.cdof.T * contacts.mask[:, None]  # (n, 1 + tangents, nv)
-    along = jnp.where(active[:, None, None], along, 0.0)
-    friction = np.ones((index.size, 1 + num_tangents, 1), np.float32)
-    friction[:, 1:] = contacts.friction[:, None, None]
-    along = along * friction
-    signs = np.array([(1, *signs) for signs in contacts.edges], np.float32)
-    speed = (along @ data.qvel) @ signs.T  # (n, edges)
-    impedance = contacts.impedance(gap)
-    pull = contacts.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
-    weight = jnp.where(active, _weight(impedance, contacts.inverse_weight), 0.0)
+    along = add(wrench[:, :, k, None] * at.cdof[:, k] for k in range(6))
+    along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
+    scale = [along[:, :1], along[:, 1:] * constants.friction[:, None, None]]
+    along = materialize(jnp.concatenate(scale, axis=1))  # (C, A, V, B)
+    speed = materialize(jnp.sum(along * qvel, axis=2))
+    signs = np.array([(1, *signs) for signs in edges], np.float32)[..., None]
+    speed = jnp.sum(speed[:, None] * signs, axis=2)  # (C, edges, B)
+    impedance = constants.impedance(gap)
+    pull = constants.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
+    weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)
     # A normal that stands for two edges weighs as both.
-    count = [
-        2.0 if contacts.edges == _FLAT_PYRAMID and not any(s) else 1.0
-        for s in contacts.edges
-    ]
+    count = [2.0 if edges == _FLAT_PYRAMID and not any(s) else 1.0 for s in edges]
     return newton.Contacts(
         normal=along[:, 0],
         tangents=along[:, 1:],
-        reference=-contacts.impedance.damping[:, None] * speed - pull[:, None],
-        weight=weight[:, None] * np.array(count, np.float32),
-        edges=contacts.edges,
+        reference=-constants.impedance.damping[:, None] * speed - pull[:, None],
+        weight=weight[:, None] * np.array(count, np.float32)[:, None],
+        edges=edges,
     )
+
+
+def body_forces(
+    edges: tuple[tuple[int, ...], ...],
+    contacts: Contacts,
+    com: jax.Array,
+    edge_forces: jax.Array,
+) -> jax.Array:
+    """Return contacts' torque about `com` and force on each body, (N, 6, B).
+
+    Args:
+      edges: the group's edges.
+      contacts: the group's contacts.
+      com: (3, B), centre of mass of the tree, metres.
+      edge_forces: (C, E, B), force along each edge.
+    """
+    (_, position, axes), constants = contacts
+    signs = np.array(edges, np.float32).reshape(len(edges), -1)
+    force = jnp.sum(edge_forces, axis=1)[:, None] * axes[:, 0]
+    for t in range(signs.shape[1]):
+        along = jnp.sum(edge_forces * signs[:, t, None], axis=1) * constants.friction
+        force = force + along[:, None] * axes[:, t + 1]
+    wrench = jnp.concatenate([tree.cross(position - com, force), force], axis=1)
+    wrench = materialize(wrench)
+    return jnp.sum(constants.body[:, :, None] * wrench[:, None], axis=0)
+
+
+# Few of the possible contacts are in play at once: humanoid has 138 possible contacts,
+# and no more than 8 in play in any group unless it lies with folded arms.
+MOST_IN_PLAY = 8
+
+
+def num_in_play(contacts: Contacts) -> jax.Array:
+    """Return how many contacts of a group are in play, (B,)."""
+    in_play = contacts.touch.distance < contacts.constants.margin
+    return jnp.sum(in_play, axis=0, dtype=jnp.int32)
+
+
+def gather(contacts: Contacts) -> Contacts:
+    """Move the contacts in play into `MOST_IN_PLAY` slots.
+
+    A slot that stays empty is at an infinite distance.
+    """
+    num_contacts = contacts.touch.distance.shape[0]
+    if num_contacts <= MOST_IN_PLAY:
+        return contacts
+    in_play = contacts.touch.distance < contacts.constants.margin  # (C, B)
+    number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
+    index, left = [], jnp.where(in_play, number, num_contacts)
+    for _ in range(MOST_IN_PLAY):
+        first = jnp.min(left, axis=0)
+        index.append(first)
+        left = jnp.where(left == first, num_contacts, left)
+    chosen = materialize(jnp.stack(index))  # (P, B)
+    safe = jnp.minimum(chosen, num_contacts - 1)
+
+    def move(x: Any) -> Any:
+        if x.shape[0] == 1:
+            return x
+        at = safe.reshape(MOST_IN_PLAY, *(1,) * (x.ndim - 2), -1)
+        x = jnp.broadcast_to(x, (*x.shape[:-1], at.shape[-1]))
+        return jnp.take_along_axis(x, at, axis=0)
+
+    touch, constants = jax.tree.map(move, contacts)
+    empty = chosen == num_contacts
+    touch = touch._replace(distance=jnp.where(empty, jnp.inf, touch.distance))
+    return Contacts(touch, constants)

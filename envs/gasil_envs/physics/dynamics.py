@@ -1,42 +1,51 @@
-"""One time step of MuJoCo's dynamics: MJX's smooth part, our constraints and solver.
+"""One time step of MuJoCo's dynamics, many states at once.
 
-The stages and integrators are those of C MuJoCo (``engine_forward.c``). Kinematics,
-collision, inertia and bias forces are MJX's; constraint rows are built in
-`constraints`, and every linear system is solved in `newton`.
+The stages and integrators are those of C MuJoCo (``engine_forward.c``). Smooth dynamics
+are in `tree`, contacts in `collision`, constraint rows in `constraints`, and every
+linear system is solved in `newton`. Every array has the batch as its last axis.
+
+Shape letters: N bodies, V degrees of freedom, B batch.
 """
 
+import functools
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
-from gasil_envs.physics import constraints, newton
+from gasil_envs.physics import constraints, newton, tree
+from gasil_envs.physics.batching import materialize, on_cpu
+from gasil_envs.physics.interface import Fields, PhysicsState
 
 _JOINT_TRANSMISSION = [
     int(mujoco.mjtTrn.mjTRN_JOINT),
     int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
 ]
+#: The arrays of ``mjData`` that `step` can return.
+FIELDS = ("xpos", "xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
 
 
 class Dynamics(NamedTuple):
     """A model, and the parts of its dynamics that do not depend on the state.
 
     Attributes:
-      model: MJX's model.
+      model: the model.
       layout: layout of the constraints.
-      motor: (nu, nv), generalized force of one unit of control.
-      control_range: (2, nu), lowest and highest control.
+      motor: (V, nu), generalized force of one unit of control.
+      control_range: (2, nu, 1), lowest and highest control.
       iterations: number of iterations of the solver.
+      fields: names of the fields to return, of `FIELDS`.
     """
 
-    model: mjx.Model
+    model: mujoco.MjModel
     layout: constraints.Layout
     motor: np.ndarray
     control_range: np.ndarray
     iterations: int
+    fields: tuple[str, ...]
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -51,103 +60,179 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         or (model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_NONE)).any()
         or model.actuator_forcelimited.any()
         or model.jnt_actfrclimited.any()
-        or not np.isin(
-            model.jnt_type[model.actuator_trnid[:, 0]], constraints.SLIDE_AND_HINGE
-        ).all()
+        or (model.jnt_type[model.actuator_trnid[:, 0]] == tree.FREE).any()
     ):
         return "it has actuators other than plain motors on slides and hinges"
-    if model.nv > 60:
-        return "it has more than 60 degrees of freedom, and MJX's inertia is sparse"
-    return constraints.unsupported(model)
+    return tree.unsupported(model) or constraints.unsupported(model)
 
 
-def make(model: mujoco.MjModel, mjx_model: mjx.Model, iterations: int = 4) -> Dynamics:
+def make(
+    model: mujoco.MjModel, fields: Sequence[str] = (), iterations: int = 4
+) -> Dynamics:
     """Compute what does not depend on the state, for a supported model."""
-    motor = np.zeros((model.nu, model.nv), np.float32)
+    motor = np.zeros((model.nv, model.nu), np.float32)
     dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-    motor[np.arange(model.nu), dof] = (
+    motor[dof, np.arange(model.nu)] = (
         model.actuator_gear[:, 0] * model.actuator_gainprm[:, 0]
     )
     limited = model.actuator_ctrllimited[:, None].astype(bool)
     control_range = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
     return Dynamics(
-        mjx_model,
-        constraints.layout(model, mjx_model),
+        model,
+        constraints.layout(model),
         motor,
-        control_range.T.astype(np.float32),
+        control_range.T[..., None].astype(np.float32),
         iterations,
+        tuple(fields),
     )
 
 
-def step(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
-    """Advance one time step; derived fields of `data` are of the last evaluation."""
-    if dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4:
-        return _runge_kutta(dynamics, data)
-    return _euler(dynamics.model, forward(dynamics, data))
+class _Accelerations(NamedTuple):
+    """The result of one evaluation of the dynamics.
+
+    Attributes:
+      inertia: (V, V, B).
+      force: (V, B), all forces.
+      qacc: (V, B).
+      fields: the fields to return.
+    """
+
+    inertia: jax.Array
+    force: jax.Array
+    qacc: jax.Array
+    fields: Fields
 
 
-def forward(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
-    """Compute accelerations and forces from positions, velocities and controls."""
-    model = dynamics.model
-    data = mjx.kinematics(model, data)
-    data = mjx.com_pos(model, data)
-    data = mjx.tendon(model, data)
-    data = mjx.crb(model, data)
-    data = mjx.tendon_armature(model, data)
-    data = constraints.align_frames(dynamics.layout, mjx.collision(model, data))
-    data = mjx.com_vel(model, data)
-    data = mjx.passive(model, data)
-    data = mjx.rne(model, data)
-    data = mjx.tendon_bias(model, data)
-    control = jnp.clip(data.ctrl, *dynamics.control_range)
-    actuation = control @ dynamics.motor
-    force = data.qfrc_passive - data.qfrc_bias + actuation
-    limits, contacts = constraints.make(dynamics.layout, data)
-    solution = newton.solve(
-        newton.Problem(
-            inertia=data._impl.M,
-            force=force,
-            warmstart=data.qacc_warmstart,
-            limits=limits,
-            contacts=contacts,
-        ),
-        dynamics.iterations,
+def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
+    """Return the fields at `state`, with all forces 0."""
+    model, size = dynamics.model, state.qpos.shape[-1]
+    at = tree.kinematics(model, state.qpos)
+    fields = {
+        "xpos": at.xpos,
+        "xipos": at.xipos,
+        "cinert": at.cinert,
+        "cvel": tree.velocity(model, at.cdof, state.qvel),
+        "qfrc_actuator": jnp.zeros((model.nv, size), jnp.float32),
+        "cfrc_ext": jnp.zeros((model.nbody, 6, size), jnp.float32),
+    }
+    return {name: fields[name] for name in dynamics.fields}
+
+
+def forward(
+    dynamics: Dynamics, state: PhysicsState, actuation: jax.Array
+) -> _Accelerations:
+    """Compute accelerations and fields; `actuation` are the motors' forces (V, B)."""
+    model, (qpos, qvel) = dynamics.model, (state.qpos, state.qvel)
+    at = tree.kinematics(model, qpos)
+    smooth = tree.smooth(model, at, qpos, qvel)
+    force = materialize(smooth.force + actuation)
+    lines = constraints.collision.segments(model, at)
+    groups = dynamics.layout.groups
+    contacts = [
+        constraints.Contacts(
+            materialize(constraints.collision.touch(model, x.pairs, lines)), x.constants
+        )
+        for x in groups
+    ]
+    limits = constraints.limit_rows(dynamics.layout.limits, qpos, qvel)
+
+    def constrain(contacts: Sequence[constraints.Contacts], for_speed: bool) -> Any:
+        rows = [
+            constraints.contact_rows(group.edges, x, at, qvel)
+            for group, x in zip(groups, contacts, strict=True)
+        ]
+        problem = newton.Problem(
+            smooth.inertia, force, state.qacc_warmstart, limits, tuple(rows)
+        )
+        solution = newton.solve_many(dynamics.iterations, 4, problem, for_speed)
+        of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
+        if "cfrc_ext" in dynamics.fields:
+            for group, x, edge in zip(
+                groups, contacts, solution.edge_forces, strict=True
+            ):
+                of_bodies = of_bodies + constraints.body_forces(
+                    group.edges, x, at.com, edge
+                )
+        return solution.qacc, solution.constraint_force, of_bodies
+
+    qacc, constraint_force, of_bodies = _with_contacts_in_play(constrain, contacts)
+    fields = {
+        "xpos": at.xpos,
+        "xipos": at.xipos,
+        "cinert": at.cinert,
+        "cvel": smooth.cvel,
+        "qfrc_actuator": actuation,
+        "cfrc_ext": of_bodies,
+    }
+    return _Accelerations(
+        smooth.inertia,
+        force + constraint_force,
+        qacc,
+        {name: fields[name] for name in dynamics.fields},
     )
-    return data.tree_replace(
-        {
-            "qfrc_actuator": actuation,
-            "qfrc_smooth": force,
-            "qacc_smooth": solution.qacc_smooth,
-            "qacc": solution.qacc,
-            "qfrc_constraint": solution.constraint_force,
-            "_impl.efc_force": constraints.row_forces(dynamics.layout, solution),
-        }
+
+
+# On a GPU a decision needs the host, which pays from this many possible contacts on.
+_FEWEST_WORTH_A_DECISION = 20
+
+
+def _with_contacts_in_play(
+    function: Callable[[Sequence[constraints.Contacts], bool], Any],
+    contacts: Sequence[constraints.Contacts],
+) -> Any:
+    """Call a function with only the contacts that are in play, and for speed.
+
+    If one of the states has more in a group than there are slots, the function gets all
+    contacts of all. This is rare, so that program is compiled for size.
+    """
+    count = [x.touch.distance.shape[0] for x in contacts]
+    most = max(count, default=0)
+    if most <= constraints.MOST_IN_PLAY or not (
+        on_cpu() or most >= _FEWEST_WORTH_A_DECISION
+    ):
+        return function(contacts, True)
+    in_play = jnp.stack([constraints.num_in_play(x) for x in contacts])
+    return jax.lax.cond(
+        jnp.all(in_play <= constraints.MOST_IN_PLAY),
+        lambda: function([constraints.gather(x) for x in contacts], True),
+        lambda: function(contacts, False),
     )
+
+
+def step(
+    dynamics: Dynamics, state: PhysicsState, control: jax.Array, frame_skip: int
+) -> tuple[PhysicsState, Fields]:
+    """Advance `frame_skip` time steps; the fields are of the last evaluation."""
+    control = jnp.clip(control, *dynamics.control_range)
+    actuation = jnp.broadcast_to(dynamics.motor @ control, state.qvel.shape)
+    is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
+    integrate = _euler if is_euler else _runge_kutta
+    one = functools.partial(integrate, dynamics, actuation)
+    carry = (state, kinematics(dynamics, state))
+    return jax.lax.scan(lambda x, _: (one(*x), None), carry, length=frame_skip)[0]
 
 
 def _integrate_positions(
-    model: mjx.Model, qpos: jax.Array, qvel: jax.Array
+    model: mujoco.MjModel, qpos: jax.Array, qvel: jax.Array
 ) -> jax.Array:
-    """qpos after one time step at qvel; the joint types are static."""
+    """qpos (nq, B) after one time step at qvel (V, B)."""
     dt = model.opt.timestep
     parts, q, v = [], 0, 0
     for kind in model.jnt_type:
-        if kind == mujoco.mjtJoint.mjJNT_FREE:
+        if kind == tree.FREE:
             parts.append(qpos[q : q + 3] + dt * qvel[v : v + 3])
             parts.append(_rotate(qpos[q + 3 : q + 7], qvel[v + 3 : v + 6], dt))
             q, v = q + 7, v + 6
-        elif kind == mujoco.mjtJoint.mjJNT_BALL:
-            parts.append(_rotate(qpos[q : q + 4], qvel[v : v + 3], dt))
-            q, v = q + 4, v + 3
         else:
             parts.append(qpos[q : q + 1] + dt * qvel[v : v + 1])
             q, v = q + 1, v + 1
     return jnp.concatenate(parts)
 
 
-def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: jax.Array) -> jax.Array:
-    """A unit quaternion (4,) after turning with `velocity` (3,) rad/s for `dt`."""
-    speed = jnp.linalg.norm(velocity)
+def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: float) -> jax.Array:
+    """Unit quaternions (4, B) after turning with `velocity` (3, B) rad/s for `dt`."""
+    norm = lambda x: jnp.sqrt(jnp.sum(x**2, axis=0))
+    speed = norm(velocity)
     half = 0.5 * dt * speed
     scale = jnp.where(speed > 1e-10, jnp.sin(half) / jnp.maximum(speed, 1e-10), 0.0)
     w, x, y, z = quaternion
@@ -160,25 +245,28 @@ def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: jax.Array) -> jax.Ar
             w * d + x * c - y * b + z * a,
         ]
     )
-    return turned / jnp.linalg.norm(turned)
+    return turned / norm(turned)
 
 
-def _euler(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+def _euler(
+    dynamics: Dynamics, actuation: jax.Array, state: PhysicsState, fields: Fields
+) -> tuple[PhysicsState, Fields]:
     """Semi-implicit Euler, with the joints' damping taken implicitly."""
+    model = dynamics.model
     dt = model.opt.timestep
-    qacc = data.qacc
+    now = forward(dynamics, state, actuation)
+    qacc = now.qacc
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-        inertia = data._impl.M + jnp.diag(dt * model.dof_damping)
-        qacc = newton.linear_solve(inertia, data.qfrc_smooth + data.qfrc_constraint)
-    qvel = data.qvel + dt * qacc
-    return data.replace(
-        qvel=qvel,
-        qpos=_integrate_positions(model, data.qpos, qvel),
-        qacc_warmstart=data.qacc,
-    )
+        damping = np.diag(dt * model.dof_damping).astype(np.float32)[..., None]
+        qacc = newton.eliminate(now.inertia + damping, now.force)
+    qvel = state.qvel + dt * qacc
+    qpos = _integrate_positions(model, state.qpos, qvel)
+    return PhysicsState(qpos, qvel, now.qacc), now.fields
 
 
-def _runge_kutta(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
+def _runge_kutta(
+    dynamics: Dynamics, actuation: jax.Array, state: PhysicsState, fields: Fields
+) -> tuple[PhysicsState, Fields]:
     """Classical Runge-Kutta of order 4.
 
     The first evaluation, at the state itself, is a stage of the loop too, so that
@@ -186,25 +274,27 @@ def _runge_kutta(dynamics: Dynamics, data: mjx.Data) -> mjx.Data:
     """
     model = dynamics.model
     dt = model.opt.timestep
-    qpos, qvel = data.qpos, data.qvel
+    qpos, qvel = state.qpos, state.qvel
 
     def stage(carry: Any, coefficients: Any) -> Any:
-        data, velocity_sum, acceleration_sum = carry
+        state, velocity_sum, acceleration_sum, _ = carry
         ahead, weight = coefficients
         # Both are replaced at once: positions use the velocity of the previous stage.
-        position = _integrate_positions(model, qpos, ahead * data.qvel)
-        data = data.replace(qpos=position, qvel=qvel + dt * ahead * data.qacc)
-        data = forward(dynamics, data)
-        velocity_sum = velocity_sum + weight * data.qvel
-        return (data, velocity_sum, acceleration_sum + weight * data.qacc), None
+        position = _integrate_positions(model, qpos, ahead * state.qvel)
+        state = state.replace(
+            qpos=position, qvel=qvel + dt * ahead * state.qacc_warmstart
+        )
+        now = forward(dynamics, state, actuation)
+        state = state.replace(qacc_warmstart=now.qacc)
+        velocity_sum = velocity_sum + weight * state.qvel
+        acceleration_sum = acceleration_sum + weight * now.qacc
+        return (state, velocity_sum, acceleration_sum, now.fields), None
 
-    stages = jnp.array(
-        [[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], jnp.float32
+    stages = np.array(
+        [[0.0, 1 / 6], [0.5, 1 / 3], [0.5, 1 / 3], [1.0, 1 / 6]], np.float32
     )
-    carry = (data, jnp.zeros_like(qvel), jnp.zeros_like(qvel))
-    (data, velocity, acceleration), _ = jax.lax.scan(stage, carry, stages)
-    return data.replace(
-        qpos=_integrate_positions(model, qpos, velocity),
-        qvel=qvel + dt * acceleration,
-        qacc_warmstart=data.qacc,
-    )
+    zero = jnp.zeros_like(qvel)
+    carry = (state, zero, zero, fields)
+    (state, velocity, acceleration, fields), _ = jax.lax.scan(stage, carry, stages)
+    qpos = _integrate_positions(model, qpos, velocity)
+    return PhysicsState(qpos, qvel + dt * acceleration, state.qacc_warmstart), fields

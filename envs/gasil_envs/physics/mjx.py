@@ -1,8 +1,8 @@
 """MuJoCo physics in pure JAX, on MJX."""
 
-import functools
 import logging
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ import mujoco
 from mujoco import mjx
 
 from gasil_envs.physics import dynamics
+from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, PhysicsState
 from gasil_envs.precision import full_precision
 
@@ -34,9 +35,9 @@ class MjxPhysics:
     Args:
       model: the model; its solver options are overwritten.
       fields: names of the ``mjData`` arrays to return.
-      solver: "small" uses our constraint rows and our Newton's method for small dense
-        problems (`dynamics`). For a model that these do not support it falls back to
-        "mjx" and logs a warning. "mjx" uses MJX's own step.
+      solver: "small" uses our own dynamics and Newton's method for small dense problems
+        (`dynamics`). For a model that these do not support it falls back to "mjx" and
+        logs a warning. "mjx" uses MJX's own step.
       iterations: Newton iterations of either solver.
       ls_iterations: line-search steps of MJX's solver. Float32 never meets MuJoCo's
         tolerance, which is meant for float64, so that all of its 100 iterations would
@@ -57,16 +58,15 @@ class MjxPhysics:
         # humanoid.xml specifies PGS, which MJX does not have.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         self._fields = tuple(fields)
-        self._mjx_model = mjx.put_model(model)
-        self._blank_data = mjx.make_data(model)
         reason = dynamics.unsupported(model) if solver == "small" else None
         if reason is not None:
             _LOGGER.warning("MJX's own solver steps this model: %s", reason)
+        self._small: dynamics.Dynamics | None = None
         if solver == "small" and reason is None:
-            small = dynamics.make(model, self._mjx_model, iterations)
-            self._step = functools.partial(dynamics.step, small)
+            self._small = dynamics.make(model, fields, iterations)
         else:
-            self._step = functools.partial(mjx.step, self._mjx_model)
+            self._mjx_model = mjx.put_model(model)
+            self._blank_data = mjx.make_data(model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
@@ -83,6 +83,8 @@ class MjxPhysics:
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""
+        if self._small is not None:
+            return batch_last(partial(dynamics.kinematics, self._small))(state)
         data = mjx.kinematics(self._mjx_model, self._data(state))
         data = mjx.com_pos(self._mjx_model, data)
         return self._pick(mjx.com_vel(self._mjx_model, data))
@@ -92,9 +94,13 @@ class MjxPhysics:
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
         """Advance `frame_skip` time steps under one control (nu,)."""
+        if self._small is not None:
+            small = self._small
+            many = lambda x: dynamics.step(small, x[0], x[1], frame_skip)
+            return batch_last(in_tiles(many))((state, control))
         data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
-            lambda data, _: (self._step(data), None),
+            lambda data, _: (mjx.step(self._mjx_model, data), None),
             data,
             length=frame_skip,
         )[0]

@@ -17,20 +17,21 @@ E the small constant matrix that makes edges of normal and tangents, J = E B, an
 
     J q = E (B q),    J' diag(w) J = B' (E' diag(w) E) B,
 
-where B has 2 or 3 rows for each contact and J has 4. If only a few of the possible
-contacts are in play, the solver is given only these.
+where B has 2 or 3 rows for each contact and J has 4.
 
 It is not reverse-mode differentiable. Neither is MJX's own solver, because its loop is
 dynamic.
 """
 
 import functools
-from collections.abc import Callable, Iterable
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from gasil_envs.physics.batching import add, batch_last, in_tiles, materialize, on_cpu
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges.
@@ -106,131 +107,13 @@ class Solution(struct.PyTreeNode):
 
 def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
     """Solve one problem; use `jax.vmap`, nested if needed, for many."""
-    function = functools.partial(_solve, iterations, line_search)
-    batched = _batch_last(
-        _in_tiles(functools.partial(_without_idle_contacts, function))
-    )
-    solution = batched(jax.tree.map(lambda x: x[..., None], problem))
-    return jax.tree.map(lambda x: x[..., 0], solution)
+    function = functools.partial(solve_many, iterations, line_search)
+    return batch_last(in_tiles(function))(problem)
 
 
 def linear_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,)."""
-    batched = _batch_last(lambda pair: _eliminate(*pair))
-    return batched((matrix[..., None], right[..., None]))[..., 0]
-
-
-def _batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Make `jax.vmap` extend the trailing batch axis of a function's arrays."""
-    function = jax.custom_batching.custom_vmap(function)
-
-    @function.def_vmap
-    def rule(axis_size: int, in_batched: list[Any], tree: Any) -> tuple[Any, Any]:
-        is_batched = in_batched[0]
-
-        def join(x: jax.Array, batched: bool) -> jax.Array:
-            if not batched:
-                x = jnp.broadcast_to(x, (axis_size, *x.shape))
-            x = jnp.moveaxis(x, 0, -2)
-            return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
-
-        def part(x: jax.Array) -> jax.Array:
-            x = x.reshape(*x.shape[:-1], axis_size, x.shape[-1] // axis_size)
-            return jnp.moveaxis(x, -2, 0)
-
-        joined = _materialize(jax.tree.map(join, tree, is_batched))
-        result = _materialize(function(joined))
-        result = jax.tree.map(part, result)
-        return result, jax.tree.map(lambda _: True, result)
-
-    return function
-
-
-# A CPU's caches hold the data of no more problems than this.
-_MOST_IN_A_TILE = 64
-
-
-def _in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Make a function of arrays with a trailing batch run in parts on a CPU."""
-
-    def in_tiles(tree: Any) -> Any:
-        batch = jax.tree.leaves(tree)[0].shape[-1]
-        size = max(n for n in range(1, _MOST_IN_A_TILE + 1) if batch % n == 0)
-        if not _on_cpu() or size < 16 or size == batch:
-            return function(tree)
-        tiles = batch // size
-        split = lambda x: jnp.moveaxis(x.reshape(*x.shape[:-1], tiles, size), -2, 0)
-        join = lambda x: jnp.moveaxis(x, 0, -2).reshape(*x.shape[1:-1], batch)
-        return jax.tree.map(join, jax.lax.map(function, jax.tree.map(split, tree)))
-
-    return in_tiles
-
-
-# Few of the possible contacts are in play at once: humanoid has 138 possible contacts,
-# and no more than 8 in play in any group unless it lies with folded arms.
-_MOST_IN_PLAY = 8
-# On a GPU a decision needs the host, which pays from this many possible contacts on.
-_FEWEST_WORTH_A_DECISION = 20
-
-
-def _without_idle_contacts(
-    solve: Callable[[Problem, bool], Solution], problem: Problem
-) -> Solution:
-    """Solve problems, batch last, with only the contacts that are in play.
-
-    If one of the problems has more than `_MOST_IN_PLAY` in a group, all are solved with
-    all contacts. This is rare, so that program is compiled for size and not for speed.
-    """
-    large = [x for x in problem.contacts if x.normal.shape[0] > _MOST_IN_PLAY]
-    most = max((x.normal.shape[0] for x in large), default=0)
-    if not large or not (_on_cpu() or most >= _FEWEST_WORTH_A_DECISION):
-        return solve(problem, True)
-
-    def few(problem: Problem) -> Solution:
-        moved, restore = zip(*map(_together, problem.contacts), strict=True)
-        solution = solve(problem.replace(contacts=moved), True)
-        forces = [f(x) for f, x in zip(restore, solution.edge_forces, strict=True)]
-        return solution.replace(edge_forces=tuple(forces))
-
-    fits = [jnp.sum(x.weight[:, 0] > 0, axis=0) <= _MOST_IN_PLAY for x in large]
-    return jax.lax.cond(
-        jnp.all(jnp.stack(fits)), few, lambda problem: solve(problem, False), problem
-    )
-
-
-def _together(
-    contacts: Contacts,
-) -> tuple[Contacts, Callable[[jax.Array], jax.Array]]:
-    """Gather the contacts in play into `_MOST_IN_PLAY` slots.
-
-    Returns:
-      The gathered contacts, and a function that puts their forces (P, ...) back at the
-      indices of all contacts (C, ...).
-    """
-    num_contacts = contacts.normal.shape[0]
-    if num_contacts <= _MOST_IN_PLAY:
-        return contacts, lambda forces: forces
-    in_play = contacts.weight[:, 0] > 0  # (C, B)
-    slot = jnp.cumsum(in_play, axis=0, dtype=jnp.int32) - 1
-    number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
-    chosen = in_play & (slot == jnp.arange(_MOST_IN_PLAY)[:, None, None])  # (P, C, B)
-    index = jnp.max(jnp.where(chosen, number, -1), axis=1)  # (P, B), -1 for none
-
-    def move(x: jax.Array) -> jax.Array:
-        at = index.reshape(_MOST_IN_PLAY, *(1,) * (x.ndim - 2), -1)
-        moved = jnp.take_along_axis(x, jnp.maximum(at, 0), axis=0)
-        return jnp.where(at < 0, 0.0, moved)
-
-    def restore(forces: jax.Array) -> jax.Array:
-        at = jnp.clip(slot, 0, _MOST_IN_PLAY - 1)[:, None]
-        return jnp.where(in_play[:, None], jnp.take_along_axis(forces, at, axis=0), 0.0)
-
-    return jax.tree.map(move, contacts), restore
-
-
-# XLA's CPU backend fuses a chain of elementwise operations into each of its users and
-# computes it again in each. A value with many users must be stored explicitly.
-_materialize = jax.lax.optimization_barrier
+    return batch_last(lambda pair: eliminate(*pair))((matrix, right))
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -245,24 +128,15 @@ _MOST_ENTRIES_SPELLED_OUT = {"cpu": 1100, "gpu": 300}
 _MOST_DEGREES_UNROLLED = 10
 
 
-def _on_cpu() -> bool:
-    return jax.default_backend() == "cpu"
-
-
 def _spells_out(matrix: jax.Array) -> bool:
-    most = _MOST_ENTRIES_SPELLED_OUT["cpu" if _on_cpu() else "gpu"]
+    most = _MOST_ENTRIES_SPELLED_OUT["cpu" if on_cpu() else "gpu"]
     return matrix.shape[0] * matrix.shape[1] <= most
-
-
-def _sum(terms: Iterable[jax.Array]) -> jax.Array:
-    # There is at least one term, which the type of `sum` does not express.
-    return cast(jax.Array, sum(terms))
 
 
 def _matvec(matrix: jax.Array, vector: jax.Array, spell_out: bool) -> jax.Array:
     """(N, V, B), (V, B) -> (N, B)."""
     if spell_out:
-        return _sum(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
+        return add(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
     return jnp.sum(matrix * vector, axis=1)
 
 
@@ -271,7 +145,7 @@ def _matvec_transposed(
 ) -> jax.Array:
     """(N, V, B), (N, B) -> (V, B)."""
     if spell_out:
-        return _sum(matrix[n] * vector[n] for n in range(vector.shape[0]))
+        return add(matrix[n] * vector[n] for n in range(vector.shape[0]))
     return jnp.sum(matrix * vector[:, None], axis=0)
 
 
@@ -281,10 +155,10 @@ def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> ja
     if not spell_out:
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
     rows = [
-        _sum(left[n, i] * right[n, : i + 1] for n in range(num_rows))
+        add(left[n, i] * right[n, : i + 1] for n in range(num_rows))
         for i in range(size)
     ]
-    rows = [_materialize(row) for row in rows]
+    rows = [materialize(row) for row in rows]
     return jnp.stack(
         [
             jnp.concatenate(
@@ -319,7 +193,7 @@ class _Rows:
         parts = []
         for group in problem.contacts:
             parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
-        self._basis = _materialize(jnp.concatenate(parts)) if parts else None
+        self._basis = materialize(jnp.concatenate(parts)) if parts else None
         self._spell_out = (
             self._basis is not None and for_speed and _spells_out(self._basis)
         )
@@ -358,11 +232,11 @@ class _Rows:
         for edges, of_edges, (_, tangents) in zip(
             self._edges, of_groups, self._shapes, strict=True
         ):
-            along.append(_sum(of_edges))
+            along.append(add(of_edges))
             for t in range(tangents):
                 signs = [signs[t] for signs in edges]
                 along.append(_sum_signed(of_edges, signs))
-        joined = _materialize(jnp.concatenate(along))
+        joined = materialize(jnp.concatenate(along))
         return result + _matvec_transposed(self._basis, joined, self._spell_out)
 
     def gram(self, weights: list[jax.Array]) -> jax.Array:
@@ -385,7 +259,7 @@ class _Rows:
                     if any(products):
                         terms.append(_sum_signed(of_edges, products)[:, None] * part)
                 weighted.append(sum(terms))
-        weighted = _materialize(jnp.concatenate(weighted))
+        weighted = materialize(jnp.concatenate(weighted))
         return result + _symmetric_product(weighted, self._basis, self._spell_out)
 
 
@@ -406,7 +280,7 @@ def _sum_signed(values: jax.Array, signs: list[int]) -> jax.Array:
     return sum(chosen)
 
 
-def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
+def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Return x of A x = b by Gauss-Jordan elimination: (V, V, B), (V, B) -> (V, B).
 
     Symmetric positive matrices need no pivoting. Each step drops the first column and
@@ -416,12 +290,43 @@ def _eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     for _ in range(matrix.shape[0]):
         row = table[0, 1:] / table[0, 0]
         others = table[1:, 1:] - table[1:, :1] * row
-        table = _materialize(jnp.concatenate([others, row[None]]))
+        table = materialize(jnp.concatenate([others, row[None]]))
     return table[:, 0]
 
 
-def _solve(
-    iterations: int, line_search: int, problem: Problem, for_speed: bool
+def _repeat(
+    function: Callable[[Any], tuple[Any, jax.Array]], carry: Any, least: int, most: int
+) -> Any:
+    """Call a function `least` to `most` times, and on a CPU until nothing changes.
+
+    The function returns the carry and whether something has changed. On a GPU each
+    decision would wait for the host, and the loop itself would cost more than its body
+    (a fifth of the time of walker2d). On a CPU unrolling it only costs compile time.
+    """
+    if not on_cpu():
+        size = jax.tree.leaves(carry)[0].shape[0]
+        return jax.lax.fori_loop(
+            0,
+            most,
+            lambda _, carry: function(carry)[0],
+            carry,
+            unroll=size <= _MOST_DEGREES_UNROLLED,
+        )
+
+    def goes_on(state: Any) -> jax.Array:
+        count, changed, _ = state
+        return (count < least) | (changed & (count < most))
+
+    def body(state: Any) -> Any:
+        count, _, carry = state
+        carry, changed = function(carry)
+        return count + 1, changed, carry
+
+    return jax.lax.while_loop(goes_on, body, (0, True, carry))[2]
+
+
+def solve_many(
+    iterations: int, line_search: int, problem: Problem, for_speed: bool = True
 ) -> Solution:
     """Solve problems whose arrays have the batch as their last axis."""
     inertia, force = problem.inertia, problem.force
@@ -429,13 +334,12 @@ def _solve(
     spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
     each = jax.tree.map
-    # On a GPU the loop itself costs more than its body (a fifth of the time of
-    # walker2d). On a CPU unrolling it only costs compile time.
-    unroll = not _on_cpu() and force.shape[0] <= _MOST_DEGREES_UNROLLED
-    loop = functools.partial(jax.lax.fori_loop, unroll=unroll)
     total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
     distance_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
-    qacc_smooth = _eliminate(inertia, force)
+    qacc_smooth = eliminate(inertia, force)
+
+    is_pushing = lambda distance: each(lambda d: d < 0.0, distance)
+    changes = lambda a, b: jnp.any(total(each(jnp.not_equal, a, b)) > 0)
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
@@ -446,22 +350,22 @@ def _solve(
     better = cost(problem.warmstart) < cost(qacc_smooth)
     start = jnp.where(better, problem.warmstart, qacc_smooth)
 
-    def iterate(_: int, carry: tuple[jax.Array, list[jax.Array]]) -> Any:
+    def iterate(carry: tuple[jax.Array, list[jax.Array]]) -> Any:
         qacc, distance = carry
         active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), distance, weight)
         residual = _matvec(inertia, qacc, spell_out) - force
         pull = rows.transposed_times(each(jnp.multiply, active, distance))
-        active, gradient = _materialize((active, residual + pull))
+        active, gradient = materialize((active, residual + pull))
         hessian = inertia + rows.gram(active)
-        direction = -_eliminate(hessian, gradient)
+        direction = -eliminate(hessian, gradient)
 
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
-        slope = _materialize(rows.times(direction))
+        slope = materialize(rows.times(direction))
         linear = _dot(direction, residual)
         quadratic = _dot(direction, _matvec(inertia, direction, spell_out))
 
-        def newton(_: int, search: tuple[jax.Array, ...]) -> Any:
-            step, low, high = search
+        def newton(search: tuple[Any, ...]) -> Any:
+            step, low, high, pushing = search
             there = each(lambda d, s: d + step * s, distance, slope)
             pushed = each(
                 lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
@@ -473,15 +377,19 @@ def _solve(
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
-            return jnp.where(inside, following, 0.5 * (low + high)), low, high
+            following = jnp.where(inside, following, 0.5 * (low + high))
+            now = is_pushing(there)
+            return (following, low, high, now), changes(pushing, now)
 
         step = jnp.ones_like(linear)
-        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3))
-        step = loop(0, line_search, newton, search)[0]
+        pushing = is_pushing(distance)
+        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
+        step = _repeat(newton, search, 1, line_search)[0]
         moved = each(lambda d, s: d + step * s, distance, slope)
-        return qacc + step * direction, moved
+        return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
 
-    qacc, distance = loop(0, iterations, iterate, (start, distance_at(start)))
+    begin = (start, distance_at(start))
+    qacc, distance = _repeat(iterate, begin, 2, iterations)
     push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
     return Solution(
         qacc=qacc,

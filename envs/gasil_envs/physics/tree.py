@@ -1,0 +1,391 @@
+"""Kinematics, inertia and bias forces of a tree of bodies, many states at once.
+
+The quantities and their names are MuJoCo's (``engine_core_smooth.c``). Every array has
+the batch as its last axis. The model is known when a program is traced: recursions over
+bodies are unrolled, and products with its zeros are left out.
+
+Shape letters: N bodies, the world first; V degrees of freedom; B batch. A spatial
+vector (6, B) is a rotation and then a translation of the point at the tree's centre of
+mass; a rotation matrix is the list of its columns, (3, B) each.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from gasil_envs.physics.batching import add, materialize
+
+FREE, SLIDE, HINGE = (
+    int(mujoco.mjtJoint.mjJNT_FREE),
+    int(mujoco.mjtJoint.mjJNT_SLIDE),
+    int(mujoco.mjtJoint.mjJNT_HINGE),
+)
+_NEGLIGIBLE = 1e-9
+
+
+class Kinematics(NamedTuple):
+    """Positions in the world's frame, metres.
+
+    Attributes:
+      columns: rotation of each body.
+      xpos: (N, 3, B), origins of the bodies.
+      xipos: (N, 3, B), their centres of mass.
+      com: (3, B), centre of mass of the tree.
+      cinert: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass
+        times offset, mass.
+      cdof: (V, 6, B), motion of one unit of each velocity.
+    """
+
+    columns: list[list[jax.Array]]
+    xpos: jax.Array
+    xipos: jax.Array
+    com: jax.Array
+    cinert: jax.Array
+    cdof: jax.Array
+
+
+def unsupported(model: mujoco.MjModel) -> str | None:
+    """Return why these functions do not describe this model, or None if they do."""
+    if not np.isin(model.jnt_type, [FREE, SLIDE, HINGE]).all():
+        return "it has ball joints"
+    if np.unique(model.body_rootid[1:]).size > 1:
+        return "it has more than one kinematic tree"
+    if model.jnt_stiffness[model.jnt_type == FREE].any():
+        return "it has free joints with springs"
+    tendons = model.tendon_stiffness, model.tendon_damping, model.tendon_armature
+    if any(x.any() for x in tendons):
+        return "it has tendons with springs, damping or armature"
+    if model.nmocap or model.body_gravcomp.any():
+        return "it has mocap bodies or compensated gravity"
+    if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
+        return "it has wind or the ellipsoid model of fluids"
+    flags = mujoco.mjtDisableBit
+    if model.opt.disableflags & (
+        flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER | flags.mjDSBL_GRAVITY
+    ):
+        return "its springs, dampers or gravity are disabled"
+    return None
+
+
+def cross(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Cross product along the axis before the last: (..., 3, B)."""
+    a1, a2, a3 = (a[..., i, :] for i in range(3))
+    b1, b2, b3 = (b[..., i, :] for i in range(3))
+    return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-2)
+
+
+def rotate(columns: Sequence[jax.Array], vector: np.ndarray) -> jax.Array:
+    """Return a rotation matrix times a constant vector (3,): (3, B)."""
+    terms = [
+        float(x) * column
+        for x, column in zip(vector, columns, strict=True)
+        if abs(x) > _NEGLIGIBLE
+    ]
+    return add(terms) if terms else jnp.zeros_like(columns[0])
+
+
+def _matrix(quaternion: np.ndarray) -> np.ndarray:
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    return matrix.reshape(3, 3)
+
+
+def _turn(
+    columns: Sequence[jax.Array], axis: np.ndarray, cosine: jax.Array, sine: jax.Array
+) -> list[jax.Array]:
+    """Return a rotation matrix times a rotation about a constant unit axis."""
+    along = np.outer(axis, axis)
+    skew = np.cross(np.eye(3), axis)  # skew @ x is the cross product axis x x.
+    parts = ((along, 1.0), (np.eye(3) - along, cosine), (skew, sine))
+
+    def column(j: int) -> jax.Array:
+        terms = []
+        for k in range(3):
+            factors = [
+                float(matrix[k, j]) * x
+                for matrix, x in parts
+                if abs(matrix[k, j]) > _NEGLIGIBLE
+            ]
+            if factors:
+                terms.append(sum(factors) * columns[k])
+        return add(terms)
+
+    return [column(j) for j in range(3)]
+
+
+def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
+    """Return the rotation of a quaternion of any length, (4, B)."""
+    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2, axis=0))
+    return [
+        jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
+        jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
+        jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
+    ]
+
+
+def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
+    """Compute positions, inertia and axes of motion at qpos (nq, B)."""
+    size = qpos.shape[1:]
+    zero = jnp.zeros((3, *size), jnp.float32)
+    world = [jnp.broadcast_to(x[:, None], zero.shape) for x in np.eye(3, dtype="f")]
+    angle = qpos - model.qpos0.astype(np.float32)[:, None]
+    cosine, sine = materialize((jnp.cos(angle), jnp.sin(angle)))
+    xpos, columns = [zero], [world]
+    # For each degree of freedom: rotation axis, point on it, translation.
+    dofs: list[tuple[jax.Array, jax.Array, jax.Array]] = []
+    for body in range(1, model.nbody):
+        parent = model.body_parentid[body]
+        turned = columns[parent]
+        position = xpos[parent] + rotate(turned, model.body_pos[body])
+        if not np.allclose(model.body_quat[body], [1, 0, 0, 0]):
+            local = _matrix(model.body_quat[body])
+            turned = [rotate(turned, local[:, j]) for j in range(3)]
+        first = model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
+            at = model.jnt_qposadr[joint]
+            if model.jnt_type[joint] == FREE:
+                position = qpos[at : at + 3]
+                turned = materialize(_free_rotation(qpos[at + 3 : at + 7]))
+                dofs += [(zero, zero, x) for x in world]
+                dofs += [(x, position, zero) for x in turned]
+                continue
+            axis = rotate(turned, model.jnt_axis[joint])
+            if model.jnt_type[joint] == SLIDE:
+                dofs.append((zero, zero, axis))
+                position = position + axis * angle[at]
+                continue
+            anchor = position + rotate(turned, model.jnt_pos[joint])
+            turned = _turn(turned, model.jnt_axis[joint], cosine[at], sine[at])
+            turned = materialize(turned)
+            position = anchor - rotate(turned, model.jnt_pos[joint])
+            dofs.append((axis, anchor, zero))
+        xpos.append(materialize(position))
+        columns.append(turned)
+    places = zip(xpos, columns, model.body_ipos, strict=True)
+    xipos = jnp.stack([x + rotate(turned, local) for x, turned, local in places])
+    mass = model.body_mass.astype(np.float32)[:, None]
+    com = add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
+    xipos, com = materialize((xipos, com))
+    cinert = _inertia(model, columns, xipos - com, mass)
+    axis, anchor, translation = map(jnp.stack, zip(*dofs, strict=True))
+    translation = translation + cross(axis, com - anchor)
+    cdof = jnp.concatenate([axis, translation], axis=1)
+    cinert, cdof = materialize((cinert, cdof))
+    return Kinematics(columns, jnp.stack(xpos), xipos, com, cinert, cdof)
+
+
+def _inertia(
+    model: mujoco.MjModel,
+    columns: list[list[jax.Array]],
+    offset: jax.Array,
+    mass: np.ndarray,
+) -> jax.Array:
+    """Return the bodies' inertia about a point `offset` away: (N, 10, B)."""
+    rotation = materialize(jnp.stack([jnp.stack(x) for x in columns]))  # (N, k, i, B)
+    local = np.stack(
+        [
+            _matrix(quaternion) * inertia @ _matrix(quaternion).T
+            for quaternion, inertia in zip(
+                model.body_iquat, model.body_inertia, strict=True
+            )
+        ]
+    ).astype(np.float32)[..., None, None]
+    # local is symmetric: row j of (local @ rotation') is the sum over its columns.
+    half = add(local[:, :, k] * rotation[:, k, None] for k in range(3))  # (N, k, i, B)
+    half = materialize(half)
+    entry = lambda i, j: add(half[:, k, i] * rotation[:, k, j] for k in range(3))
+    x, y, z = (offset[:, i] for i in range(3))
+    return jnp.stack(
+        [
+            entry(0, 0) + mass * (y * y + z * z),
+            entry(1, 1) + mass * (x * x + z * z),
+            entry(2, 2) + mass * (x * x + y * y),
+            entry(0, 1) - mass * x * y,
+            entry(0, 2) - mass * x * z,
+            entry(1, 2) - mass * y * z,
+            mass * x,
+            mass * y,
+            mass * z,
+            jnp.broadcast_to(mass, x.shape),
+        ],
+        axis=1,
+    )
+
+
+def _momentum(inertia: jax.Array, motion: jax.Array) -> jax.Array:
+    """Inertia times motion: (..., 10, B), (..., 6, B) -> (..., 6, B)."""
+    xx, yy, zz, xy, xz, yz, *_, mass = (inertia[..., i, :] for i in range(10))
+    a, b, c = (motion[..., i, :] for i in range(3))
+    offset, rotation, translation = (
+        inertia[..., 6:9, :],
+        motion[..., :3, :],
+        motion[..., 3:, :],
+    )
+    turned = jnp.stack(
+        [xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c],
+        axis=-2,
+    )
+    return jnp.concatenate(
+        [
+            turned + cross(offset, translation),
+            mass[..., None, :] * translation - cross(offset, rotation),
+        ],
+        axis=-2,
+    )
+
+
+def _cross_motion(a: jax.Array, b: jax.Array) -> jax.Array:
+    """Change of motion b that moves with motion a: (..., 6, B)."""
+    turn = a[..., :3, :]
+    return jnp.concatenate(
+        [
+            cross(turn, b[..., :3, :]),
+            cross(a[..., 3:, :], b[..., :3, :]) + cross(turn, b[..., 3:, :]),
+        ],
+        axis=-2,
+    )
+
+
+def _cross_force(a: jax.Array, f: jax.Array) -> jax.Array:
+    """Change of force f that moves with motion a: (..., 6, B)."""
+    turn = a[..., :3, :]
+    return jnp.concatenate(
+        [
+            cross(turn, f[..., :3, :]) + cross(a[..., 3:, :], f[..., 3:, :]),
+            cross(turn, f[..., 3:, :]),
+        ],
+        axis=-2,
+    )
+
+
+def _sum_down(model: mujoco.MjModel, of_dof: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Sum from the root to each degree of freedom, without it, and to each body.
+
+    The three rotations of a free joint are one step. (V, 6, B) -> (V, 6, B), (N, 6, B).
+    """
+    before, to_body = [], [jnp.zeros_like(of_dof[0])]
+    for body in range(1, model.nbody):
+        total = to_body[model.body_parentid[body]]
+        first = model.body_jntadr[body]
+        for joint in range(first, first + model.body_jntnum[body]):
+            dof = model.jnt_dofadr[joint]
+            for width in (3, 3) if model.jnt_type[joint] == FREE else (1,):
+                before += [total] * width
+                total = add([total, *of_dof[dof : dof + width]])
+                dof += width
+        to_body.append(total)
+    return jnp.stack(before), jnp.stack(to_body)
+
+
+def _sum_up(model: mujoco.MjModel, of_body: jax.Array) -> list[jax.Array]:
+    """Sum over each body's subtree: (N, K, B) -> N times (K, B)."""
+    total = list(of_body)
+    for body in range(model.nbody - 1, 0, -1):
+        parent = model.body_parentid[body]
+        total[parent] = total[parent] + total[body]
+    return total
+
+
+class Smooth(NamedTuple):
+    """The dynamics without constraints.
+
+    Attributes:
+      inertia: (V, V, B), the joint-space inertia.
+      force: (V, B), passive forces less bias forces.
+      cvel: (N, 6, B), velocity of each body.
+    """
+
+    inertia: jax.Array
+    force: jax.Array
+    cvel: jax.Array
+
+
+def velocity(model: mujoco.MjModel, cdof: jax.Array, qvel: jax.Array) -> jax.Array:
+    """Return the velocity of each body, (N, 6, B)."""
+    return _sum_down(model, materialize(cdof * qvel[:, None]))[1]
+
+
+def smooth(
+    model: mujoco.MjModel, at: Kinematics, qpos: jax.Array, qvel: jax.Array
+) -> Smooth:
+    """Compute inertia and forces at qpos (nq, B) and qvel (V, B)."""
+    cdof, cinert = at.cdof, at.cinert
+    before, cvel = _sum_down(model, materialize(cdof * qvel[:, None]))
+    before, cvel = materialize((before, cvel))
+    change = materialize(_cross_motion(before, cdof) * qvel[:, None])
+    gravity = np.concatenate([np.zeros(3), model.opt.gravity]).astype(np.float32)
+    acceleration = _sum_down(model, change)[1] - gravity[:, None]
+    momentum = materialize(_momentum(cinert, cvel))
+    of_body = _momentum(cinert, materialize(acceleration))
+    of_body = of_body + _cross_force(cvel, momentum)
+    if model.opt.density > 0 or model.opt.viscosity > 0:
+        of_body = of_body - _drag(model, at, cvel)
+    in_subtree = _sum_up(model, materialize(jnp.concatenate([cinert, of_body], axis=1)))
+    moved = materialize(jnp.stack([in_subtree[i] for i in model.dof_bodyid]))
+    bias = jnp.sum(cdof * moved[:, 10:], axis=1)
+    passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
+    hinge = model.jnt_type != FREE
+    if model.jnt_stiffness.any():
+        index = model.jnt_qposadr[hinge]
+        stretch = qpos[index] - model.qpos_spring[index].astype(np.float32)[:, None]
+        stiffness = np.zeros((model.nv, hinge.sum()), np.float32)
+        stiffness[model.jnt_dofadr[hinge], np.arange(hinge.sum())] = (
+            model.jnt_stiffness[hinge]
+        )
+        passive = passive - stiffness @ stretch
+    push = materialize(_momentum(moved[:, :10], cdof))
+    return Smooth(_joint_inertia(model, push, cdof), passive - bias, cvel)
+
+
+def _joint_inertia(
+    model: mujoco.MjModel, push: jax.Array, cdof: jax.Array
+) -> jax.Array:
+    """Return the inertia (V, V, B), from the momentum of each unit motion (V, 6, B)."""
+    above = np.zeros((model.nv, model.nv, 1), bool)
+    for dof in range(model.nv):
+        ancestor = model.dof_parentid[dof]
+        while ancestor >= 0:
+            above[dof, ancestor] = True
+            ancestor = model.dof_parentid[ancestor]
+    product = add(push[:, None, k] * cdof[None, :, k] for k in range(6))
+    product = materialize(product)
+    own = np.eye(model.nv, dtype=bool)[..., None]
+    armature = np.diag(model.dof_armature).astype(np.float32)[..., None]
+    one_sided = jnp.where(above | own, product, 0.0) + armature
+    return one_sided + jnp.where(
+        np.swapaxes(above, 0, 1), jnp.swapaxes(product, 0, 1), 0.0
+    )
+
+
+def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
+    """Return the force of a medium on each body, taken as a box, (N, 6, B)."""
+    mass = np.maximum(model.body_mass, 1e-12)[:, None]
+    total = model.body_inertia.sum(axis=1, keepdims=True)
+    square = 6.0 * np.maximum(total - 2 * model.body_inertia, 1e-12) / mass
+    box = np.sqrt(square) * (model.body_mass[:, None] > 0)
+    diameter = box.mean(axis=1, keepdims=True)
+    area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, 1e-12)
+    fourth = box**4
+    turning = box * (fourth.sum(axis=1, keepdims=True) - fourth)
+    rho, mu = model.opt.density, model.opt.viscosity
+    linear = np.stack([np.pi * diameter**3 * mu, 3 * np.pi * diameter * mu])
+    square = np.stack([rho * turning / 64, rho * area / 2])
+    # The box's axes, (N, axis, 3, B).
+    axes = jnp.stack(
+        [
+            jnp.stack([rotate(columns, x) for x in _matrix(quaternion).T])
+            for columns, quaternion in zip(at.columns, model.body_iquat, strict=True)
+        ]
+    )
+    arm = at.xipos - at.com
+    turn = cvel[:, :3]
+    local = jnp.stack([turn, cvel[:, 3:] - cross(arm, turn)])  # (2, N, 3, B)
+    local = jnp.sum(axes * local[:, :, None], axis=-2)
+    factor = lambda x: x.astype(np.float32)[..., None]
+    against = -(factor(linear) + factor(square) * jnp.abs(local)) * local
+    torque, force = jnp.sum(axes * against[:, :, :, None], axis=2)
+    return jnp.concatenate([torque + cross(arm, force), force], axis=1)
