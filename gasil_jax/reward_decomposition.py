@@ -46,7 +46,6 @@ class Decomposition(struct.PyTreeNode):
       network: g, a learner of `networks.StepReward`.
       rates: moments of payout / length of all windows so far; a normalizer with
         obs = 1.
-      next_observation: float32 (N, H, obs), beside the history's observations.
       reward: float32 (N, H), the decomposed rewards of the history's steps.
       open_reward: float32 (N,), sum of the decomposed rewards of the running window.
       open_steps: float32 (N,), number of steps of the running window.
@@ -56,7 +55,6 @@ class Decomposition(struct.PyTreeNode):
 
     network: Learner
     rates: Normalizer
-    next_observation: jax.Array
     reward: jax.Array
     open_reward: jax.Array
     open_steps: jax.Array
@@ -101,7 +99,6 @@ def init(
     return Decomposition(
         network=learner.init(params, learner.adam()),
         rates=normalization.init(1),
-        next_observation=jnp.zeros((num_envs, steps, observation_size), jnp.float32),
         reward=jnp.zeros((num_envs, steps), jnp.float32),
         open_reward=jnp.zeros(num_envs, jnp.float32),
         open_steps=jnp.zeros(num_envs, jnp.float32),
@@ -223,7 +220,7 @@ def decompose(
     Args:
       decomposition: the state before the batch.
       batch: (T, N, ...), with the environment's rewards.
-      history: the history after `record` of the batch.
+      history: the history after `record` of the batch; it keeps next observations.
       normalizer: of observations.
       key: random key; consumed.
       config: number and size of the gradient steps.
@@ -268,15 +265,11 @@ def decompose(
     )
     num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
     cursor = (history.cursor - num_steps) % ring
-    next_observation = good_trajectories.write(
-        decomposition.next_observation, batch.next_observation, cursor
-    )
     recorded_steps = jnp.minimum(decomposition.recorded_steps + num_steps, ring)
     trained = _train(
         decomposition.network,
         history,
         windows(history, recorded_steps),
-        next_observation,
         rates,
         key,
         predict=predict,
@@ -293,7 +286,6 @@ def decompose(
     decomposition = decomposition.replace(
         network=trained,
         rates=rates,
-        next_observation=next_observation,
         reward=good_trajectories.write(decomposition.reward, reward, cursor),
         open_reward=running[0],
         open_steps=running[1],
@@ -306,7 +298,6 @@ def _train(
     network: Learner,
     history: History,
     complete: Windows,
-    next_observation: jax.Array,
     rates: Normalizer,
     key: jax.Array,
     *,
@@ -318,6 +309,8 @@ def _train(
     num_windows = config.decomposition_minibatch_size
     num_rows = config.decomposition_window_steps
     steps = complete.ends.shape[1]
+    assert history.next_observation is not None  # Ensured by `train.init`.
+    rings = (history.observation, history.action, history.next_observation)
     mean, scale = normalization.moments(rates)
     counts = jnp.cumsum(complete.ends.ravel())
 
@@ -333,10 +326,7 @@ def _train(
         length = complete.length[env, end]
         offset, weight = represent(step_key, length, num_rows)
         position = (history.cursor + end[:, None] - offset) % steps
-        rows = tuple(
-            ring[env[:, None], position]
-            for ring in (history.observation, history.action, next_observation)
-        )
+        rows = tuple(ring[env[:, None], position] for ring in rings)
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
         gradient = jax.grad(objective)(network.params, rows, weight, target)
         return learner.descend(network, gradient, learner.adam(), step_size), None

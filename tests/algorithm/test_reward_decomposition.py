@@ -72,6 +72,7 @@ def decompose_once():
             batch.action,
             jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
             batch.ended,
+            batch.next_observation,
         )
         decomposition, batch, metrics = reward_decomposition.decompose(
             decomposition,
@@ -89,7 +90,9 @@ def decompose_once():
 
 
 def decompose_all(batches):
-    history = good_trajectories.init_history(NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT)
+    history = good_trajectories.init_history(
+        NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True
+    )
     decomposition = reward_decomposition.init(jax.random.key(0), CONFIG, history, ACT)
     for i, batch in enumerate(batches):
         decomposition, history, reward, metrics = decompose_once()(
