@@ -18,6 +18,7 @@ the network has learned anything the payout is spread evenly, and where every st
 the reward is the environment's own.
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import chex
@@ -34,6 +35,9 @@ from gasil_jax.normalization import Normalizer
 from gasil_jax.rollout import Rollout
 
 Metrics = dict[str, jax.Array]
+
+# A part of a minibatch is 2 MB at most: on a CPU it then stays in the cache.
+_PART_NUMBERS = 2**19
 
 # Shape letters: N environments, H steps of history per environment, T steps of a batch
 # per environment, W windows of a minibatch, S steps that represent a window.
@@ -314,9 +318,14 @@ def _train(
     mean, scale = normalization.moments(rates)
     counts = jnp.cumsum(complete.ends.ravel())
 
-    def objective(params: Any, rows: Any, weight: jax.Array, target: jax.Array) -> Any:
-        output = predict(params, *rows).reshape(weight.shape)
-        predicted = jnp.sum(weight * output, axis=1)
+    parts = num_parts(num_windows, num_rows * sum(ring.shape[-1] for ring in rings))
+
+    def objective(params: Any, drawn: Any) -> jax.Array:
+        env, position, weight, target = drawn
+        # One axis of rows: a CPU takes a third longer with one of windows and of steps.
+        index = (jnp.repeat(env, num_rows), position.ravel())
+        output = predict(params, *(ring[index] for ring in rings))
+        predicted = jnp.sum(weight * output.reshape(weight.shape), axis=1)
         return jnp.mean((predicted - target) ** 2)
 
     def step(network: Learner, key: jax.Array) -> Any:
@@ -327,11 +336,9 @@ def _train(
         length = complete.length[env, end]
         offset, weight = represent(step_key, length, num_rows)
         position = (history.cursor + end[:, None] - offset) % steps
-        # One axis of rows: a CPU takes a third longer with one of windows and of steps.
-        index = (jnp.repeat(env, num_rows), position.ravel())
-        rows = tuple(ring[index] for ring in rings)
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
-        gradient = jax.grad(objective)(network.params, rows, weight, target)
+        drawn = (env, position, weight, target)
+        gradient = mean_gradient(jax.grad(objective), network.params, drawn, parts)
         return learner.descend(network, gradient, learner.adam(), step_size), None
 
     trained, _ = jax.lax.scan(
@@ -340,6 +347,41 @@ def _train(
     return jax.tree.map(
         lambda new, old: jnp.where(counts[-1] > 0, new, old), trained, network
     )
+
+
+def num_parts(num_windows: int, window_numbers: int) -> int:
+    """Return in how many equal parts a minibatch is read, so that each fits a cache.
+
+    Args:
+      num_windows: W, of which the result is a divisor.
+      window_numbers: how many numbers the network reads of a window.
+    """
+    divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
+    fits = lambda parts: num_windows // parts * window_numbers <= _PART_NUMBERS
+    return next((parts for parts in divisors if fits(parts)), num_windows)
+
+
+def mean_gradient(
+    gradient: Callable[[Any, Any], Any], params: Any, minibatch: Any, parts: int
+) -> Any:
+    """Return the gradient of a mean over a minibatch, from one part after another.
+
+    Args:
+      gradient: (params, minibatch) -> gradient of the mean.
+      params: a pytree.
+      minibatch: a pytree, (W, ...) each leaf.
+      parts: a divisor of W.
+    """
+    if parts == 1:
+        return gradient(params, minibatch)
+    divided = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), minibatch)
+    add = lambda total, part: jax.tree.map(jnp.add, total, gradient(params, part))
+    total, _ = jax.lax.scan(
+        lambda total, part: (add(total, part), None),
+        jax.tree.map(jnp.zeros_like, params),
+        divided,
+    )
+    return jax.tree.map(lambda x: x / parts, total)
 
 
 def represent(
