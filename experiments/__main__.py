@@ -11,7 +11,14 @@ from typing import Annotated, Any
 
 import tyro
 
-from experiments import benchmark, engine, point_mass_layouts, point_mass_moments, store
+from experiments import (
+    benchmark,
+    engine,
+    point_mass_layouts,
+    point_mass_moments,
+    profile,
+    store,
+)
 from experiments.figures import FIGURES, Figure
 from experiments.report import Page
 from experiments.store import RESULTS, Store
@@ -147,6 +154,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], None]]] = {
     "report": (ReportOptions, _report),
     "merge": (MergeOptions, _merge),
     "benchmark": (benchmark.Options, benchmark.run),
+    "profile": (profile.Options, profile.run),
     "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
     "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
 }
