@@ -17,6 +17,7 @@ from experiments import (
     matrix,
     point_mass_layouts,
     point_mass_moments,
+    profile,
     store,
     zoo,
 )
@@ -176,6 +177,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "coverage": (CoverageOptions, _coverage),
     "merge": (MergeOptions, _merge),
     "benchmark": (benchmark.Options, benchmark.run),
+    "profile": (profile.Options, profile.run),
     "zoo": (zoo.Options, zoo.run),
     "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
     "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),

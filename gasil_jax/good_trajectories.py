@@ -52,6 +52,7 @@ class History(struct.PyTreeNode):
       reward: float32 (N, H), the environment's own reward.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
+      next_observation: float32 (N, H, obs), after the action; None if it is not kept.
     """
 
     observation: jax.Array
@@ -59,6 +60,7 @@ class History(struct.PyTreeNode):
     reward: jax.Array
     ended: jax.Array
     cursor: jax.Array
+    next_observation: jax.Array | None = None
 
     def in_time(self, ring: jax.Array) -> jax.Array:
         """Return a ring (N, H, ...) of this history in time order, oldest first."""
@@ -100,20 +102,25 @@ def init_history(
     max_episode_steps: int,
     observation_size: int,
     action_size: int,
+    keep_next: bool = False,
 ) -> History:
     """Return an empty history, long enough for every episode that ends in a batch.
 
     Its length H is a multiple of `num_steps`, so that a batch is written in one piece.
+    With `keep_next` it also keeps the observations after each action.
     """
     batches = -(-(max_episode_steps + num_steps) // num_steps)
     length = batches * num_steps
+    # Each field needs its own array: a shared one could not be donated.
+    observations = lambda: jnp.zeros((num_envs, length, observation_size), jnp.float32)
     return History(
-        observation=jnp.zeros((num_envs, length, observation_size), jnp.float32),
+        observation=observations(),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
         reward=jnp.zeros((num_envs, length), jnp.float32),
         # No episode reaches back beyond the first step.
         ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
+        next_observation=observations() if keep_next else None,
     )
 
 
@@ -123,6 +130,7 @@ def record(
     action: jax.Array,
     reward: jax.Array,
     ended: jax.Array,
+    next_observation: jax.Array | None = None,
 ) -> History:
     """Return the history with a batch written over the oldest steps.
 
@@ -132,16 +140,21 @@ def record(
       action: float32 (time, N, action).
       reward: float32 (time, N).
       ended: bool (time, N).
+      next_observation: float32 (time, N, obs), needed if the history keeps it.
     """
     chex.assert_equal_shape_prefix([observation, action, reward, ended], 2)
     num_steps = observation.shape[0]
-    cursor = history.cursor
+    cursor, next_ring = history.cursor, history.next_observation
+    if next_ring is not None:
+        assert next_observation is not None, "this history keeps next observations"
+        next_ring = write(next_ring, next_observation, cursor)
     return History(
         observation=write(history.observation, observation, cursor),
         action=write(history.action, action, cursor),
         reward=write(history.reward, reward, cursor),
         ended=write(history.ended, ended, cursor),
         cursor=(cursor + num_steps) % history.observation.shape[1],
+        next_observation=next_ring,
     )
 
 

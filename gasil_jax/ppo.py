@@ -13,6 +13,7 @@ from gasil_jax import learner
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.learner import Learner
 from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
+from gasil_jax.permutation import permutation
 
 
 class ActorCritic(struct.PyTreeNode):
@@ -278,7 +279,7 @@ def update(
         return descend(actor_critic, gradient, hyperparameters), metrics
 
     def epoch(actor_critic: ActorCritic, key: jax.Array) -> Any:
-        order = jax.random.permutation(key, config.batch_steps)
+        order = permutation(key, config.batch_steps)
         order = order.reshape(config.num_minibatches, config.minibatch_size)
         return jax.lax.scan(minibatch_step, actor_critic, order)
 

@@ -93,7 +93,11 @@ def init(
     sizes = (env.observation_size, env.action_size)
     episode_steps = max_episode_steps(env, config)
     history = good_trajectories.init_history(
-        config.num_envs, config.num_steps, episode_steps, *sizes
+        config.num_envs,
+        config.num_steps,
+        episode_steps,
+        *sizes,
+        keep_next=config.decompose_rewards,
     )
     return TrainState(
         actor_critic=_init_actor_critic(
@@ -284,6 +288,7 @@ def remember(
         # No return of an episode with a faulty step, or of one cut short, is one.
         jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
         batch.ended,
+        batch.next_observation,
     )
     episodes = good_trajectories.ended_episodes(
         history, batch.ended, batch.discounted_return, batch.episode_length

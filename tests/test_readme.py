@@ -45,6 +45,7 @@ NOT_RUN = {
     "python -m pip install": "it changes the environment; .ci/run does it",
     "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
+    "python -m experiments profile": "it measures for minutes",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
     "and tests/test_ray.py train shards",
     "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",
@@ -72,7 +73,7 @@ OURS = [line for line in commands() if line.startswith("python -m gasil_jax")]
 FIGURES = [
     line
     for line in commands()
-    if line.startswith("python -m experiments") and "benchmark" not in line
+    if line.startswith("python -m experiments") and not line.startswith(tuple(NOT_RUN))
 ]
 
 

@@ -222,3 +222,18 @@ def test_limits_in_one_program_are_as_capacities():
                     getattr(limited, name)[i][filled], getattr(expected, name)[filled]
                 )
     assert [int(buffer.size) for buffer, _ in own] == [2, 5, CAPACITY]
+
+
+def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
+    history = good_trajectories.init_history(1, 2, 2, 1, 1, keep_next=True)
+    assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
+    for first in (0.0, 2.0, 4.0):
+        observation = first + jnp.arange(2.0)[:, None, None]
+        zeros = jnp.zeros((2, 1))
+        batch = (observation, zeros[..., None], zeros, zeros > 0)
+        history = good_trajectories.record(history, *batch, observation + 1)
+    assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
+    assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
+    history = good_trajectories.init_history(1, 2, 2, 1, 1)
+    history = good_trajectories.record(history, *batch, observation + 1)
+    assert history.next_observation is None

@@ -72,6 +72,7 @@ def decompose_once():
             batch.action,
             jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
             batch.ended,
+            batch.next_observation,
         )
         decomposition, batch, metrics = reward_decomposition.decompose(
             decomposition,
@@ -89,7 +90,9 @@ def decompose_once():
 
 
 def decompose_all(batches):
-    history = good_trajectories.init_history(NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT)
+    history = good_trajectories.init_history(
+        NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True
+    )
     decomposition = reward_decomposition.init(jax.random.key(0), CONFIG, history, ACT)
     for i, batch in enumerate(batches):
         decomposition, history, reward, metrics = decompose_once()(
@@ -274,3 +277,22 @@ def test_agents_and_ppo_see_decomposed_rewards_and_the_buffer_the_environments()
     assert np.all(metrics["skipped_updates"] == 0)
     assert jnp.nanmean(state.history.reward != 0.0) < 0.1
     assert state.good_trajectories.size > 0
+
+
+def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():
+    rng = np.random.default_rng(0)
+    rows, target = rng.normal(size=(12, 3)), rng.normal(size=12)
+    gradient = jax.grad(lambda w, drawn: jnp.mean((drawn[0] @ w - drawn[1]) ** 2))
+    of = lambda parts: reward_decomposition.mean_gradient(
+        gradient, jnp.ones(3), (rows, target), parts
+    )
+    for parts in (2, 3, 12):
+        np.testing.assert_allclose(of(parts), of(1), rtol=1e-5)
+
+
+def test_large_inputs_are_read_in_as_few_parts_as_fit():
+    num_parts = reward_decomposition.num_parts
+    assert num_parts(64, 32 * 40) == 1
+    assert num_parts(64, 32 * 713) == 4
+    assert num_parts(7, 2**18) == 7
+    assert num_parts(6, 2**30) == 6

@@ -1,0 +1,68 @@
+"""The profile's table, and the parts that operations belong to."""
+
+import jax
+import pytest
+
+from experiments import __main__ as experiments
+from experiments import profile
+
+
+@pytest.fixture
+def cache_settings():
+    name = "jax_compilation_cache_include_metadata_in_key"
+    before = getattr(jax.config, name)
+    yield
+    jax.config.update(name, before)
+
+
+def test_every_part_of_an_iteration_is_in_the_table(cache_settings, capsys):
+    toy = "--env point_mass --seeds 2 --iterations 1 --repeats 1"
+    assert experiments.main(["profile", *toy.split()]) == 0
+    title, *lines = capsys.readouterr().out.splitlines()
+    assert title.startswith("point_mass, ppo+gasil, 2 seeds")
+    rows = {line[:30].strip(): [float(x) for x in line[30:].split()] for line in lines}
+    for part in (*profile.PARTS, "host: metrics.csv"):
+        # There is no physics, and the preset leaves rewards as they are.
+        absent = part.startswith(("physics", "rewards", "agent's"))
+        assert part in rows or absent, part
+    *parts, total, whole = rows.values()
+    assert total[0] == pytest.approx(sum(time for time, _ in parts), abs=0.1)
+    assert total[1] == 1 and whole[0] > 0
+    # Little belongs to no part.
+    assert rows["the rest"][1] < 0.1
+
+
+def test_operations_belong_to_the_functions_that_they_were_written_in():
+    program = """HloModule toy
+FileNames
+1 "/somewhere/train.py"
+2 "/somewhere/ppo.py"
+
+FunctionNames
+1 "iterate"
+2 "update"
+
+FileLocations
+1 {file_name_id=1 function_name_id=1 line=1}
+2 {file_name_id=2 function_name_id=2 line=1}
+
+StackFrames
+1 {file_location_id=1 parent_frame_id=1}
+2 {file_location_id=2 parent_frame_id=2}
+
+%body (x: f32[]) -> f32[] {
+  %dot.1 = f32[2]{0} dot(%x, %x), metadata={op_name="dot" stack_frame_id=2}
+  ROOT %copy.1 = f32[2]{0} copy(%dot.1)
+}
+
+ENTRY %main (x: f32[]) -> f32[] {
+  %while.1 = f32[] while(%x), body=%body, metadata={op_name="while" stack_frame_id=2}
+  ROOT %add.1 = f32[] add(%x, %x), metadata={op_name="add" stack_frame_id=1}
+}
+"""
+    expected = {
+        "dot.1": "PPO: minibatches",
+        "copy.1": "PPO: minibatches",
+        "add.1": "the rest",
+    }
+    assert profile.operations(program) == expected
