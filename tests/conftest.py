@@ -41,6 +41,30 @@ _LONG = {
 }
 
 
+def _generate_code_quickly():
+    """Let XLA generate code without fusion emitters, unless it is to be optimized.
+
+    That takes a third of the time. JAX has no setting for it; without the function that
+    is wrapped here tests only take longer.
+    """
+    from jax._src import compiler
+
+    original = getattr(compiler, "get_compile_options", None)
+    if original is None:
+        return
+
+    def options(*arguments, env_options_overrides=None, **more):
+        overrides = dict(env_options_overrides or {})
+        if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") == "1":
+            overrides.setdefault("xla_cpu_use_fusion_emitters", "False")
+        return original(*arguments, env_options_overrides=overrides, **more)
+
+    compiler.get_compile_options = options
+
+
+_generate_code_quickly()
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Set how far programs are optimized, here and in the processes a test starts."""
