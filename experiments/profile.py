@@ -1,9 +1,9 @@
 """Time of each part of a training iteration: ``python -m experiments profile``.
 
 One iteration of the program that `gasil_jax.run` trains with is traced. XLA remembers
-the functions that each of its operations was written in, which say what part it belongs
-to. An operation's time is its median times its number, so that other processes hardly
-matter. Tracing makes tiny operations look longer, those of physics above all.
+the named scopes that each of its operations was written in, which say what part it
+belongs to. An operation's time is its median times its number, so that other processes
+hardly matter. Tracing makes tiny operations look longer, those of physics above all.
 
 All seeds are on one device. For the time of one core start it on one, ``taskset -c 0``.
 """
@@ -14,7 +14,7 @@ import pathlib
 import re
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Annotated, Any
 
 import jax
@@ -27,26 +27,26 @@ from gasil_jax import presets
 from gasil_jax.host import command_line, devices, metrics_files
 from gasil_jax.host.members import make_members
 
-#: Patterns of FILE.FUNCTION by part. An operation belongs to the first part of which a
-#: function has called it, however indirectly.
+#: Named scopes by part. An operation belongs to the first part whose scope it is in.
 PARTS: Mapping[str, str] = {
-    "physics: solver": r"newton\.solve",
-    "physics: constraint rows": r"constraints\.",
-    "physics: collision": r"collision\.",
-    "physics: smooth, integration": r"dynamics\.|tree\.|native\.",
-    "environments: starts": r"\w+\.\w+\.reset",
-    "environments: the rest": r"rollout\.collect\.<locals>\.step_one",
-    "policy": r"train\.sample_trajectories\.<locals>",
-    "rollout: the rest": r"train\.sample_trajectories",
-    "history and buffer": r"train\.remember",
-    "rewards": r"train\.learner_rewards",
-    "discriminator": r"adversarial\.update_and_score",
-    "advantages": r"train\.advantages",
-    "PPO: permutations": r"permutation\.permutation",
-    "PPO: minibatches": r"ppo\.update",
-    "agent's other updates": r"train\.update_policy|\w+\._update_and_reward",
-    "the rest": r"",
+    "physics: solver": "solver",
+    "physics: constraint rows": "constraint_rows",
+    "physics: collision": "collision",
+    "physics: smooth dynamics": "smooth_dynamics",
+    "physics: the rest": "physics",
+    "environments: starts": "reset",
+    "environments: the rest": "environment",
+    "policy": "policy",
+    "rollout: the rest": "rollout",
+    "history and buffer": "good_trajectories",
+    "rewards": "rewards",
+    "discriminator": "discriminator",
+    "advantages": "advantages",
+    "PPO: permutations": "permutation",
+    "PPO: minibatches": "ppo",
+    "agent's other updates": "update_policy",
 }
+_REST = "the rest"
 _CONTROL = ("while", "call", "conditional")
 
 
@@ -80,48 +80,24 @@ def operations(program: str) -> dict[str, str]:
 
     One that XLA added itself belongs to what most of its neighbours belong to.
     """
-    tables: dict[str, dict[str, str]] = collections.defaultdict(dict)
     blocks: list[dict[str, str | None]] = [{}]
-    table = ""
     for line in program.splitlines():
-        if re.fullmatch(r"FileNames|FunctionNames|FileLocations|StackFrames", line):
-            table = line
-        elif row := re.match(r"(\d+) (.*)", line):
-            tables[table][row[1]] = row[2].strip('"')
-        elif row := re.match(r"\s+(?:ROOT )?%?([\w.-]+) = .*?\s([\w-]+)\(", line):
-            frame = re.search(r"stack_frame_id=(\d+)", line)
+        if row := re.match(r"\s+(?:ROOT )?%?([\w.-]+) = .*?\s([\w-]+)\(", line):
+            scopes = re.search(r'op_name="([^"]*)"', line)
             if row[2] not in _CONTROL:
-                blocks[-1][row[1]] = frame and frame[1]
+                blocks[-1][row[1]] = scopes and scopes[1]
         elif line.endswith("{"):
             blocks.append({})
 
-    def number(name: str, text: str) -> str:
-        (digits,) = re.findall(rf"{name}=(\d+)", text)
-        return digits
-
-    # XLA 0.10 counts parents from 1, so that the first frame seems to be its own.
-    own = number("parent_frame_id", tables["StackFrames"].get("1", "parent_frame_id=0"))
-
-    def functions(frame: str) -> list[str]:
-        names = []
-        while frame in tables["StackFrames"]:
-            row = tables["StackFrames"][frame]
-            location = tables["FileLocations"][number("file_location_id", row)]
-            path = tables["FileNames"][number("file_name_id", location)]
-            name = tables["FunctionNames"][number("function_name_id", location)]
-            names.append(f"{pathlib.Path(path).stem}.{name}")
-            frame = str(int(number("parent_frame_id", row)) - int(own))
-        return names
-
-    def part(names: Sequence[str]) -> str:
-        matches = lambda pattern: any(re.match(pattern, name) for name in names)
-        return next((p for p, pattern in PARTS.items() if matches(pattern)), "the rest")
+    def part(scopes: str) -> str:
+        names = set(re.findall(r"\w+", scopes))
+        return next((x for x, scope in PARTS.items() if scope in names), _REST)
 
     parts: dict[str, str] = {}
     for block in blocks:
-        sure = {name: part(functions(frame)) for name, frame in block.items() if frame}
+        sure = {name: part(scopes) for name, scopes in block.items() if scopes}
         usual = collections.Counter(sure.values()).most_common(1)
-        parts |= {name: usual[0][0] if usual else "the rest" for name in block} | sure
+        parts |= {name: usual[0][0] if usual else _REST for name in block} | sure
     return parts
 
 
@@ -137,7 +113,7 @@ def trace(call: Any, program: str) -> dict[str, float]:
         for line in plane.lines:
             for event in line.events:
                 times[event.name].append(event.duration_ns)
-    totals = dict.fromkeys(PARTS, 0.0)
+    totals = dict.fromkeys((*PARTS, _REST), 0.0)
     for name, part in operations(program).items():
         if name in times:
             totals[part] += float(np.median(times[name])) * len(times[name]) * 1e-9

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 _MOST = 2**16
 
 
+@jax.named_scope("permutation")
 def permutation(key: jax.Array, size: int) -> jax.Array:
     """Return the numbers below `size` in random order, int32 (size,).
 

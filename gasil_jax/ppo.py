@@ -243,6 +243,7 @@ def descend_one(
     return learner.descend(network, gradient, transform, hyperparameters.learning_rate)
 
 
+@jax.named_scope("ppo")
 def update(
     actor_critic: ActorCritic,
     batch: Batch,

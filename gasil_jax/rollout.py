@@ -164,14 +164,17 @@ def collect(
     num_envs = environments.episode_length.shape[0]
     low, high = wrappers.action_range(env)
 
+    @jax.named_scope("environment")
     def step_one(state: Any, action: jax.Array, reset_key: jax.Array) -> Any:
         stepped = env.step(state, jnp.clip(action, low, high))
-        return stepped, env.reset(reset_key)
+        with jax.named_scope("reset"):
+            return stepped, env.reset(reset_key)
 
     def step(carry: EnvironmentStates, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
         observation = carry.state.obs
-        mean, log_std = policy(observation)
+        with jax.named_scope("policy"):
+            mean, log_std = policy(observation)
         noise = jax.random.normal(action_key, mean.shape, mean.dtype)
         action = mean + jnp.exp(log_std) * noise
         reset_keys = jax.random.split(reset_key, num_envs)

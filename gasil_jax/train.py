@@ -234,6 +234,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
 
 
+@jax.named_scope("rollout")
 def sample_trajectories(
     env: Any,
     config: Config,
@@ -270,6 +271,7 @@ def sample_trajectories(
     )
 
 
+@jax.named_scope("good_trajectories")
 def remember(
     config: Config, state: TrainState, batch: Rollout, hyperparameters: Hyperparameters
 ) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
@@ -320,6 +322,7 @@ class Rewards(NamedTuple):
     normalizer: reward_normalization.RewardNormalizer | None
 
 
+@jax.named_scope("rewards")
 def learner_rewards(
     env: Any,
     config: Config,
@@ -370,6 +373,7 @@ def learner_rewards(
     return Rewards(batch, history, scale, decomposition, normalizer), metrics
 
 
+@jax.named_scope("advantages")
 def advantages(
     actor_critic: ActorCritic,
     rewards: jax.Array,
@@ -419,6 +423,7 @@ def advantages(
     ), {"explained_variance": jnp.mean(explained), **metrics}
 
 
+@jax.named_scope("update_policy")
 def update_policy(
     agent: Imitation,
     actor_critic: ActorCritic,

@@ -256,6 +256,7 @@ def _train_discriminator(
     return choose(ready, trained, state), metrics
 
 
+@jax.named_scope("discriminator")
 def update_and_score(
     state: Learner, context: Context, key: jax.Array, source: Source = GOOD_TRAJECTORIES
 ) -> tuple[Learner, jax.Array, Metrics]:

@@ -32,37 +32,22 @@ def test_every_part_of_an_iteration_is_in_the_table(cache_settings, capsys):
     assert rows["the rest"][1] < 0.1
 
 
-def test_operations_belong_to_the_functions_that_they_were_written_in():
+def test_operations_belong_to_the_scopes_that_they_were_written_in():
     program = """HloModule toy
-FileNames
-1 "/somewhere/train.py"
-2 "/somewhere/ppo.py"
-
-FunctionNames
-1 "iterate"
-2 "update"
-
-FileLocations
-1 {file_name_id=1 function_name_id=1 line=1}
-2 {file_name_id=2 function_name_id=2 line=1}
-
-StackFrames
-1 {file_location_id=1 parent_frame_id=1}
-2 {file_location_id=2 parent_frame_id=2}
-
 %body (x: f32[]) -> f32[] {
-  %dot.1 = f32[2]{0} dot(%x, %x), metadata={op_name="dot" stack_frame_id=2}
+  %dot.1 = f32[2]{0} dot(%x, %x), metadata={op_name="jit(f)/vmap(ppo)/while/body/dot"}
   ROOT %copy.1 = f32[2]{0} copy(%dot.1)
 }
 
 ENTRY %main (x: f32[]) -> f32[] {
-  %while.1 = f32[] while(%x), body=%body, metadata={op_name="while" stack_frame_id=2}
-  ROOT %add.1 = f32[] add(%x, %x), metadata={op_name="add" stack_frame_id=1}
+  %while.1 = f32[] while(%x), body=%body, metadata={op_name="jit(f)/ppo/while"}
+  %sort.1 = f32[] sort(%x), metadata={op_name="jit(f)/ppo/permutation/sort"}
+  ROOT %add.1 = f32[] add(%x, %x), metadata={op_name="jit(f)/add"}
 }
 """
-    expected = {
+    assert profile.operations(program) == {
         "dot.1": "PPO: minibatches",
         "copy.1": "PPO: minibatches",
+        "sort.1": "PPO: permutations",
         "add.1": "the rest",
     }
-    assert profile.operations(program) == expected

@@ -107,6 +107,7 @@ class Segments(NamedTuple):
     half: jax.Array
 
 
+@jax.named_scope("collision")
 def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
     """Return the line of each geom; that of a sphere or a plane is a point."""
     middle, half = [], []
@@ -123,6 +124,7 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
     return Segments(*materialize((jnp.stack(middle), jnp.stack(half))))
 
 
+@jax.named_scope("collision")
 def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     """Return the contacts of a group."""
     parts = []

@@ -256,6 +256,7 @@ def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
     return 1.0 / jnp.maximum(resistance, mujoco.mjMINVAL)
 
 
+@jax.named_scope("constraint_rows")
 def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limits:
     """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
     joint = qpos[limits.qpos]
@@ -275,6 +276,7 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     return newton.Limits(*(jnp.concatenate([x, none])[index] for x in of_limit))
 
 
+@jax.named_scope("constraint_rows")
 def contact_rows(
     edges: tuple[tuple[int, ...], ...],
     contacts: Contacts,
@@ -311,6 +313,7 @@ def contact_rows(
     )
 
 
+@jax.named_scope("constraint_rows")
 def body_forces(
     edges: tuple[tuple[int, ...], ...],
     contacts: Contacts,
@@ -347,6 +350,7 @@ def num_in_play(contacts: Contacts) -> jax.Array:
     return jnp.sum(in_play, axis=0, dtype=jnp.int32)
 
 
+@jax.named_scope("constraint_rows")
 def gather(contacts: Contacts) -> Contacts:
     """Move the contacts in play into `MOST_IN_PLAY` slots.
 

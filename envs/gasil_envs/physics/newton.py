@@ -325,6 +325,7 @@ def _repeat(
     return jax.lax.while_loop(goes_on, body, (0, True, carry))[2]
 
 
+@jax.named_scope("solver")
 def solve_many(
     iterations: int, line_search: int, problem: Problem, for_speed: bool = True
 ) -> Solution:

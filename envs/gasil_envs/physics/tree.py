@@ -127,6 +127,7 @@ def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
     ]
 
 
+@jax.named_scope("smooth_dynamics")
 def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
     """Compute positions, inertia and axes of motion at qpos (nq, B)."""
     size = qpos.shape[1:]
@@ -309,6 +310,7 @@ def velocity(model: mujoco.MjModel, cdof: jax.Array, qvel: jax.Array) -> jax.Arr
     return _sum_down(model, materialize(cdof * qvel[:, None]))[1]
 
 
+@jax.named_scope("smooth_dynamics")
 def smooth(
     model: mujoco.MjModel, at: Kinematics, qpos: jax.Array, qvel: jax.Array
 ) -> Smooth:
