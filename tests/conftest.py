@@ -41,13 +41,22 @@ _LONG = {
 }
 
 
-def _generate_code_quickly():
-    """Let XLA generate code without fusion emitters, unless it is to be optimized.
+# Without fusion emitters XLA's CPU backend generates code in a third of the time.
+_WITHOUT_EMITTERS = "xla_cpu_use_fusion_emitters"
+_XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
 
-    That takes a third of the time. JAX has no setting for it; without the function that
-    is wrapped here tests only take longer.
+
+def _generate_code_quickly():
+    """Do without fusion emitters in this process, unless programs are optimized.
+
+    JAX has no setting for it; without the function that is wrapped here tests only take
+    longer.
     """
+    import jax
     from jax._src import compiler
+
+    # From now on XLA_FLAGS is only for the processes that a test starts.
+    jax.devices()
 
     original = getattr(compiler, "get_compile_options", None)
     if original is None:
@@ -56,7 +65,7 @@ def _generate_code_quickly():
     def options(*arguments, env_options_overrides=None, **more):
         overrides = dict(env_options_overrides or {})
         if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") == "1":
-            overrides.setdefault("xla_cpu_use_fusion_emitters", "False")
+            overrides.setdefault(_WITHOUT_EMITTERS, "False")
         return original(*arguments, env_options_overrides=overrides, **more)
 
     compiler.get_compile_options = options
@@ -73,6 +82,8 @@ def pytest_runtest_setup(item):
     plainly = item.module.__name__ not in _COMPILED_AS_FOR_USERS
     before = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(plainly))
+    flag = f" --{_WITHOUT_EMITTERS}=false" if plainly else ""
+    os.environ["XLA_FLAGS"] = f"{_XLA_FLAGS}{flag}".strip()
     if before != str(int(plainly)):
         jax.config.update("jax_disable_most_optimizations", plainly)
         # JAX keeps compiled programs whatever the setting, and they round otherwise.
