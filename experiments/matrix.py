@@ -15,7 +15,7 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from experiments.search import DELAY, TASKS, Point, Space, Stage, means
+from experiments.search import DELAY, TASKS, Point, Space, Stage, means, scores
 from experiments.store import ALGORITHM_VERSION, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.figures import statistics
@@ -134,10 +134,7 @@ class Cell:
 
         The result is None if the store lacks a run of the stage.
         """
-        runs = self.runs(stage)
-        if store.missing(itertools.chain(*runs)):
-            return None
-        return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+        return scores(self.runs(stage), store)
 
     def stages(self, store: Store) -> list[Stage]:
         """Return the drawn points and, if all their runs are stored, those beyond."""

@@ -552,8 +552,8 @@ def _draw(page: Page) -> matplotlib.figure.Figure:
     shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
     if count > 1 and len(shown[0][1]) > 4 and all(x[1] == shown[0][1] for x in shown):
         # So many names would hide the curves.
-        place: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
-        figure.legend(*shown[0], frameon=False, **place)
+        below: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
+        figure.legend(*shown[0], frameon=False, **below)
     else:
         for axes, (_, labels) in zip(grid.flat, shown, strict=False):
             if labels:

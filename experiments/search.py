@@ -115,6 +115,18 @@ class Stage(NamedTuple):
     seeds: range
 
 
+def scores(runs: Sequence[Sequence[Run]], store: Store) -> np.ndarray | None:
+    """Return the mean return over the last fifth of training, (points, seeds).
+
+    Args:
+      runs: the runs of each point.
+      store: where they are; the result is None if it lacks one of them.
+    """
+    if store.missing(itertools.chain(*runs)):
+        return None
+    return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+
+
 @dataclasses.dataclass(frozen=True)
 class Search:
     """A search for an agent's hyperparameters on a task.
@@ -174,10 +186,7 @@ class Search:
 
         The result is None if the store lacks a run of the stage.
         """
-        runs = self.runs(stage)
-        if store.missing(run for of_point in runs for run in of_point):
-            return None
-        return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+        return scores(self.runs(stage), store)
 
     def first(self, store: Store) -> Stage | None:
         """Return the first stage, or None if an earlier search must end first."""

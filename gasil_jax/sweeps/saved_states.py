@@ -209,8 +209,9 @@ def load_policies(
     """
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
         env, config, seeds, states = load(folder, which, point, seed)
-        states = jax.device_get(states)
-        weights = [policy.weights(member(states, i), env) for i in range(len(seeds))]
+        every = jax.device_get(policy.weights(states, env))
+        shared = {name: every.pop(name) for name in ("low", "high")}
+        weights = [member(every, i) | shared for i in range(len(seeds))]
         return Policies(env, train.max_episode_steps(env, config), seeds, weights)
     if point is not None or which != "last":
         raise InputError(f"run is {folder}: it has no points and no checkpoints")
