@@ -151,7 +151,7 @@ def _coverage(options: CoverageOptions) -> int:
     rows = matrix.coverage(Store(RESULTS / "runs"), curves)
     print("task               agent                   search    seeds")
     for x in rows:
-        task = f"{name_of(x.cell.env, x.cell.reward_delay):18} {x.cell.agent:20}"
+        task = f"{name_of(x.cell.env, x.cell.reward_delay):18} {x.name:20}"
         search = f"{x.searched} of {x.to_search}"
         print(f"{task} {search:>9} {f'{x.trained} of {x.to_train}':>8}")
     return int(not all(x.complete for x in rows))

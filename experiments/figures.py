@@ -12,6 +12,7 @@ The second is drawn over the delay with ``over=("reward_delay", "delay")``.
 """
 
 import dataclasses
+import functools
 import itertools
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -57,7 +58,8 @@ class Curve:
     total_steps: int = 1_000_000
 
     @property
-    def _search(self) -> Search | matrix.Cell | None:
+    def search(self) -> Search | matrix.Cell | None:
+        """The search whose choice it uses, if any."""
         task = (self.env, self.agent, self.reward_delay, self.obs_noise)
         return self.base(*task) if callable(self.base) else None
 
@@ -66,7 +68,7 @@ class Curve:
 
         It is None if the curve's search is not complete in the store `searched`.
         """
-        chosen = self._search.chosen(searched) if self._search else {}
+        chosen = self.search.chosen(searched) if self.search else {}
         return None if chosen is None else {**chosen, **self.changes}
 
     def runs(self, searched: Store) -> tuple[Run, ...]:
@@ -74,8 +76,8 @@ class Curve:
         if (point := self.point(searched)) is None:
             return ()
         config, version = Config(agent=self.agent), ALGORITHM_VERSION
-        if self._search:
-            config, version = self._search.config({}), self._search.version
+        if self.search:
+            config, version = self.search.config({}), self.search.version
         elif isinstance(self.base, str):
             config = presets.preset(self.env, self.agent, self.base, self.reward_delay)
         config = config.replace(**{"total_steps": self.total_steps, **point})
@@ -480,22 +482,37 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(
                 (env,),
-                matrix.AGENTS,
+                [Arm(name, cell.agent)],
                 (delay,),
-                base=matrix.Cell,
+                base=functools.partial(
+                    matrix.Cell, decompose_rewards=cell.decompose_rewards
+                ),
                 seeds=matrix.seeds(env, delay),
             )
             for delay, env in itertools.product((DELAY, 1), TASKS)
+            for name, cell in matrix.cells(env, delay).items()
         ),
         searches={
-            f"{name_of(env, delay)} {agent}": matrix.Cell(env, agent, delay)
-            for (env, delay), agent in itertools.product(matrix.CELLS, matrix.AGENTS)
+            f"{name_of(*task)} {name}": cell
+            for task in matrix.CELLS
+            for name, cell in matrix.cells(*task).items()
         },
     ),
     "single_setting": Figure(
         "All agents on delayed tasks, each with a single setting",
         "",
-        grid(TASKS, matrix.AGENTS, (DELAY,), panel="{env}", base=matrix.Single),
+        joined(
+            [
+                grid(TASKS, matrix.AGENTS, (DELAY,), panel="{env}", base=matrix.Single),
+                grid(
+                    TASKS,
+                    [Arm("ppo, decomposed", "ppo")],
+                    (DELAY,),
+                    panel="{env}",
+                    base=functools.partial(matrix.Single, decompose_rewards=True),
+                ),
+            ]
+        ),
         favourite=_ADAPTIVE,
     ),
     "adaptive_ablation": Figure(

@@ -21,7 +21,7 @@ from gasil_jax.config import Config
 from gasil_jax.figures import statistics
 
 #: Points of each agent's search; their seeds.
-_POINTS, _SEEDS = 18, range(1000, 1002)
+_POINTS, _SEEDS = 12, range(1000, 1002)
 #: Every agent's hyperparameters, and those of one or two.
 _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
@@ -64,8 +64,8 @@ _BEYOND: Mapping[str, tuple[Any, Any]] = {
     "buffer_steps": (500, 20_000),
     "imitation_weight": (0.15, None),
 }
-#: What an agent has besides, where rewards are delayed.
-_DELAYED = {"ppo+gasil-adaptive": {"decompose_rewards": True}}
+#: The agents that decompose rewards where these are delayed.
+_DECOMPOSED = ("ppo+gasil-adaptive",)
 
 
 def draw(agent: str) -> tuple[Point, ...]:
@@ -103,24 +103,28 @@ class Cell:
       reward_delay: the environment's reward delay.
       obs_noise: the environment's observation noise; figures with noise use what was
         chosen without.
+      decompose_rewards: decompose rewards where they are delayed, even if the agent
+        does not by itself.
     """
 
     env: str
     agent: str
     reward_delay: int = 1
     obs_noise: float = 0.0
+    decompose_rewards: bool = False
     #: The version of the algorithm that its runs are of.
     version: ClassVar[int] = ALGORITHM_VERSION
 
     def config(self, point: Point) -> Config:
         """Return a point's config."""
-        delayed = _DELAYED.get(self.agent, {}) if self.reward_delay > 1 else {}
+        decompose = self.decompose_rewards or self.agent in _DECOMPOSED
         return Config(
             agent=self.agent,
             total_steps=1_000_000,
             num_envs=32,
             normalize_rewards=True,
-        ).replace(**{**delayed, **point})
+            decompose_rewards=decompose and self.reward_delay > 1,
+        ).replace(**point)
 
     def runs(self, stage: Stage) -> list[list[Run]]:
         """Return the runs of a stage, a list for each point."""
@@ -167,6 +171,19 @@ class Cell:
 CELLS = tuple(itertools.product(TASKS, (1, DELAY)))
 
 
+def cells(env: str, reward_delay: int) -> dict[str, Cell]:
+    """Return the searches on a task by the names of their curves.
+
+    Beside the agents there is PPO with decomposed rewards: what it shares with
+    `ppo+gasil-adaptive` is no merit of imitation.
+    """
+    searches = {agent: Cell(env, agent, reward_delay) for agent in AGENTS}
+    if reward_delay > 1:
+        decomposed = Cell(env, "ppo", reward_delay, decompose_rewards=True)
+        searches["ppo, decomposed"] = decomposed
+    return searches
+
+
 @dataclasses.dataclass(frozen=True)
 class Single(Cell):
     """The search of one agent for one point for all tasks, dense and delayed."""
@@ -179,7 +196,7 @@ class Single(Cell):
         """
         ranks = []
         for env, delay in CELLS:
-            cell = Cell(env, self.agent, delay)
+            cell = dataclasses.replace(self, env=env, reward_delay=delay)
             scores = cell.scores(Stage(draw(self.agent), _SEEDS), store)
             if scores is None:
                 return None
@@ -211,12 +228,13 @@ def importance(agent: str, store: Store) -> dict[str, float]:
 
 
 class Coverage(NamedTuple):
-    """How many runs of an agent on a task are stored and planned.
+    """How many runs of a curve on a task are stored and planned.
 
     A search that is incomplete has a plan of its drawn points alone.
     """
 
     cell: Cell
+    name: str
     searched: int
     to_search: int
     trained: int
@@ -237,13 +255,13 @@ def coverage(store: Store, curves: Sequence[Any]) -> list[Coverage]:
     """
     stored = lambda runs: sum(run in store for run in runs)
     rows = []
-    for (env, delay), agent in itertools.product(CELLS, AGENTS):
-        cell = Cell(env, agent, delay)
+    searches = itertools.chain(*(cells(*task).items() for task in CELLS))
+    for name, cell in searches:
         points = [runs for stage in cell.stages(store) for runs in cell.runs(stage)]
         search = list(itertools.chain(*points))
-        task = (env, agent, delay)
-        mine = [x for x in curves if (x.env, x.agent, x.reward_delay) == task]
+        mine = [curve for curve in curves if curve.search == cell]
         trained = sum(stored(curve.runs(store)) for curve in mine)
         planned = sum(curve.seeds for curve in mine)
-        rows.append(Coverage(cell, stored(search), len(search), trained, planned))
+        of = (stored(search), len(search), trained, planned)
+        rows.append(Coverage(cell, name, *of))
     return rows

@@ -93,7 +93,8 @@ def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
     fill(store, cell, first, range(len(first.points)))
     curves = [curve for *_, curve in FIGURES["matrix"].curves()]
     rows = {x.cell: x for x in matrix.coverage(store, curves)}
-    assert len(rows) == len(matrix.CELLS) * len(AGENTS)
+    # Where rewards are delayed, there is PPO with decomposed rewards too.
+    assert len(rows) == len(matrix.CELLS) * len(AGENTS) + len(matrix.TASKS)
     mine, other = rows[cell], rows[Cell("hopper", "ppo", 1)]
     assert mine.searched == 2 * len(first.points) < mine.to_search
     assert (mine.trained, mine.to_train) == (0, 20) and not mine.complete
@@ -102,6 +103,5 @@ def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
     assert __main__.main(["coverage"]) == 1
     printed = capsys.readouterr().out
     line = next(x for x in printed.splitlines() if x.startswith("hopper-delayed"))
-    assert line.split() == [
-        *("hopper-delayed", "ppo", "36", "of", str(mine.to_search), "0", "of", "20")
-    ]
+    words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 20"
+    assert line.split() == words.split()
