@@ -14,7 +14,7 @@ import pathlib
 import re
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any
 
 import jax
@@ -101,6 +101,33 @@ def operations(program: str) -> dict[str, str]:
     return parts
 
 
+def seconds_of_parts(planes: Sequence[Any], program: str) -> dict[str, float]:
+    """Return the seconds that each part of a program takes in a trace of it.
+
+    On a GPU these are the times of its kernels, which run one after the other.
+
+    Args:
+      planes: the planes of a `jax.profiler.ProfileData`.
+      program: the text of the compiled program.
+    """
+    # A GPU's kernel has its operation's name with _ for other characters.
+    plain = lambda name: re.sub(r"\W", "_", name)
+    on_gpu = [plane for plane in planes if plane.name.startswith("/device:GPU")]
+    times = collections.defaultdict(list)
+    for plane in on_gpu or planes:
+        for line in plane.lines:
+            for event in line.events:
+                times[plain(event.name)].append(event.duration_ns)
+    totals = dict.fromkeys((*PARTS, _REST), 0.0)
+    for name, part in operations(program).items():
+        if durations := times.pop(plain(name), None):
+            totals[part] += float(np.median(durations)) * len(durations) * 1e-9
+    if on_gpu:
+        # Copies, and products of matrices that a library computes.
+        totals[_REST] += sum(map(sum, times.values())) * 1e-9
+    return totals
+
+
 def trace(call: Any, program: str) -> dict[str, float]:
     """Return the seconds that each part of a program takes in a call of it."""
     with tempfile.TemporaryDirectory() as folder:
@@ -108,16 +135,7 @@ def trace(call: Any, program: str) -> dict[str, float]:
             jax.block_until_ready(call())
         (path,) = pathlib.Path(folder).rglob("*.xplane.pb")
         profile = jax.profiler.ProfileData.from_file(str(path))
-    times = collections.defaultdict(list)
-    for plane in profile.planes:
-        for line in plane.lines:
-            for event in line.events:
-                times[event.name].append(event.duration_ns)
-    totals = dict.fromkeys((*PARTS, _REST), 0.0)
-    for name, part in operations(program).items():
-        if name in times:
-            totals[part] += float(np.median(times[name])) * len(times[name]) * 1e-9
-    return totals
+    return seconds_of_parts(list(profile.planes), program)
 
 
 def run(options: Options) -> None:

@@ -1,5 +1,7 @@
 """The profile's table, and the parts that operations belong to."""
 
+from types import SimpleNamespace
+
 import jax
 import pytest
 
@@ -30,6 +32,25 @@ def test_every_part_of_an_iteration_is_in_the_table(cache_settings, capsys):
     assert total[1] == 1 and whole[0] > 0
     # Little belongs to no part.
     assert rows["the rest"][1] < 0.1
+
+
+def plane(name, **seconds):
+    event = lambda name, s: SimpleNamespace(name=name, duration_ns=s * 1e9)
+    events = [event(name, s) for name, each in seconds.items() for s in each]
+    return SimpleNamespace(name=name, lines=[SimpleNamespace(events=events)])
+
+
+def test_the_times_of_a_gpu_are_those_of_its_kernels():
+    program = """ENTRY %main (x: f32[]) -> f32[] {
+  %loop_add_fusion.1 = f32[] fusion(%x), metadata={op_name="jit(f)/ppo/add"}
+}
+"""
+    host = plane("/host:CPU", **{"loop_add_fusion.1": [50.0], "call": [9.0]})
+    gpu = plane("/device:GPU:0", loop_add_fusion_1=[1.0, 2.0, 6.0], MemcpyD2D=[3.0])
+    totals = profile.seconds_of_parts([host, gpu], program)
+    assert totals["PPO: minibatches"] == 6.0 and totals["the rest"] == 3.0
+    totals = profile.seconds_of_parts([host], program)
+    assert totals["PPO: minibatches"] == 50.0 and totals["the rest"] == 0.0
 
 
 def test_operations_belong_to_the_scopes_that_they_were_written_in():
