@@ -14,15 +14,15 @@ import tyro
 from experiments import (
     benchmark,
     engine,
-    matrix,
     point_mass_layouts,
     point_mass_moments,
     profile,
     store,
     zoo,
 )
-from experiments.figures import FIGURES, Figure, name_of
+from experiments.figures import FIGURES, Curve, Figure, name_of
 from experiments.report import Page
+from experiments.search import coverage
 from experiments.store import RESULTS, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
@@ -72,9 +72,16 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
 
 
 def _small(figure: Figure, names: Sequence[str]) -> Figure:
-    """Return the small version of a figure, of the named panels or the first one."""
+    """Return the small version of a figure, of the named panels or the first one.
+
+    It has the presets "tuned" instead of what a search may not have chosen yet.
+    """
     figure = _selected(figure, names or [*figure.panels][:1])
-    small = lambda x: dataclasses.replace(x, seeds=3, total_steps=100_000)
+
+    def small(curve: Curve) -> Curve:
+        base = "tuned" if callable(curve.base) else curve.base
+        return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
+
     panels = {
         panel: {name: small(curve) for name, curve in curves.items()}
         for panel, curves in figure.panels.items()
@@ -148,12 +155,12 @@ class CoverageOptions:
 
 def _coverage(options: CoverageOptions) -> int:
     curves = [curve for *_, curve in FIGURES["matrix"].curves()]
-    rows = matrix.coverage(Store(RESULTS / "runs"), curves)
+    rows = coverage(Store(RESULTS / "runs"), curves)
     print("task               agent                   search    seeds")
     for x in rows:
-        task = f"{name_of(x.cell.env, x.cell.reward_delay):18} {x.name:20}"
-        search = f"{x.searched} of {x.to_search}"
-        print(f"{task} {search:>9} {f'{x.trained} of {x.to_train}':>8}")
+        task = f"{name_of(x.search.env, x.search.reward_delay):18} {x.name:20}"
+        searched = f"{x.searched} of {x.to_search}"
+        print(f"{task} {searched:>9} {f'{x.trained} of {x.to_train}':>8}")
     return int(not all(x.complete for x in rows))
 
 
@@ -165,8 +172,7 @@ class ReportOptions:
 def _report(options: ReportOptions) -> None:
     stored = Store(RESULTS / "runs")
     for name in FIGURES:
-        if (page := Page(name, stored)).begun:
-            page.write(RESULTS)
+        Page(name, stored).write(RESULTS)
     Summary(stored).write()
     print(f"in {RESULTS}")
 

@@ -6,7 +6,7 @@ For example, an ablation with the same settings on all tasks, and many delays:
 
     grid(TASKS, ("ppo", "ppo+gasil", Arm("no bonus", "ppo+gasil", {"alpha": 0.0})),
          (DELAY,), base=None, changes={"num_envs": 64})
-    grid(TASKS, AGENTS, (1, 5, 20, 100, 1000), panel="{env}", curve="{arm}-{delay}")
+    grid(TASKS, PAIR, (1, 5, 20, 100, 1000), panel="{env}", curve="{arm}-{delay}")
 
 The second is drawn over the delay with ``over=("reward_delay", "delay")``.
 """
@@ -18,9 +18,19 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments import matrix
-from experiments.search import AGENTS, DELAY, NOISE, PAIR, TASKS, Point, Search
-from experiments.store import ALGORITHM_VERSION, Run, Store
+from experiments.search import (
+    ADAPTIVE,
+    AGENTS,
+    CELLS,
+    DELAY,
+    PAIR,
+    TASKS,
+    Point,
+    Search,
+    SingleSetting,
+    searches,
+)
+from experiments.store import Run, Store
 from gasil_jax import presets
 from gasil_jax.config import Config
 
@@ -42,8 +52,8 @@ class Curve:
       reward_delay: the task's reward delay.
       obs_noise: the task's observation noise.
       base: the settings that are changed: a preset's by its name, the defaults of
-        `Config` (None), or what a search chose, by a function of task, agent, delay
-        and noise that returns the search.
+        `Config` (None), or what a search chose, by a function of task, agent and delay
+        that returns the search.
       seeds: number of seeds, from seed 0 on.
       total_steps: environment steps per seed.
     """
@@ -53,15 +63,16 @@ class Curve:
     changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
     obs_noise: float = 0.0
-    base: str | Callable[..., Search | matrix.Cell] | None = "tuned"
+    base: str | Callable[[str, str, int], Search] | None = "tuned"
     seeds: int = 10
     total_steps: int = 1_000_000
 
     @property
-    def search(self) -> Search | matrix.Cell | None:
+    def search(self) -> Search | None:
         """The search whose choice it uses, if any."""
-        task = (self.env, self.agent, self.reward_delay, self.obs_noise)
-        return self.base(*task) if callable(self.base) else None
+        if callable(self.base):
+            return self.base(self.env, self.agent, self.reward_delay)
+        return None
 
     def point(self, searched: Store) -> Point | None:
         """Return what differs from the appendix's or the preset's values.
@@ -75,15 +86,14 @@ class Curve:
         """Return its runs, or none if its search is not complete."""
         if (point := self.point(searched)) is None:
             return ()
-        config, version = Config(agent=self.agent), ALGORITHM_VERSION
+        config = Config(agent=self.agent)
         if self.search:
-            config, version = self.search.config({}), self.search.version
+            config = self.search.config({})
         elif isinstance(self.base, str):
             config = presets.preset(self.env, self.agent, self.base, self.reward_delay)
         config = config.replace(**{"total_steps": self.total_steps, **point})
-        delay, noise = self.reward_delay, self.obs_noise
         return tuple(
-            Run(self.env, config, seed, delay, noise, algorithm_version=version)
+            Run(self.env, config, seed, self.reward_delay, self.obs_noise)
             for seed in range(self.seeds)
         )
 
@@ -114,9 +124,7 @@ class Figure:
     panels: Panels = dataclasses.field(default_factory=dict)
     favourite: str | None = "ppo+gasil"
     comparisons: Comparisons | None = None
-    searches: Mapping[str, Search | matrix.Cell] = dataclasses.field(
-        default_factory=dict
-    )
+    searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
     over: tuple[str, str] | None = None
     early: int | None = None
 
@@ -164,8 +172,8 @@ class Figure:
           searched: the store of the searches' runs.
         """
         searches = self.searches.values()
-        stages = [x.runs(stage) for x in searches for stage in x.stages(searched)]
-        runs = [run for points in stages for seeds in points for run in seeds]
+        points = [x.runs(x.points(searched)) for x in searches]
+        runs = [run for search in points for seeds in search for run in seeds]
         runs += [run for *_, curve in self.curves() for run in curve.runs(searched)]
         return list(dict.fromkeys(runs))
 
@@ -179,16 +187,6 @@ def name_of(env: str, reward_delay: int = 1) -> str:
     """Return the name of a task with its delay, such as hopper-delayed."""
     delayed = {1: "", DELAY: "-delayed"}.get(reward_delay, f"-delayed-{reward_delay}")
     return f"{env}{delayed}"
-
-
-def searched(env: str, agent: str, delay: int, noise: float = 0.0) -> Search:
-    """Return the search on a task; all noises use what it chose at the middle one."""
-    return Search(env, agent, delay, NOISE if noise else 0.0)
-
-
-def searched_normalized(env: str, agent: str, delay: int, noise: float = 0.0) -> Search:
-    """Return the search on a task with normalized rewards."""
-    return Search(env, agent, delay, NOISE if noise else 0.0, normalize_rewards=True)
 
 
 class Arm(NamedTuple):
@@ -240,107 +238,74 @@ def joined(grids: Iterable[Panels]) -> Panels:
     return panels
 
 
-#: The tasks with normalized rewards: ant and humanoid cost several times as much, and
-#: no agent has learned to walk there.
-NORMALIZED = TASKS[:4]
-#: Searches without and with normalized rewards, and how names of panels end.
-_REWARDS = ((searched, ""), (searched_normalized, "-normalized"))
-
-
-def _searches(base: Callable[..., Search], tasks: Sequence[str]) -> dict[str, Search]:
-    """Return the searches of all agents, and those with noise."""
-    searches = {
-        f"{name_of(env, delay)} {agent}": base(env, agent, delay)
-        for env, delay, agent in itertools.product(tasks, (1, DELAY), AGENTS)
-    }
-    noisy = {f"walker2d-noise {x}": base("walker2d", x, 1, NOISE) for x in PAIR}
-    return searches | noisy
-
-
-def _delayed(tasks: Sequence[str], **shared: Any) -> Panels:
-    """Return all agents on delayed tasks.
-
-    Where one seed learns to run and another does not, ten tell few agents apart.
-    """
-    runners = grid(tasks[:3], AGENTS, (DELAY,), seeds=20, **shared)
-    return {**runners, **grid(tasks[3:], AGENTS, (DELAY,), **shared)}
-
-
+#: The standard deviations of noise on observations (paper, figure 6).
 _NOISES = (0.0, 0.05, 0.1, 0.5)
-
-
-def _noisy(noise: float, end: str) -> str:
-    """Return the name of a panel with noise."""
-    return f"noise-{noise:g}{end}"
 
 
 def _noise_comparisons() -> Comparisons:
     """Compare the gap at each noise, and its growth with noise."""
     compared: dict[tuple[str, ...], Terms] = {}
-    for (_, end), noise in itertools.product(_REWARDS, _NOISES):
-        panel, calm = _noisy(noise, end), _noisy(0.0, end)
+    calm, *noisy = (f"noise {noise:g}" for noise in _NOISES)
+    less = difference(calm, "ppo", "ppo+gasil")
+    for panel in (calm, *noisy):
         gap = difference(panel, "ppo+gasil", "ppo")
         compared[panel, "ppo+gasil", "ppo"] = gap
-        if noise:
-            less = difference(calm, "ppo", "ppo+gasil")
+        if panel != calm:
             compared[panel, "ppo+gasil", "ppo", calm] = (*gap, *less)
     return compared
 
 
-#: The values of the paper's figure 8.
+#: The values of the paper's figure 8, and the one that is compared with the ends that
+#: the paper names.
 _VALUES = {
     "buffer_steps": (500, 1000, 2000, 5000, 10000),
     "discriminator_updates": (1, 5, 10, 20),
 }
-#: A discriminator that its entropy bonus holds at 1/2 everywhere, so that its reward is
-#: alpha log 2 in each step. With this weight of the entropy, the difference between
-#: good and other trajectories moves a logit by only 4 / 1000.
-CONSTANT = {
-    "discriminator_entropy_coefficient": 1e3,
-    "discriminator_updates": 5,
-    "discriminator_learning_rate": 3e-4,
-}
+_MIDDLE = {"buffer_steps": (1000, (500, 5000)), "discriminator_updates": (5, (1, 20))}
 
 
-def _bonus_comparisons() -> Comparisons:
-    """Compare what the bonus adds, what imitation adds to that, and which adds more."""
-    compared: dict[tuple[str, ...], Terms] = {}
-    for panel in ("hopper-delayed", "walker2d-delayed"):
-        pairs = (("ppo+gasil", "ppo"), ("ppo+gasil", "constant"), ("constant", "ppo"))
-        compared |= {(panel, *pair): difference(panel, *pair) for pair in pairs}
-        imitation = difference(panel, "ppo+gasil", "constant")
-        more = (*imitation, *difference(panel, "ppo", "constant"))
-        compared[panel, "imitation", "bonus"] = more
-    return compared
+def _ends(panels: Panels) -> Comparisons:
+    """Compare the value in the middle with both ends of figure 8's panels."""
+    return {
+        (panel, f"{middle}", f"{end}"): difference(panel, f"{middle}", f"{end}")
+        for panel in panels
+        for name, (middle, ends) in _MIDDLE.items()
+        if panel.startswith(name)
+        for end in ends
+    }
 
 
-#: The paper's schedule of alpha for humanoid (appendix).
-_SCHEDULED = {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))}
-_LONG: Any = {"base": searched, "total_steps": 3_000_000}
-_WIDER = Arm("wider", "ppo+gasil")
-
-
-def _wider(env: str, agent: str, delay: int, noise: float = 0.0) -> Search:
-    """Return a search that continues the first one of a task."""
-    free = ("discriminator_updates", "discriminator_learning_rate", "buffer_steps")
-    before = searched(env, agent, delay, noise)
-    return dataclasses.replace(before, after=before, free=free)
-
-
-#: Numbers of environments per seed in the figure on batch geometry, and whether they
-#: start at random ages, in words.
-_NUM_ENVS, _AGES = (1, 8, 32, 128), {True: "drawn", False: "not-drawn"}
-_GEOMETRY = [
-    Arm(
-        f"{agent}-{num_envs}-{_AGES[drawn]}",
-        agent,
-        {"num_envs": num_envs, "batch_steps": 2048, "stagger_episodes": drawn},
+_EFFECTS = joined(
+    grid(
+        ("walker2d",),
+        [Arm(f"{value}", "ppo+gasil", {name: value}) for value in values],
+        (delay,),
+        panel=name_of(name, delay),
+        base=Search,
     )
-    for agent, drawn, num_envs in itertools.product(PAIR, _AGES, _NUM_ENVS)
+    for delay in (1, DELAY)
+    for name, values in _VALUES.items()
+)
+#: The paper's schedule of alpha for humanoid (appendix).
+_SCHEDULED = Arm(
+    "ppo+gasil-from-2M",
+    "ppo+gasil",
+    {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
+)
+_LONG: Any = {"base": Search, "total_steps": 3_000_000}
+_PAPERS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
+#: Adaptive imitation, and without one of its parts at a time.
+_PARTS = [
+    Arm("whole", ADAPTIVE),
+    Arm("rewards not decomposed", ADAPTIVE, {"decompose_rewards": False}),
+    Arm("no imitation", ADAPTIVE, {"imitation_weight": 0.0}),
+    *(
+        Arm(f"rule {rule}", ADAPTIVE, {"imitation_rule": rule})
+        for rule in ("agreement", "gap", "fixed")
+    ),
+    Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
-_ADAPTIVE, _RULES = "ppo+gasil-adaptive", ("agreement", "gap", "fixed")
-#: What is stored of ant and humanoid: environments that were reset together.
-_IN_STEP = [Arm(f"{agent}, in step", agent) for agent in PAIR]
+_DECOMPOSED = Arm("ppo, decomposed", "ppo")
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
     "on most of them."
@@ -350,152 +315,43 @@ _DELAYED = (
     "PPO+BC and PPO+SIL, on all tasks by a large margin."
 )
 
+
+def _at_delay(env: str, agent: str, delay: int) -> Search:
+    """Return the search for a task whose reward is delayed by any number of steps."""
+    return Search(env, agent, DELAY if delay > 1 else 1)
+
+
+def _matrix() -> Panels:
+    """Return all agents on all tasks, each with what its search on the task chose."""
+    return joined(
+        grid(
+            (env,),
+            [Arm(name, search.agent)],
+            (delay,),
+            base=functools.partial(Search, decompose_rewards=search.decompose_rewards),
+        )
+        for env, delay in CELLS
+        for name, search in searches(env, delay).items()
+    )
+
+
 FIGURES: Mapping[str, Figure] = {
     "point_mass": Figure(
         "2D point mass (paper, figures 2 to 4)",
         "PPO learns a sub-optimal policy quickly; PPO+GASIL learns a little more "
         "slowly at first and ends with a better policy.",
-        grid(("point_mass",), PAIR, base=searched, seeds=40, total_steps=500_000),
+        grid(("point_mass",), PAIR, base=Search, seeds=40, total_steps=500_000),
+        searches={f"point_mass {agent}": Search("point_mass", agent) for agent in PAIR},
         early=30_000,
     ),
-    "mujoco": Figure(
-        "MuJoCo tasks (paper, figure 5)", _DENSE, grid(TASKS, AGENTS, base=searched)
-    ),
-    "stochastic_walker2d": Figure(
-        "Walker2d with noisy observations (paper, figure 6)",
-        "The gap between PPO and PPO+GASIL is larger when Gaussian noise, of standard "
-        "deviation 0.05, 0.1 and 0.5, is added to the observations.",
-        joined(
-            grid(("walker2d",), PAIR, panel=_noisy(x, end), obs_noise=x, base=base)
-            for (base, end), x in itertools.product(_REWARDS, _NOISES)
-        ),
-        comparisons=_noise_comparisons(),
-    ),
-    "delayed_mujoco": Figure(
-        "MuJoCo tasks with delayed rewards (paper, figure 7)",
-        _DELAYED,
-        _delayed(TASKS, base=searched, panel="{env}"),
-    ),
-    "hyperparameters": Figure(
-        "Effect of GASIL's hyperparameters (paper, figure 8)",
-        "The agent performs poorly when the buffer is too small (500 steps) or too "
-        "large (5000 steps), and with too few or too many discriminator updates.",
-        joined(
-            grid(
-                ("walker2d",),
-                [Arm(f"{value}", "ppo+gasil", {name: value}) for value in values],
-                (delay,),
-                panel=f"{name_of(name, delay)}{end}",
-                base=base,
-            )
-            for base, end in _REWARDS
-            for delay in (1, DELAY)
-            for name, values in _VALUES.items()
-        ),
-        favourite=None,
-    ),
-    "random_search": Figure(
-        "Hyperparameters of every agent (paper, table 1)",
-        "A search over the appendix's ranges, for every task.",
-        searches=_searches(searched, TASKS)
-        | {f"point_mass {agent}": searched("point_mass", agent, 1) for agent in PAIR},
-    ),
-    "normalized_rewards": Figure(
-        "Normalized rewards (paper, figures 5 and 7)",
-        f"{_DELAYED} {_DENSE}",
-        {
-            **_delayed(NORMALIZED, base=searched_normalized),
-            **grid(NORMALIZED, AGENTS, base=searched_normalized),
-        },
-        searches=_searches(searched_normalized, NORMALIZED),
-    ),
-    "constant_bonus": Figure(
-        "Delayed rewards and a bonus that knows nothing",
-        "The discriminator's reward, learned from good trajectories, acts as a useful "
-        "reward shaping that makes learning easier.",
-        grid(
-            ("hopper", "walker2d"),
-            ("ppo", Arm("constant", "ppo+gasil", CONSTANT), "ppo+gasil"),
-            (DELAY,),
-            base=searched_normalized,
-            seeds=20,
-        ),
-        comparisons=_bonus_comparisons(),
-    ),
-    "humanoid": Figure(
-        "Humanoid over 3M steps (paper, figures 5 and 7)",
-        "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
-        "where the reward is delayed.",
-        joined(
-            grid(("humanoid",), arms, (delay,), panel=panel, **_LONG)
-            for panel, delay, arms in (
-                ("dense", 1, AGENTS),
-                ("dense", 1, [Arm("ppo+gasil-from-2M", "ppo+gasil", _SCHEDULED)]),
-                ("delayed", DELAY, AGENTS),
-            )
-        ),
-    ),
-    "wider_search": Figure(
-        "PPO+GASIL on delayed tasks, searched further",
-        _DELAYED,
-        joined(
-            [
-                _delayed(NORMALIZED, base=searched, panel="{env}"),
-                grid(NORMALIZED, [_WIDER], (DELAY,), panel="{env}", base=_wider),
-            ]
-        ),
-        favourite="wider",
-        searches={name_of(x, DELAY): _wider(x, "ppo+gasil", DELAY) for x in NORMALIZED},
-    ),
-    "batch_geometry": Figure(
-        "Number of environments, and episodes in step",
-        "",
-        {
-            **grid(("halfcheetah",), _GEOMETRY, (1, DELAY), seeds=20),
-            **grid(("swimmer",), _GEOMETRY, (1, DELAY)),
-        },
-        comparisons={
-            (f"{env}{end}", *names): difference(f"{env}{end}", *names)
-            for env in ("halfcheetah", "swimmer")
-            for end in ("", "-delayed")
-            for agent, count in itertools.product(PAIR, _NUM_ENVS)
-            for names in [[f"{agent}-{count}-{ages}" for ages in _AGES.values()]]
-        },
-        favourite=None,
-        over=("num_envs", "environments"),
-    ),
-    "adaptive_imitation": Figure(
-        "Delayed rewards with adaptive imitation, beyond the paper",
-        "",
-        joined(
-            [
-                grid(TASKS[:4], (*PAIR, _ADAPTIVE), (DELAY,), panel="{env}"),
-                grid(TASKS[4:], _IN_STEP, (DELAY,), panel="{env}", base=searched),
-                grid(TASKS[4:], (_ADAPTIVE,), (DELAY,), panel="{env}"),
-            ]
-        ),
-        favourite=_ADAPTIVE,
-    ),
     "matrix": Figure(
-        "All agents on all tasks, tuned alike",
+        "All agents on all tasks (paper, figures 5 and 7, table 1)",
         f"{_DELAYED} {_DENSE}",
-        joined(
-            grid(
-                (env,),
-                [Arm(name, cell.agent)],
-                (delay,),
-                base=functools.partial(
-                    matrix.Cell, decompose_rewards=cell.decompose_rewards
-                ),
-                seeds=matrix.seeds(env, delay),
-            )
-            for delay, env in itertools.product((DELAY, 1), TASKS)
-            for name, cell in matrix.cells(env, delay).items()
-        ),
+        _matrix(),
         searches={
-            f"{name_of(*task)} {name}": cell
-            for task in matrix.CELLS
-            for name, cell in matrix.cells(*task).items()
+            f"{name_of(*task)} {name}": search
+            for task in CELLS
+            for name, search in searches(*task).items()
         },
     ),
     "single_setting": Figure(
@@ -503,32 +359,74 @@ FIGURES: Mapping[str, Figure] = {
         "",
         joined(
             [
-                grid(TASKS, matrix.AGENTS, (DELAY,), panel="{env}", base=matrix.Single),
+                grid(TASKS, AGENTS, (DELAY,), panel="{env}", base=SingleSetting),
                 grid(
                     TASKS,
-                    [Arm("ppo, decomposed", "ppo")],
+                    [_DECOMPOSED],
                     (DELAY,),
                     panel="{env}",
-                    base=functools.partial(matrix.Single, decompose_rewards=True),
+                    base=functools.partial(SingleSetting, decompose_rewards=True),
                 ),
             ]
         ),
-        favourite=_ADAPTIVE,
+        favourite=ADAPTIVE,
+    ),
+    "stochastic_walker2d": Figure(
+        "Walker2d with noisy observations (paper, figure 6)",
+        "The gap between PPO and PPO+GASIL is larger when Gaussian noise, of standard "
+        "deviation 0.05, 0.1 and 0.5, is added to the observations.",
+        joined(
+            grid(("walker2d",), PAIR, panel=f"noise {x:g}", obs_noise=x, base=Search)
+            for x in _NOISES
+        ),
+        comparisons=_noise_comparisons(),
+    ),
+    "hyperparameters": Figure(
+        "Effect of GASIL's hyperparameters (paper, figure 8)",
+        "The agent performs poorly when the buffer is too small (500 steps) or too "
+        "large (5000 steps), and with too few or too many discriminator updates.",
+        _EFFECTS,
+        comparisons=_ends(_EFFECTS),
+        favourite=None,
+    ),
+    "humanoid": Figure(
+        "Humanoid over 3M steps (paper, figures 5 and 7)",
+        "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
+        "where the reward is delayed.",
+        joined(
+            [
+                grid(("humanoid",), _PAPERS, (1, DELAY), **_LONG),
+                grid(("humanoid",), [_SCHEDULED], **_LONG),
+            ]
+        ),
+    ),
+    "delays": Figure(
+        "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
+        "",
+        joined(
+            grid(
+                TASKS[:3],
+                arms,
+                (1, 5, DELAY, 100, 1000),
+                panel="{env}",
+                curve="{arm}-{delay}",
+                base=base,
+            )
+            for arms, base in ((PAIR, _at_delay), ((ADAPTIVE,), "tuned"))
+        ),
+        favourite=ADAPTIVE,
+        over=("reward_delay", "delay"),
     ),
     "adaptive_ablation": Figure(
         "Adaptive imitation, with each of its parts taken away",
         "",
-        grid(
-            TASKS[:4],
-            [
-                Arm("whole", _ADAPTIVE),
-                Arm("rewards not decomposed", _ADAPTIVE, {"decompose_rewards": False}),
-                Arm("no imitation", _ADAPTIVE, {"imitation_weight": 0.0}),
-                *(Arm(f"rule {x}", _ADAPTIVE, {"imitation_rule": x}) for x in _RULES),
-                Arm("deviation 1", _ADAPTIVE, {"initial_deviation": 1.0}),
-            ],
-            (DELAY,),
-            panel="{env}",
+        joined(
+            grid(tasks, arms, (DELAY,), panel="{env}")
+            for tasks, arms in (
+                (TASKS[:4], _PARTS),
+                (("ant",), [_PARTS[i] for i in (0, 2, 6)]),
+                (("humanoid",), _PARTS[:1]),
+            )
         ),
         favourite="whole",
     ),

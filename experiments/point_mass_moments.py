@@ -21,8 +21,7 @@ from matplotlib.figure import Figure
 
 import gasil_jax
 from experiments import report
-from experiments.figures import FIGURES
-from experiments.store import RESULTS, Store
+from experiments.store import RESULTS
 from gasil_jax import normalization, policy
 from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, output_file
@@ -161,8 +160,7 @@ def run(options: Options) -> None:
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(SHARES), len(titles), squeeze=False)
     for agent in _COLUMNS:
-        curve = FIGURES["point_mass"].panels["point_mass"][agent]
-        config = curve.runs(Store(RESULTS / "runs"))[0].config
+        config = gasil_jax.preset("point_mass", agent, "tuned")
         config = config.replace(total_steps=options.total_steps)
         columns = [i for i, (of, _) in enumerate(titles) if of == agent]
         for row, state in zip(grid, states_at(env, config, SHARES), strict=True):

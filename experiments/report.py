@@ -5,6 +5,7 @@ corrected for the number of comparisons of their page by Holm's method.
 """
 
 import contextlib
+import csv
 import dataclasses
 import functools
 import io
@@ -22,9 +23,8 @@ import matplotlib.figure
 import numpy as np
 from PIL import Image
 
-from experiments import matrix
-from experiments.figures import FIGURES, Comparisons, Curve, Figure
-from experiments.search import AGENTS, SPACES, Search, by_value, means
+from experiments.figures import FIGURES, Comparisons, Curve, Figure, name_of
+from experiments.search import AGENTS, DELAY, TASKS, importance
 from experiments.store import Record, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
@@ -33,6 +33,8 @@ from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 from gasil_jax.host import output_file
 
 NOTES = pathlib.Path(__file__).parent / "notes"
+#: Others' mean returns after about 1M steps, each with the file that it stands in.
+PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 #: The probability that any verdict of a page is wrong, at most.
 LEVEL = 0.05
 _DRAWS = 10_000
@@ -42,19 +44,15 @@ _VERDICTS = ("better", "not clear", "worse")
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
 
-IN_STEP = (
-    "These runs are of environments that were reset together and stayed in step; see "
-    "[batch geometry](batch_geometry.md)."
-)
 _READING = """## How to read this
 
 A final return is the interquartile mean over seeds of the mean return over the last
 tenth of training, of the episodes that the acting policy ended; in brackets a 95%
 interval, the percentile bootstrap's over seeds, which is a little too narrow for ten.
 Better, worse and not clear are verdicts on differences, corrected by Holm's method for
-the {} comparisons of this page: the chance that any of them is wrong is 5%. A list of
-added seeds, which are also among all, is corrected by itself. A percentage over several
-tasks is the geometric mean of the ratios, less one."""
+the {} comparisons of this page: the chance that any of them is wrong is 5%. The
+probability of improvement is that of a seed of one curve having more than a seed of the
+other, averaged over the tasks."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,22 +113,30 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
     return {key: corrected[key] for key in raw}
 
 
-def together(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
-    """Return by what share one curve exceeds the other over all panels, in words."""
-    drawn = [np.log(draws(scores, p, ours) / draws(scores, p, other)) for p in panels]
-    mean = lambda panel, curve: interquartile_mean(scores[panel, curve])
-    middle = np.mean([np.log(mean(p, ours) / mean(p, other)) for p in panels])
-    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
-    shares = [100 * math.expm1(float(x)) for x in (middle, low, high)]
-    return "{:+.0f}% [{:.0f}, {:.0f}]".format(*shares)
+def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
+    """Return the probability of improvement over the panels, in words.
 
-
-def positive(scores: Scores, panels: Iterable[str], *curves: str) -> list[str]:
-    """Return the panels where all returns of the curves are above 0.
-
-    A ratio of returns has a meaning there alone.
+    It is the probability that a seed of `ours` has more than one of `other`, in the
+    mean over the panels, with the 95% percentile bootstrap interval over seeds, drawn
+    within each panel (Agarwal et al. 2021).
     """
-    return [p for p in panels if all((scores[p, curve] > 0).all() for curve in curves)]
+    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
+
+    def probability(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        more, same = (
+            a[..., :, None] > b[..., None, :],
+            a[..., :, None] == b[..., None, :],
+        )
+        return (more + 0.5 * same).mean(axis=(-1, -2))
+
+    def resampled(values: np.ndarray) -> np.ndarray:
+        return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
+
+    pairs = [(scores[panel, ours], scores[panel, other]) for panel in panels]
+    middle = np.mean([probability(*pair) for pair in pairs])
+    drawn = [probability(*map(resampled, pair)) for pair in pairs]
+    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def counted(verdicts: Sequence[str]) -> str:
@@ -158,8 +164,10 @@ def interval(scores: np.ndarray) -> str:
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown."""
+    """Return a table in Markdown; without rows nothing."""
     lines = [head, ["---"] * len(head), *rows]
+    if len(lines) == 2:
+        return ""
     return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
 
 
@@ -239,8 +247,8 @@ class Page:
     """
 
     SLOTS = (
-        *("table", "compared", "differences", "tally", "added", "best"),
-        *("geometry", "geometry_tally", "searches", "effects", "importance"),
+        *("table", "differences", "tally", "aggregate"),
+        *("searches", "importance", "published"),
     )
 
     def __init__(
@@ -285,13 +293,6 @@ class Page:
             rows.append(cells)
         return markdown_table(head, rows)
 
-    def compared(self, panel: str, ours: str, other: str) -> str:
-        """Return a comparison in words."""
-        comparison = self.comparisons[panel, ours, other]
-        words = {"not clear": "is not clearly different from"}
-        phrase = words.get(comparison.verdict, f"is {comparison.verdict} than")
-        return f"{ours} {phrase} {other} on {panel} ({comparison})"
-
     def differences(self) -> str:
         """Return every comparison of the page, each in a line."""
         lines = []
@@ -301,152 +302,120 @@ class Page:
             lines.append(f"- {panel}, {ours} - {other}{more}: {difference}.")
         return "\n".join(lines)
 
-    def tally(self, *panels: str, scores: Scores | None = None) -> str:
+    def tally(self, *panels: str) -> str:
         """Return on how many panels the favourite is better than each other curve.
 
         Args:
           *panels: the panels; default all.
-          scores: the scores to compare, as a family of their own; default the page's.
         """
-        comparisons, lines = self.comparisons, []
-        if scores is not None:
-            comparisons = compare(scores, self.figure.compared())
-        scores, panels = scores or self.scores, panels or tuple(self.figure.panels)
+        lines, panels = [], panels or tuple(self.figure.panels)
         for other in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
             with_other = [p for p in panels if other in self.figure.panels[p]]
             ours = str(self.figure.rival(with_other[0], other))
-            complete = [p for p in panels if (p, ours, other) in comparisons]
-            if not complete:
-                continue
-            verdicts = [comparisons[p, ours, other].verdict for p in complete]
-            line = f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
-            above = positive(scores, complete, ours, other)
-            if len(above) > 1:
-                which = f"the {len(above)} where every seed's return is above 0"
-                which = "all of them" if len(above) == len(complete) else which
-                line += f"; over {which} {together(scores, above, ours, other)}"
-            lines.append(f"{line}.")
-        return "\n".join(lines)
-
-    def added(self, *panels: str) -> str:
-        """Return the tally of only the seeds after the tenth."""
-        later = {
-            key: scores[10:]
-            for key, scores in self.scores.items()
-            if key[0] in panels and len(scores) > 10
-        }
-        return self.tally(*panels, scores=later)
-
-    def best_value(self, panel: str) -> str:
-        """Return the curve of a panel with the highest interquartile mean."""
-        mean = lambda label: float(interquartile_mean(self.scores[panel, label]))
-        return max(self.figure.panels[panel], key=mean)
-
-    def verdict(self, panel: str, ours: str, other: str) -> str:
-        """Return the verdict on two curves of a panel, in either order."""
-        if comparison := self.comparisons.get((panel, ours, other)):
-            return comparison.verdict
-        verdict = self.comparisons[panel, other, ours].verdict
-        return {"better": "worse", "worse": "better"}.get(verdict, verdict)
-
-    def best(self) -> str:
-        """Return each panel's best value, and whether it is better than each other."""
-        lines = []
-        for panel, curves in self.figure.panels.items():
-            if all((panel, label) in self.scores for label in curves):
-                best, labels = self.best_value(panel), list(curves)
-                end = best in (labels[0], labels[-1])
-                verdicts = ", ".join(
-                    f"{label} ({self.verdict(panel, best, label)})"
-                    for label in labels
-                    if label != best
-                )
-                where = "at an end" if end else "in the middle"
+            complete = [p for p in with_other if (p, ours, other) in self.comparisons]
+            if complete:
+                verdicts = [self.comparisons[p, ours, other].verdict for p in complete]
+                probability = improvement(self.scores, complete, ours, other)
                 lines.append(
-                    f"- {panel}: {best} has most, {where}; against {verdicts}."
+                    f"- {ours} against {other}: {counted(verdicts)} of "
+                    f"{len(complete)}; probability of improvement {probability}."
                 )
         return "\n".join(lines)
 
-    def geometry(self) -> str:
-        """Return final returns with drawn ages and without, for each cell."""
+    def aggregate(self, unit: str = "ppo") -> str:
+        """Return each curve's return over all tasks, in units of one dense curve's.
+
+        A seed's return is divided by the interquartile mean of the curve `unit` in the
+        panel of the same task with dense rewards. Then every task counts alike in the
+        interquartile mean over all seeds of all tasks; its 95% interval is the
+        percentile bootstrap's over seeds, drawn within each task. The curves must have
+        scores on all of these tasks, dense or delayed.
+        """
+        dense: dict[str, list[str]] = {}
+        for panel, curves in self.figure.panels.items():
+            curve = next(iter(curves.values()))
+            if (name_of(curve.env), unit) in self.scores:
+                delayed = "delayed" if curve.reward_delay > 1 else "dense"
+                dense.setdefault(delayed, []).append(panel)
         rows = []
-        for (panel, *names), comparison in self.comparisons.items():
-            cells = [panel, *names[0].split("-")[:2]]
-            cells += [interval(self.scores[panel, name]) for name in names]
-            rows.append([*cells, str(comparison), comparison.verdict])
-        head = ["task", "agent", "environments", "ages drawn", "not drawn"]
-        head += ["difference", "drawn is"]
-        return markdown_table(head, rows) if rows else "No cell is complete yet."
-
-    def geometry_tally(self) -> str:
-        """Return for each number of environments how often drawn ages are better."""
-        keys_of: dict[str, list[tuple[str, ...]]] = {}
-        for key in self.comparisons:
-            keys_of.setdefault(key[1].split("-")[1], []).append(key)
-        lines = []
-        for count, keys in keys_of.items():
-            ratios = []
-            for names in dict.fromkeys(key[1:] for key in keys):
-                panels = [key[0] for key in keys if key[1:] == names]
-                ratio = together(
-                    self.scores, positive(self.scores, panels, *names), *names
-                )
-                ratios.append(f"{names[0].split('-')[0]} {ratio}")
-            verdicts = [self.comparisons[key].verdict for key in keys]
-            many = "environment" if count == "1" else "environments"
-            lines.append(
-                f"- {count} {many}: drawn is {counted(verdicts)} of {len(keys)} cells; "
-                "over the tasks where every seed's return is above 0, "
-                f"{', '.join(ratios)}."
+        for kind, panels in dense.items():
+            names = list(
+                dict.fromkeys(x for p in panels for x in self.figure.panels[p])
             )
-        return "\n".join(lines)
+            for name in names:
+                having = [panel for panel in panels if (panel, name) in self.scores]
+                if having == panels:
+                    rows.append(
+                        [kind, name, f"{len(panels)}", self._over(panels, name, unit)]
+                    )
+        head = ["rewards", "agent", "tasks", f"return in units of dense {unit}'s"]
+        return markdown_table(head, rows)
+
+    def _over(self, panels: Sequence[str], name: str, unit: str) -> str:
+        """Return the interquartile mean over panels, as `aggregate` says, in words."""
+        of_panel = []
+        for panel in panels:
+            env = next(iter(self.figure.panels[panel].values())).env
+            one = float(interquartile_mean(self.scores[name_of(env), unit]))
+            of_panel.append(self.scores[panel, name] / one)
+        most = math.lcm(*map(len, of_panel))
+        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        drawn = []
+        for _ in range(_DRAWS // 10):
+            parts = [rng.choice(x, len(x)).repeat(most // len(x)) for x in of_panel]
+            drawn.append(interquartile_mean(np.concatenate(parts)))
+        low, high = np.percentile(drawn, [2.5, 97.5])
+        every = np.concatenate([x.repeat(most // len(x)) for x in of_panel])
+        return f"{float(interquartile_mean(every)):.2f} [{low:.2f}, {high:.2f}]"
 
     def searches(self) -> str:
         """Return the results of the figure's searches."""
-        head = "task|points x seeds|again|best point|its mean|seeds|median|worst"
+        head = ["task", "points", "best point", "its mean", "median", "worst"]
         rows = []
         for name, search in self.figure.searches.items():
-            stages, best = search.stages(self.searched), search.best(self.searched)
-            sizes = [f"{len(stage.points)} x {len(stage.seeds)}" for stage in stages]
-            cells = ["not complete", *[""] * 4]
-            scores = search.scores(stages[0], self.searched) if stages else None
-            if best is not None and scores is not None:
-                first = means(scores)
-                cells = [point_in_words(best[0]), f"{best[1].mean():.0f}"]
-                cells += [f"{len(best[1])}", f"{np.median(first):.0f}"]
-                cells += [f"{first.min():.0f}"]
-            rows.append([name, *sizes, *[""] * (2 - len(sizes)), *cells])
-        return markdown_table(head.split("|"), rows)
-
-    def effects(self) -> str:
-        """Return the mean first-stage score of PPO+GASIL's points with each value.
-
-        Every value met every value of the other hyperparameters equally often, so a
-        mean does not depend on them. What two values do together is not shown.
-        """
-        space, rows = SPACES["ppo+gasil"], []
-        for label, search in self.figure.searches.items():
-            if not isinstance(search, Search) or search.space != space:
-                continue
-            if (stage := search.first(self.searched)) is None:
-                continue
-            if (scores := search.scores(stage, self.searched)) is not None:
-                cells = [label]
-                for name in space:
-                    values = sorted(by_value(name, stage.points, means(scores)).items())
-                    cells.append(", ".join(f"{x:g}: {mean:.0f}" for x, mean in values))
-                rows.append(cells)
-        return markdown_table(["task", *space], rows)
+            points = search.points(self.searched)
+            scores = search.scores(points, self.searched)
+            best = search.best(self.searched)
+            cells = ["not complete", "", "", ""]
+            if scores is not None and best is not None:
+                means = scores.mean(axis=1)
+                values = (best[1].mean(), np.median(means), means.min())
+                cells = [point_in_words(best[0]), *(f"{x:.0f}" for x in values)]
+            rows.append([name, f"{len(points)}", *cells])
+        return markdown_table(head, rows)
 
     def importance(self) -> str:
-        """Return how much each hyperparameter of the matrix matters to each agent."""
-        shares = {x: matrix.importance(x, self.searched) for x in matrix.AGENTS}
+        """Return how much each hyperparameter matters to each agent."""
+        shares = {x: importance(x, self.searched) for x in AGENTS}
         names = list(dict.fromkeys(name for x in shares.values() for name in x))
         rows = [
             [agent, *(f"{x[name]:.0%}" if name in x else "" for name in names)]
             for agent, x in shares.items()
+            if x
         ]
         return markdown_table(["agent", *names], rows)
+
+    def published(self, rewards: str, *names: str) -> str:
+        """Return others' published returns beside those of some of our curves.
+
+        Args:
+          rewards: "dense" or "delayed".
+          *names: our curves.
+        """
+        with PUBLISHED.open(newline="") as file:
+            others = [row for row in csv.DictReader(file) if row["rewards"] == rewards]
+        delay = DELAY if rewards == "delayed" else 1
+        rows = []
+        for name in names:
+            ours = [self.scores.get((name_of(env, delay), name)) for env in TASKS]
+            counts = sorted({len(x) for x in ours if x is not None})
+            cells = ["" if x is None else interval(x) for x in ours]
+            if counts:
+                seeds = " or ".join(map(str, counts))
+                rows.append([f"ours, {name}", "v5", seeds, *cells])
+        columns = ("source", "tasks", "seeds", *TASKS)
+        rows += [[row[column] for column in columns] for row in others]
+        return markdown_table(columns, rows)
 
     def settings(self) -> str:
         """Return what each curve was trained with, beyond the appendix's values."""
@@ -471,35 +440,15 @@ class Page:
         if slot in self.SLOTS:
             # Curves that are not complete, or wrong arguments, are reported below.
             with contextlib.suppress(KeyError, TypeError):
-                return getattr(self, slot)(*arguments)
+                return getattr(self, slot)(*arguments) or "Nothing is complete yet."
         raise InputError(
             f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
             f"one of {', '.join(self.SLOTS)}, of complete curves"
         )
 
-    @property
-    def begun(self) -> bool:
-        """Whether there is anything to show: a stored run, or a complete search."""
-        searches = self.figure.searches.values()
-        return bool(self.results) or any(x.best(self.searched) for x in searches)
-
-    @property
-    def in_step(self) -> bool:
-        """Whether environments of locomotion were reset together in all runs."""
-        runs = [run for results in self.results.values() for run in results.records]
-        for search in self.figure.searches.values():
-            for stage in search.stages(self.searched)[:1]:
-                runs += [seeds[0] for seeds in search.runs(stage)]
-        ages_drawn = {
-            run.config.stagger_episodes for run in runs if run.env != "point_mass"
-        }
-        return ages_drawn == {False}
-
     def text(self) -> str:
         """Return the page as Markdown."""
         parts = [f"# {self.figure.title}"]
-        if self.in_step:
-            parts.append(IN_STEP)
         if self.figure.claim:
             parts.append(f"**The paper's claim.** {self.figure.claim}")
         note = [fill(self.note, self.value).strip()]
@@ -550,35 +499,44 @@ def _draw(page: Page) -> matplotlib.figure.Figure:
         (_draw_over if page.figure.over else _draw_curves)(page, panel, axes)
         axes.set_title(panel)
     shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
-    if count > 1 and len(shown[0][1]) > 4 and all(x[1] == shown[0][1] for x in shown):
+    handle_of = {
+        name: x
+        for handles, names in shown
+        for x, name in zip(handles, names, strict=True)
+    }
+    if count > 1 and len(handle_of) > 4:
         # So many names would hide the curves.
         below: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
-        figure.legend(*shown[0], frameon=False, **below)
+        figure.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
     else:
-        for axes, (_, labels) in zip(grid.flat, shown, strict=False):
-            if labels:
+        for axes, (_, names) in zip(grid.flat, shown, strict=False):
+            if names:
                 axes.legend(frameon=False, fontsize=7)
     for row in grid:
         row[0].set_ylabel("episode return")
     return figure
 
 
+def _colors(figure: Figure) -> dict[str, Any]:
+    """Return the color of each curve's name, the same in all panels.
+
+    An agent has the same in all figures. Values, and more names than there are colors,
+    are dark to light.
+    """
+    names = list(dict.fromkeys(x for curves in figure.panels.values() for x in curves))
+    if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
+        shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
+        return dict(zip(names, shades, strict=True))
+    of_agent = dict(zip(AGENTS, plotting.COLORS, strict=False))
+    color_of = {name: of_agent[name] for name in names if name in of_agent}
+    free = (x for x in plotting.COLORS if x not in color_of.values())
+    return {name: color_of.get(name) or next(free) for name in names}
+
+
 def _draw_curves(page: Page, panel: str, axes: Any) -> None:
     """Draw learning curves: interquartile mean and 95% interval over seeds."""
-    # Fixed colors for agents, dark to light ones for values and for many curves.
-    curves = page.figure.panels[panel]
-    shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(curves)))
-    color_of = dict(zip(curves, shades, strict=True))
-    names = [curve.agent for curve in curves.values()]
-    if len(set(names)) == len(names):
-        order = list(dict.fromkeys([*AGENTS, *names]))
-        color_of |= {
-            label: plotting.COLORS[order.index(name) % len(plotting.COLORS)]
-            for label, name in zip(curves, names, strict=True)
-        }
-    elif len(names) <= len(plotting.COLORS) and not all(map(str.isdecimal, curves)):
-        color_of = dict(zip(curves, plotting.COLORS, strict=False))
-    for label in curves:
+    color_of = _colors(page.figure)
+    for label in page.figure.panels[panel]:
         if (panel, label) not in page.results:
             continue
         records = list(page.results[panel, label].records.values())

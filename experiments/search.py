@@ -1,234 +1,171 @@
-"""The search for hyperparameters: many points on few seeds, then the best on more.
+"""The plan: what is searched, alike for every agent, and how much of it is stored.
 
-The best of many points on few seeds is partly the luckiest, so the best four are tried
-again on new seeds, and the mean over both decides. Figures train the chosen point with
-seeds of their own. The spaces are the ranges of the paper's appendix.
+Environments are out of step and rewards are normalized. Every agent is searched with
+the same number of points on every task, dense and delayed, with two seeds of the
+search's own. Where the best point has a value at an end of its grid, the next value
+beyond is tried too. So one table gives the best point of each task, which is the
+paper's protocol, and the best point over all tasks. Figures train the chosen points
+with seeds of their own.
 """
 
 import dataclasses
-import functools
 import itertools
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.store import Run, Store
 from gasil_jax.config import Config
+from gasil_jax.figures import statistics
 
 Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
 
-AGENTS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
-#: The agents of the figures that compare two.
-PAIR = ("ppo", "ppo+gasil")
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 #: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
-#: Noise on walker2d's observations in its search: the middle of the paper's three.
-NOISE = 0.1
-#: Environments per seed: more where physics is slow, because a GPU is fast only with
-#: thousands of environments.
-NUM_ENVS, NUM_ENVS_OF = 32, {"ant": 64, "humanoid": 64}
-#: The runs of these figures and searches had all environments reset together.
-STAGGER_EPISODES, ALGORITHM_VERSION = False, 1
-
-_RATES = (3e-4, 1e-4, 5e-5, 3e-5)
-# PPO's search shows how much the lower two rates cost in 1M steps.
-_RATE, _HIGHER = {"learning_rate": _RATES}, {"learning_rate": _RATES[:2]}
-_COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
-#: What each agent's search draws from.
+#: The agents of the figures that compare two, and the one beyond the paper.
+PAIR, ADAPTIVE = ("ppo", "ppo+gasil"), "ppo+gasil-adaptive"
+#: Steps of a run in a search.
+STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
+#: Points of each agent's search; their seeds.
+_POINTS, _SEEDS = 12, range(1000, 1002)
+#: Every agent's hyperparameters, and those of one or two.
+_SHARED: Space = {
+    "learning_rate": (1e-4, 3e-4, 6e-4),
+    "gae_lambda": (0.95, 0.98, 0.995),
+    "gamma": (0.99, 0.995),
+    "initial_deviation": (0.15, 0.25, 0.4, 0.6, 1.0),
+}
+_ALPHA: Space = {"alpha": (0.02, 0.1, 0.2, 1.0)}
+_DISCRIMINATOR: Space = {
+    "discriminator_updates": (1, 5, 20),
+    "discriminator_learning_rate": (2e-5, 1e-4, 3e-4),
+    "buffer_steps": (1000, 10_000),
+}
+#: What each agent's search draws from, in increasing order.
 SPACES: Mapping[str, Space] = {
-    "ppo": _RATE,
-    "ppo+bc": {**_HIGHER, "behavior_cloning_coefficient": _COEFFICIENTS},
-    "ppo+sil": {**_HIGHER, "sil_coefficient": _COEFFICIENTS},
-    "ppo+gasil": {
-        **_HIGHER,
-        "discriminator_updates": (1, 5, 10, 20),
-        "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
-        "buffer_steps": (1000, 10000),
-        "alpha": (0.02, 0.1, 0.2, 1.0),
+    "ppo": _SHARED,
+    "ppo+bc": {**_SHARED, "behavior_cloning_coefficient": (0.01, 0.1, 0.3, 1.0)},
+    "ppo+sil": {**_SHARED, "sil_coefficient": (0.01, 0.1, 0.3, 1.0)},
+    "gasil": {**_SHARED, **_DISCRIMINATOR},
+    "ppo+gasil": {**_SHARED, **_DISCRIMINATOR, **_ALPHA},
+    "ppo+bonus": {**_SHARED, **_ALPHA},
+    ADAPTIVE: {
+        **_SHARED,
+        **_DISCRIMINATOR,
+        "imitation_weight": (0.35, 0.7, 1.0),
     },
 }
-_POINT_MASS = {"learning_rate": (1e-3, 3e-4, 1e-4, 3e-5)}
-_STRONG = {
-    "discriminator_updates": (20,),
-    "discriminator_learning_rate": (3e-4,),
-    "alpha": (1.0,),
+AGENTS = tuple(SPACES)
+#: The values below and above a grid, where an agent may have them. How the size of the
+#: buffer matters has a figure of its own.
+_BEYOND: Mapping[str, tuple[Any, Any]] = {
+    "learning_rate": (3e-5, 1.2e-3),
+    "gae_lambda": (0.9, None),
+    "gamma": (0.98, 0.998),
+    "initial_deviation": (0.08, 1.5),
+    "alpha": (0.005, 3.0),
+    "behavior_cloning_coefficient": (0.003, 3.0),
+    "sil_coefficient": (0.003, 3.0),
+    "discriminator_updates": (None, 40),
+    "discriminator_learning_rate": (5e-6, 1e-3),
+    "buffer_steps": (None, None),
+    "imitation_weight": (0.15, None),
 }
-_OTHER_SPACES: Mapping[tuple[str, str], Space] = {
-    ("ant", "ppo"): _HIGHER,
-    ("humanoid", "ppo"): _HIGHER,
-    ("point_mass", "ppo"): _POINT_MASS,
-    ("point_mass", "ppo+gasil"): {**_POINT_MASS, **_STRONG},
-}
-#: Steps of a run in a search where they are not 1M; humanoid's figure has three times
-#: as many.
-STEPS = {"point_mass": 500_000, "humanoid": 333_000}
-# Runs of the first stage; points of the second stage, and their seeds.
-_RUNS, _RUNS_OF = 32, {"ant": 16, "humanoid": 16}
-_BEST, _SEEDS, _SEEDS_OF = 4, 4, {"ant": 2, "humanoid": 2}
-_FIRST_SEED, _SECOND_SEED = 1000, 2000
-#: With this number of seeds in the first stage there is no second stage.
-_ENOUGH_SEEDS = 8
-# Multiplication by 1, 2 and 3 in the field of four elements; its sum is exclusive or.
-_TIMES = ((0, 1, 2, 3), (0, 2, 3, 1), (0, 3, 1, 2))
 
 
-def every_point(space: Space) -> tuple[Point, ...]:
-    """Return all points of a space."""
-    every = itertools.product(*space.values())
-    return tuple(dict(zip(space, values, strict=True)) for values in every)
+def draw(agent: str) -> tuple[Point, ...]:
+    """Return the points of an agent's search, all different.
 
-
-def draw(space: Space) -> tuple[Point, ...]:
-    """Return at most sixteen points of a space of up to five hyperparameters.
-
-    If the space has no more points, these are all of them. Otherwise they are an
-    orthogonal array: any two hyperparameters have every pair of their values equally
-    often, so that no value's score depends on the values it was drawn with.
+    Each value of a hyperparameter is equally often among them, or once more than
+    another; which values meet is random.
     """
-    if len(every := every_point(space)) <= 16:
-        return every
-    if len(space) > 5 or any(len(values) not in (2, 4) for values in space.values()):
-        raise ValueError(
-            f"{dict(space)}: at most five hyperparameters of two or four values"
-        )
-    rng = np.random.default_rng(0)
-    # Values are assigned to levels at random; each of two values has two levels.
-    of_level = {
-        name: [values[i % len(values)] for i in rng.permutation(4)]
-        for name, values in space.items()
-    }
-    pairs = itertools.product(range(4), repeat=2)
-    rows = [(a, b, *(a ^ times[b] for times in _TIMES)) for a, b in pairs]
-    return tuple(
-        {name: of_level[name][level] for name, level in zip(space, row, strict=False)}
-        for row in rows
-    )
+    rng = np.random.default_rng(zlib.crc32(agent.encode()))
+    rows: list[tuple[Any, ...]] = []
+    while len(set(rows)) < _POINTS:
+        columns = [
+            rng.permutation([values[i % len(values)] for i in range(_POINTS)]).tolist()
+            for values in SPACES[agent].values()
+        ]
+        rows = list(zip(*columns, strict=True))
+    return tuple(dict(zip(SPACES[agent], row, strict=True)) for row in rows)
 
 
-class Stage(NamedTuple):
-    """Points and the seeds that each of them gets."""
-
-    points: tuple[Point, ...]
-    seeds: range
-
-
-def scores(runs: Sequence[Sequence[Run]], store: Store) -> np.ndarray | None:
-    """Return the mean return over the last fifth of training, (points, seeds).
-
-    Args:
-      runs: the runs of each point.
-      store: where they are; the result is None if it lacks one of them.
-    """
-    if store.missing(itertools.chain(*runs)):
-        return None
-    return np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+def beyond(agent: str, point: Point) -> Iterator[Point]:
+    """Give a point with each of its values at an end of a grid one step further."""
+    for name, values in SPACES[agent].items():
+        for end, further in zip((values[0], values[-1]), _BEYOND[name], strict=True):
+            if point[name] == end and further is not None:
+                yield {**point, name: further}
 
 
 @dataclasses.dataclass(frozen=True)
 class Search:
-    """A search for an agent's hyperparameters on a task.
+    """The search of one agent on one task.
 
     Attributes:
       env: name of the environment.
       agent: name of the agent.
       reward_delay: the environment's reward delay.
-      obs_noise: the environment's observation noise.
-      normalize_rewards: whether PPO's rewards are normalized.
-      after: an earlier search to continue. Hyperparameters that are not `free` are
-        fixed at the value whose points had the best average score in it.
-      free: the hyperparameters to search then: all their points, on two seeds each.
+      decompose_rewards: decompose rewards where they are delayed, even if the agent
+        does not by itself, as adaptive imitation does.
     """
 
     env: str
     agent: str
     reward_delay: int = 1
-    obs_noise: float = 0.0
-    normalize_rewards: bool = False
-    after: "Search | None" = None
-    free: tuple[str, ...] = ()
-    #: The version of the algorithm that its runs are of.
-    version: ClassVar[int] = ALGORITHM_VERSION
-
-    @property
-    def space(self) -> Space:
-        """The space that points are drawn from, if no earlier search is continued."""
-        return _OTHER_SPACES.get((self.env, self.agent), SPACES[self.agent])
+    decompose_rewards: bool = False
 
     def config(self, point: Point) -> Config:
-        """Return a point's config: its values, our batch and the appendix's values."""
+        """Return a point's config."""
+        decompose = self.decompose_rewards or self.agent == ADAPTIVE
         return Config(
             agent=self.agent,
-            total_steps=STEPS.get(self.env, 1_000_000),
-            num_envs=NUM_ENVS_OF.get(self.env, NUM_ENVS),
-            normalize_rewards=self.normalize_rewards,
-            stagger_episodes=STAGGER_EPISODES,
+            total_steps=_STEPS_OF.get(self.env, STEPS),
+            num_envs=32,
+            normalize_rewards=True,
+            decompose_rewards=decompose and self.reward_delay > 1,
         ).replace(**point)
 
-    def runs(self, stage: Stage) -> list[list[Run]]:
-        """Return the runs of a stage, a list for each point."""
-        run = functools.partial(
-            Run,
-            self.env,
-            reward_delay=self.reward_delay,
-            obs_noise=self.obs_noise,
-            algorithm_version=ALGORITHM_VERSION,
-        )
+    def runs(self, points: Iterable[Point]) -> list[list[Run]]:
+        """Return the runs of points, a list for each."""
         return [
-            [run(self.config(point), seed) for seed in stage.seeds]
-            for point in stage.points
+            [Run(self.env, self.config(x), seed, self.reward_delay) for seed in _SEEDS]
+            for x in points
         ]
 
-    def scores(self, stage: Stage, store: Store) -> np.ndarray | None:
+    def scores(self, points: Iterable[Point], store: Store) -> np.ndarray | None:
         """Return the mean return over the last fifth of training, (points, seeds).
 
-        The result is None if the store lacks a run of the stage.
+        The result is None if the store lacks a run. A seed that ended no episode in
+        that time has -inf.
         """
-        return scores(self.runs(stage), store)
+        runs = self.runs(points)
+        if store.missing(itertools.chain(*runs)):
+            return None
+        finals = np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
+        return np.where(np.isfinite(finals), finals, -np.inf)
 
-    def first(self, store: Store) -> Stage | None:
-        """Return the first stage, or None if an earlier search must end first."""
-        if self.after is None:
-            points = draw(self.space)
-            seeds = _RUNS_OF.get(self.env, _RUNS) // len(points)
-        else:
-            before = self.after.first(store)
-            scores = None if before is None else self.after.scores(before, store)
-            if before is None or scores is None:
-                return None
-            space = dict(self.after.space)
-            for name in set(space) - set(self.free):
-                of_values = by_value(name, before.points, means(scores))
-                space[name] = (max(of_values, key=lambda x: of_values[x]),)
-            points, seeds = every_point(space), 2
-        return Stage(points, range(_FIRST_SEED, _FIRST_SEED + seeds))
-
-    def stages(self, store: Store) -> list[Stage]:
-        """Return the stages whose points are known from the runs in the store."""
-        first = self.first(store)
-        if first is None:
-            return []
-        scores = self.scores(first, store)
-        if len(first.seeds) >= _ENOUGH_SEEDS or scores is None:
-            return [first]
-        order = np.argsort(-means(scores), kind="stable")[:_BEST]
-        seeds = range(_SECOND_SEED, _SECOND_SEED + _SEEDS_OF.get(self.env, _SEEDS))
-        return [first, Stage(tuple(first.points[i] for i in order), seeds)]
+    def points(self, store: Store) -> tuple[Point, ...]:
+        """Return the drawn points and, if all their runs are stored, those beyond."""
+        drawn = draw(self.agent)
+        scores = self.scores(drawn, store)
+        if scores is None:
+            return drawn
+        best = drawn[int(scores.mean(axis=1).argmax())]
+        return (*drawn, *beyond(self.agent, best))
 
     def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """Return the best point and its scores in all stages, or None if incomplete."""
-        stages = self.stages(store)
-        scores = [self.scores(stage, store) for stage in stages]
-        if not stages or (all_scores := scores[0]) is None or scores[-1] is None:
+        """Return the best point and its scores, or None if the search is incomplete."""
+        points = self.points(store)
+        scores = self.scores(points, store)
+        if scores is None:
             return None
-        points = stages[-1].points
-        if len(stages) > 1:
-            among = [stages[0].points.index(point) for point in points]
-            all_scores = np.hstack([all_scores[among], scores[-1]])
-        chosen = int(means(all_scores).argmax())
-        return points[chosen], all_scores[chosen]
+        chosen = int(scores.mean(axis=1).argmax())
+        return points[chosen], scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
         """Return the chosen point, or None if the search is incomplete."""
@@ -236,16 +173,98 @@ class Search:
         return None if best is None else best[0]
 
 
-def means(scores: np.ndarray) -> np.ndarray:
-    """Return the mean over seeds, (points,); -inf if a seed ended no episode."""
-    means = scores.mean(axis=1)
-    return np.where(np.isfinite(means), means, -np.inf)
+#: Every task with its delay, delayed ones first.
+CELLS = tuple((env, delay) for delay in (DELAY, 1) for env in TASKS)
 
 
-def by_value(name: str, points: Sequence[Point], means: np.ndarray) -> dict[Any, float]:
-    """Return the mean over the points with each value of a hyperparameter."""
-    values = np.array([point[name] for point in points])
-    return {
-        value: float(means[values == value].mean())
-        for value in dict.fromkeys(point[name] for point in points)
-    }
+def searches(env: str, reward_delay: int) -> dict[str, Search]:
+    """Return the searches on a task by the names of their curves.
+
+    Beside the agents there is PPO with decomposed rewards: what it shares with
+    `ppo+gasil-adaptive` is no merit of imitation.
+    """
+    by_name = {agent: Search(env, agent, reward_delay) for agent in AGENTS}
+    if reward_delay > 1:
+        decomposed = Search(env, "ppo", reward_delay, decompose_rewards=True)
+        by_name["ppo, decomposed"] = decomposed
+    return by_name
+
+
+@dataclasses.dataclass(frozen=True)
+class SingleSetting(Search):
+    """The search of one agent for one point for all tasks, dense and delayed."""
+
+    def chosen(self, store: Store) -> Point | None:
+        """Return the drawn point of the best mean rank, or None if runs are missing.
+
+        Points are ranked within each task and delay, because returns of tasks have
+        different units.
+        """
+        ranks, drawn = [], draw(self.agent)
+        for env, delay in CELLS:
+            search = dataclasses.replace(self, env=env, reward_delay=delay)
+            scores = search.scores(drawn, store)
+            if scores is None:
+                return None
+            ranks.append(scores.mean(axis=1).argsort().argsort())
+        return drawn[int(np.mean(ranks, axis=0).argmax())]
+
+
+def importance(agent: str, store: Store) -> dict[str, float]:
+    """Return how much of its points' variance each hyperparameter explains alone.
+
+    It is the mean of `statistics.importance` over the tasks, dense and delayed, whose
+    drawn points are all stored; empty if there is none.
+    """
+    points, shares = draw(agent), []
+    for env, delay in CELLS:
+        scores = Search(env, agent, delay).scores(points, store)
+        if scores is not None and np.isfinite(scores).all():
+            means = scores.mean(axis=1)
+            values = {name: [point[name] for point in points] for name in points[0]}
+            explained = {n: statistics.importance(x, means) for n, x in values.items()}
+            shares.append({name: share or 0.0 for name, share in explained.items()})
+    return (
+        {name: float(np.mean([x[name] for x in shares])) for name in shares[0]}
+        if shares
+        else {}
+    )
+
+
+class Coverage(NamedTuple):
+    """How many runs of an agent on a task are stored and planned.
+
+    A search whose drawn points are not all stored has a plan of these alone, and a
+    search that is incomplete has no final runs yet.
+    """
+
+    name: str
+    search: Search
+    searched: int
+    to_search: int
+    trained: int
+    to_train: int
+
+    @property
+    def complete(self) -> bool:
+        """Whether all planned runs are stored."""
+        return (self.searched, self.trained) == (self.to_search, self.to_train)
+
+
+def coverage(store: Store, curves: Iterable[Any]) -> list[Coverage]:
+    """Return what is stored of the plan, for each task, delay and agent.
+
+    Args:
+      store: the store of all runs.
+      curves: the curves of the figure that trains what the searches chose.
+    """
+    stored = lambda runs: sum(run in store for run in runs)
+    of = {curve.search: curve for curve in curves}
+    rows = []
+    for task in CELLS:
+        for name, search in searches(*task).items():
+            runs = list(itertools.chain(*search.runs(search.points(store))))
+            final = of[search].runs(store)
+            counts = (stored(runs), len(runs), stored(final), of[search].seeds)
+            rows.append(Coverage(name, search, *counts))
+    return rows

@@ -1,152 +1,151 @@
 """The page of all claims, and the blocks of the README that are generated.
 
-A claim's verdict is a rule on the comparisons of its figure's page.
+A claim's verdict follows from the comparisons of its figure's page.
 """
 
+import json
 import pathlib
 import shlex
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 from experiments import report
-from experiments.figures import FIGURES, NORMALIZED, name_of
+from experiments.figures import FIGURES, name_of
 from experiments.report import Page
-from experiments.search import AGENTS, DELAY, TASKS
+from experiments.search import ADAPTIVE, DELAY, TASKS
 from experiments.store import RESULTS, Store
+from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
-#: A figure and one of its panels, by the name of a row in a table.
-_Rows = Mapping[str, tuple[str, str]]
+#: A comparison of a page, and the verdict that the claim expects of it.
+_Expected = tuple[tuple[str, ...], str]
 
 
-def _rows(tasks: Sequence[str]) -> _Rows:
-    """Return the tasks with rewards as they are, delayed ones first."""
-    delayed = {f"{env}, delayed": ("delayed_mujoco", env) for env in tasks}
-    return delayed | {env: ("mujoco", env) for env in tasks}
+class Claim(NamedTuple):
+    """A claim, and what must be seen for it to hold.
+
+    Attributes:
+      words: what is claimed.
+      figure: the figure whose comparisons decide.
+      cases: what is expected in each case, such as a task, by its name. A case agrees
+        if all of its comparisons have the expected verdict.
+      needed: the number of cases that must agree for the claim to hold; fewer are a
+        part of it.
+    """
+
+    words: str
+    figure: str
+    cases: Mapping[str, Sequence[_Expected]]
+    needed: int
+
+
+def _ahead(delay: int, others: Sequence[str]) -> dict[str, list[_Expected]]:
+    """Expect PPO+GASIL to be better than other agents on each task."""
+    panels = [name_of(env, delay) for env in TASKS]
+    return {p: [((p, "ppo+gasil", x), "better") for x in others] for p in panels}
+
+
+def _comparisons(name: str, start: str = "") -> dict[str, list[_Expected]]:
+    """Expect the first of two curves to be better, in each comparison of a figure.
+
+    Args:
+      name: name of the figure.
+      start: how the names of the panels begin that count.
+    """
+    keys = [key for key in FIGURES[name].compared() if key[0].startswith(start)]
+    return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
+
+
+_OTHERS, _CONTROL = ("ppo", "ppo+bc", "ppo+sil"), ("ppo+bonus",)
+_GROWS = [key for key in FIGURES["stochastic_walker2d"].compared() if len(key) == 4]
+CLAIMS = (
+    Claim(
+        "Point mass: PPO+GASIL is slower at first and ends higher than PPO",
+        "point_mass",
+        {
+            "early": [(("point_mass", "ppo+gasil early", "ppo early"), "worse")],
+            "at the end": [(("point_mass", "ppo+gasil", "ppo"), "better")],
+        },
+        needed=2,
+    ),
+    Claim(
+        "Dense rewards: it is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
+        "matrix",
+        _ahead(1, _OTHERS),
+        needed=4,
+    ),
+    Claim(
+        "Delayed rewards: it is ahead of them by a large margin on all tasks",
+        "matrix",
+        _ahead(DELAY, _OTHERS),
+        needed=6,
+    ),
+    Claim(
+        "Noise: the gap to PPO is larger with it",
+        "stochastic_walker2d",
+        {key[0]: [(key, "better")] for key in _GROWS},
+        needed=3,
+    ),
+    Claim(
+        "Discriminator updates: too few (1) and too many (20) do poorly",
+        "hyperparameters",
+        _comparisons("hyperparameters", "discriminator_updates"),
+        needed=4,
+    ),
+    Claim(
+        "Buffer: too small (500 steps) and too large (5000) do poorly",
+        "hyperparameters",
+        _comparisons("hyperparameters", "buffer_steps"),
+        needed=4,
+    ),
+    Claim(
+        "Control, not a claim of the paper: with delayed rewards PPO+GASIL is ahead of "
+        "the same pay for staying up without imitation (PPO+BONUS)",
+        "matrix",
+        _ahead(DELAY, _CONTROL),
+        needed=6,
+    ),
+)
 
 
 class Summary:
     """The page of all claims and the README's blocks, from one store."""
 
     #: The methods that slots may name; others name a figure and one of its slots.
-    SLOTS = ("claims", "tuned", "as_they_are", "figures")
+    SLOTS = ("claims", "figures")
 
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
 
-    def _ahead(self, figure: str, panels: Sequence[str], needed: int) -> str:
-        """Holds if PPO+GASIL is better than each other agent on so many tasks."""
-        compared = self.pages[figure].comparisons.items()
-        verdicts = {
-            p: {x.verdict for key, x in compared if key[0] == p} for p in panels
+    def verdict(self, claim: Claim) -> str:
+        """Return whether a claim holds, in words, as far as its curves are complete."""
+        compared = self.pages[claim.figure].comparisons
+        measured = {
+            case: all(compared[key].verdict == verdict for key, verdict in expected)
+            for case, expected in claim.cases.items()
+            if all(key in compared for key, _ in expected)
         }
-        better = [panel for panel in panels if verdicts[panel] == {"better"}]
-        worse = [panel for panel in panels if "worse" in verdicts[panel]]
-        word = "holds" if len(better) >= needed else "holds in part"
-        words = f"{word if better else 'does not hold'}: better than all three on "
-        words += f"{len(better)} of {len(panels)} tasks"
-        words += f" ({', '.join(better)})" if better else ""
-        return words + (f", worse than one on {', '.join(worse)}" if worse else "")
-
-    def _point_mass(self) -> str:
-        """Holds if PPO+GASIL is worse early and better at the end."""
-        early, late = (
-            self.pages["point_mass"].verdict("point_mass", f"ppo+gasil{x}", f"ppo{x}")
-            for x in (" early", "")
-        )
-        word = "holds" if (early, late) == ("worse", "better") else "does not hold"
-        layout = "in a layout that was chosen for it"
-        return f"{word}: {early} early, {late} at the end, {layout}"
-
-    def _noise(self) -> str:
-        """Holds if the gap at some noise is clearly larger than without."""
-        compared = self.pages["stochastic_walker2d"].comparisons
-        better = [key for key, x in compared.items() if x.verdict == "better"]
-        ahead = ", ".join(key[0] for key in better if len(key) == 3) or "none"
-        grows = ", ".join(key[0] for key in better if len(key) == 4)
-        return (
-            f"{'holds' if grows else 'not clear'}: better than PPO at {ahead}; by "
-            f"clearly more than without noise at {grows or 'none'}"
-        )
-
-    def _ends(self, name: str, few: str, many: str) -> str:
-        """Holds if the best value is better than both of these in most panels."""
-        page = self.pages["hyperparameters"]
-        panels = [panel for panel in page.figure.panels if panel.startswith(name)]
-        best = {panel: page.best_value(panel) for panel in panels}
-        counts = [
-            sum(
-                x != end and page.verdict(p, x, end) == "better"
-                for p, x in best.items()
-            )
-            for end in (few, many)
-        ]
-        word = "holds in part" if any(counts) else "not clear"
-        word = "holds" if min(counts) > len(panels) / 2 else word
-        words = f"than {few} in {counts[0]} and than {many} in {counts[1]}"
-        return f"{word}: the best value is better {words} of {len(panels)} panels"
+        if not measured:
+            return "not measured yet"
+        agree = [case for case, agrees in measured.items() if agrees]
+        word = "holds" if len(agree) >= claim.needed else "holds in part"
+        word = word if agree else "does not hold"
+        lacking = len(claim.cases) - len(measured)
+        words = f"{word}: in {len(agree)} of {len(measured)} cases"
+        words += f" ({'; '.join(agree)})" if agree else ""
+        return words + (f"; {lacking} not measured yet" if lacking else "")
 
     def claims(self) -> str:
-        """Return a table with each claim of the paper and our measurements."""
-        dense, delayed = ([name_of(x, d) for x in NORMALIZED] for d in (1, DELAY))
-        normalized = "The same, with normalized rewards"
-        rows = [
-            (
-                "Point mass: PPO settles early on a poorer policy, PPO+GASIL is slower "
-                "at first and ends higher",
-                self._point_mass(),
-            ),
-            (
-                "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most "
-                "tasks",
-                self._ahead("mujoco", TASKS, needed=4),
-            ),
-            (normalized, self._ahead("normalized_rewards", dense, needed=3)),
-            (
-                "Delayed rewards: it is ahead of them by a large margin on all tasks",
-                self._ahead("delayed_mujoco", TASKS, needed=6),
-            ),
-            (normalized, self._ahead("normalized_rewards", delayed, needed=4)),
-            ("Noise: the gap to PPO is larger with it", self._noise()),
-            (
-                "Discriminator updates: too few (1) and too many (20) do poorly",
-                self._ends("discriminator_updates", "1", "20"),
-            ),
-            (
-                "Buffer: too small (500 steps) and too large (5000) do poorly",
-                self._ends("buffer_steps", "500", "5000"),
-            ),
-        ]
+        """Return a table with each claim and what was measured."""
+        rows = [(claim.words, self.verdict(claim)) for claim in CLAIMS]
         return report.markdown_table(["The paper's claim", "Here"], rows)
-
-    def _table(self, rows: _Rows) -> str:
-        """Return the final returns of all agents."""
-        table = []
-        for name, (figure, panel) in rows.items():
-            cells = []
-            for x in (self.pages[figure].results.get((panel, y)) for y in AGENTS):
-                seeds = "" if x is None or x.complete else f" ({x.seeds} seeds)"
-                cells.append(f"{report.interval(x.final)}{seeds}" if x else "")
-            table.append([name, *cells])
-        return report.markdown_table(["", *map(str.upper, AGENTS)], table)
-
-    def as_they_are(self) -> str:
-        """Return the results with rewards as they are of tasks with others too."""
-        return self._table(_rows(NORMALIZED))
-
-    def tuned(self) -> str:
-        """Return the results of every agent with its tuned preset."""
-        rows = {
-            name: ("normalized_rewards", name.replace(", ", "-"))
-            for name in _rows(NORMALIZED)
-        }
-        return self._table({**rows, **_rows(TASKS[len(NORMALIZED) :])})
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""
-        begun = {name: page for name, page in self.pages.items() if page.begun}
-        return "\n".join(f"- [{x.figure.title}]({n}.md)" for n, x in begun.items())
+        pages = self.pages.items()
+        return "\n".join(f"- [{page.figure.title}]({name}.md)" for name, page in pages)
 
     def value(self, name: str, *arguments: str) -> str:
         """Return what stands in a slot: one of these, or a figure's name and its slot.
@@ -165,15 +164,31 @@ class Summary:
 
     def text(self) -> str:
         """Return the page of all claims as Markdown."""
-        note = report.fill((report.NOTES / "README.md").read_text(), self.value)
-        title, body = note.split("\n", 1)
-        in_step = any(page.in_step for page in self.pages.values())
-        parts = [title, *([report.IN_STEP] if in_step else []), body.strip()]
-        return "\n\n".join(parts) + "\n"
+        return report.fill((report.NOTES / "README.md").read_text(), self.value)
+
+    def tuned(self) -> str:
+        """Return the presets "tuned", with what complete searches chose, as JSON."""
+        rows = json.loads(presets.TUNED.read_text())
+        for page in self.pages.values():
+            for search in page.figure.searches.values():
+                point = search.chosen(page.searched)
+                # Adaptive imitation has one setting for all tasks.
+                own = search.decompose_rewards or search.agent == ADAPTIVE
+                if point is None or own:
+                    continue
+                config = report.changed(search.config(point))
+                kind = "delayed" if search.reward_delay > 1 else "dense"
+                of_task = rows[kind].setdefault(search.env, {})
+                of_task[search.agent] = dict(sorted(config.items()))
+        return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
     def write(self) -> None:
-        """Write the page of all claims and the README's blocks."""
+        """Write the page of all claims, the README's blocks and the presets."""
         text = report.fill_blocks(README.read_text(), self.value)
-        for path, content in ((RESULTS / "README.md", self.text()), (README, text)):
+        for path, content in (
+            (RESULTS / "README.md", self.text()),
+            (README, text),
+            (presets.TUNED, self.tuned()),
+        ):
             with output_file.whole(path) as partial:
                 partial.write_text(content)

@@ -16,7 +16,10 @@ from gasil_jax.figures.statistics import (
 )
 
 #: Okabe and Ito's colours, which colour-blind readers can distinguish.
-COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+COLORS = (
+    *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
+    *("#E69F00", "#56B4E9", "#000000", "#999999"),
+)
 
 
 _POINTS = 50

@@ -176,34 +176,35 @@ def toy(monkeypatch):
     curve = Curve("point_mass", "ppo", seeds=2, changes=changes)
     other = dataclasses.replace(curve, changes={**curve.changes, "learning_rate": 1e-4})
     figure = Figure("Toy", "None.", {"a": {"x": curve, "y": other}}, favourite="x")
-    monkeypatch.setitem(FIGURES, "mujoco", figure)
+    monkeypatch.setitem(FIGURES, "matrix", figure)
     return figure
 
 
 def test_a_figure_is_trained_from_end_to_end_and_in_parts(toy, tmp_path, capsys):
-    note = __main__.Page("mujoco", Store(tmp_path), figure=toy).note
+    note = __main__.Page("matrix", Store(tmp_path), figure=toy).note
     assert note == "{{table}}"
     for part in ("1/2", "2/2"):
         folders = ("--runs", str(tmp_path / "runs"), "--evaluate-episodes", "0")
         results = tmp_path / part[0]
-        arguments = ("mujoco", *folders, "--results", str(results), "--part", part)
+        arguments = ("matrix", *folders, "--results", str(results), "--part", part)
         assert __main__.main([*arguments, "--devices", "1"]) == 0
         requested = toy.requested(Store(results))
         assert len(Store(results / "runs").missing(requested)) == 2
-        assert "Not trained yet: 2 of 4 runs." in (results / "mujoco.md").read_text()
+        assert "Not trained yet: 2 of 4 runs." in (results / "matrix.md").read_text()
     results = str(tmp_path / "1")
     assert __main__.main(["merge", str(tmp_path / "2"), "--results", results]) == 0
     assert "2 of 2 runs are new" in capsys.readouterr().out
-    assert __main__.main(["mujoco", "--results", results, "--list"]) == 0
-    assert "mujoco: 0 runs are missing" in capsys.readouterr().out
+    assert __main__.main(["matrix", "--results", results, "--list"]) == 0
+    assert "matrix: 0 runs are missing" in capsys.readouterr().out
 
 
-def test_the_small_version_has_few_seeds_and_steps():
-    figure = __main__._small(FIGURES["normalized_rewards"], ["swimmer"])
+def test_the_small_version_has_few_seeds_and_steps(tmp_path):
+    figure = __main__._small(FIGURES["matrix"], ["swimmer"])
     assert list(figure.panels) == ["swimmer"] and not figure.searches
     for _, _, curve in figure.curves():
         assert (curve.seeds, curve.total_steps) == (3, 100_000)
-    assert list(__main__._small(FIGURES["mujoco"], ()).panels) == ["hopper"]
+        assert len(curve.runs(Store(tmp_path))) == 3  # whatever is searched
+    assert list(__main__._small(FIGURES["matrix"], ()).panels) == ["hopper-delayed"]
 
 
 @pytest.mark.parametrize(
@@ -211,12 +212,12 @@ def test_the_small_version_has_few_seeds_and_steps():
     [
         (("nonsense",), "experiment 'nonsense' is unknown: did you mean"),
         (
-            ("mujoco", "--only", "hoper"),
+            ("matrix", "--only", "hoper"),
             "only 'hoper' is unknown: did you mean 'hopper'",
         ),
-        (("mujoco", "--part", "3/2"), "part is '3/2'"),
-        (("mujoco", "--devices", "0"), "devices is 0"),
-        (("mujoco", "--quick", "--results", "x"), "results is x: --quick writes below"),
+        (("matrix", "--part", "3/2"), "part is '3/2'"),
+        (("matrix", "--devices", "0"), "devices is 0"),
+        (("matrix", "--quick", "--results", "x"), "results is x: --quick writes below"),
         (("merge", "/proc/none"), "folder is /proc/none: it must have TASK.npz"),
         (("report", "--help-me"), "Unrecognized options: --help-me"),
         (("benchmark", "--tables", "speed"), "tables has 'speed': allowed physics"),

@@ -2,14 +2,13 @@
 
 import dataclasses
 
-import jax
 import numpy as np
 import pytest
 
 import gasil_jax
-from experiments.figures import CONSTANT, FIGURES, Arm, Curve, Figure, grid
-from experiments.search import DELAY, PAIR
-from experiments.store import RESULTS, Store
+from experiments.figures import FIGURES, Arm, Curve, Figure, grid
+from experiments.search import DELAY, PAIR, Search
+from experiments.store import RESULTS, Record, Store
 from gasil_jax.config import Config, validate
 
 STORE = Store(RESULTS / "runs")
@@ -21,8 +20,6 @@ def test_every_run_of_a_figure_is_valid(name):
     for config in {run.config for run in runs}:
         validate(config, gasil_jax.agents())
     assert len(set(runs)) == len(runs)
-    # The points of a search decide for the single setting.
-    assert runs or name == "single_setting"
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -38,84 +35,41 @@ def test_a_figure_names_what_it_has(name):
         assert sum(weight for weight, _, _ in terms) == 0
 
 
-#: Their pages say how many of their runs are stored.
-INCOMPLETE = ("batch_geometry", "wider_search")
-
-
-@pytest.mark.parametrize("name", [x for x in FIGURES if x not in INCOMPLETE])
-def test_what_is_published_is_complete(name):
-    if (RESULTS / f"{name}.md").exists():
-        assert not STORE.missing(FIGURES[name].requested(STORE))
-
-
 def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
-    for curve in FIGURES["mujoco"].panels["hopper"].values():
-        assert curve.runs(Store(tmp_path)) == () and len(curve.runs(STORE)) == 10
+    store, curves = Store(tmp_path), FIGURES["matrix"].panels["hopper-delayed"]
+    for curve in curves.values():
+        assert curve.runs(store) == ()
+        points = curve.search.points(store)
+        for seeds in curve.search.runs(points):
+            for run in seeds:
+                store.add({run: Record(*[np.ones(10)] * 3, {"physics": "mjx"})})
+        further = curve.search.points(store)[len(points) :]
+        (chosen,) = curve.search.runs(points[:1])
+        for seeds in curve.search.runs(further):
+            for run in seeds:
+                store.add({run: Record(*[np.ones(10)] * 3, {"physics": "mjx"})})
+        runs = curve.runs(store)
+        assert [run.seed for run in runs] == list(range(10))
+        assert runs[0].config == chosen[0].config
 
 
-def test_the_control_differs_in_the_discriminator_alone():
-    for curves in FIGURES["constant_bonus"].panels.values():
-        control, tuned = (curves[name].runs(STORE)[0] for name in ("constant", PAIR[1]))
-        one, other = (vars(x.config.hyperparameters) for x in (control, tuned))
-        changed = {name for name in one if one[name] != other[name]}
-        one, other = (dict(vars(x.config)) for x in (control, tuned))
-        del one["hyperparameters"], other["hyperparameters"]
-        changed |= {name for name in one if one[name] != other[name]}
-        assert "discriminator_entropy_coefficient" in changed
-        assert all(name.startswith("discriminator_") for name in changed)
-
-
-def test_the_control_s_discriminator_is_held_at_a_half():
-    env = gasil_jax.make_env("point_mass")
-    small = {"total_steps": 20 * 512, "batch_steps": 512, "num_envs": 8}
-    probability = {}
-    for name, change in (
-        ("free", {**CONSTANT, "discriminator_entropy_coefficient": 1e-3}),
-        ("held", CONSTANT),
-    ):
-        config = Config(agent="ppo+gasil").replace(**small, **change)
-        _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
-        names = ("discriminator_good_probability", "discriminator_policy_probability")
-        probability[name] = np.array([metrics[x][-1] for x in names])
-    assert np.abs(probability["held"] - 0.5).max() < 0.005
-    assert 0.5 - probability["free"][0] > 0.02
-
-
-def test_the_figure_on_geometry_is_the_tuned_presets_with_other_environments():
-    figure, runs = FIGURES["batch_geometry"], set()
-    for panel, curves in figure.panels.items():
+def test_noise_is_trained_with_what_was_chosen_without():
+    for curves in FIGURES["stochastic_walker2d"].panels.values():
         for curve in curves.values():
-            curve_runs = curve.runs(STORE)
-            assert len(curve_runs) == (20 if panel.startswith("halfcheetah") else 10)
-            delay = DELAY if panel.endswith("delayed") else 1
-            preset = gasil_jax.preset(curve.env, curve.agent, "tuned", delay)
-            config = curve_runs[0].config
-            assert (config.batch_steps, config.total_steps) == (2048, 1_000_000)
-            same = {
-                name: getattr(preset, name) for name in ("num_envs", "stagger_episodes")
-            }
-            assert (
-                config.replace(**same) == preset and curve_runs[0].reward_delay == delay
-            )
-            runs |= set(curve_runs)
-    assert len(runs) == len(figure.requested(STORE)) == 960
-    assert {(x.config.num_envs, x.config.stagger_episodes) for x in runs} == {
-        (count, drawn) for count in (1, 8, 32, 128) for drawn in (True, False)
-    }
-    # Runs that an earlier figure trained with the same settings are used.
-    assert len(runs) - len(STORE.missing(runs)) >= 100
+            assert curve.search == Search("walker2d", curve.agent)
 
 
-def test_a_curve_changes_what_was_chosen():
-    curve = FIGURES["humanoid"].panels["dense"]["ppo+gasil-from-2M"]
+def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
+    monkeypatch.setattr(Search, "chosen", lambda *_: {"alpha": 0.2, "gamma": 0.99})
+    curves = FIGURES["humanoid"].panels["humanoid"]
     scheduled, fixed = (
-        x.runs(STORE)[0].config
-        for x in (curve, FIGURES["humanoid"].panels["dense"]["ppo+gasil"])
+        curves[name].runs(STORE)[0].config
+        for name in ("ppo+gasil-from-2M", "ppo+gasil")
     )
     assert scheduled.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
-    alpha = fixed.hyperparameters.alpha
-    assert scheduled.replace(alpha=alpha, alpha_schedule=()) == fixed
-    bare = dataclasses.replace(curve, base="tuned", changes={})
+    assert (fixed.hyperparameters.alpha, fixed.total_steps) == (0.2, 3_000_000)
+    assert scheduled.replace(alpha=0.2, alpha_schedule=()) == fixed
+    bare = dataclasses.replace(curves["ppo"], base="tuned", changes={})
     assert isinstance(bare, Curve) and bare.point(STORE) == {}
 
 

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from test_figures import DELAYS
 
-from experiments import report, summary
+from experiments import report, search, summary
 from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
 from experiments.report import Page, compare
 from experiments.store import RESULTS, Record, Store
+from gasil_jax import presets
 from gasil_jax.errors import InputError
 
 STORE = Store(RESULTS / "runs")
@@ -75,16 +76,54 @@ def test_few_seeds_make_nothing_clear():
     assert report.interval(np.arange(5.0)).startswith("2.0 [")
 
 
-def test_a_ratio_over_tasks_does_not_depend_on_their_scale():
-    rng = np.random.default_rng(4)
-    lognormal = lambda mean: mean * np.exp(rng.normal(0.0, 0.5, 10))
-    data = {(panel, name): lognormal(2.0) for panel in "ab" for name in ("x", "y")}
-    scaled = {key: x * (1000.0 if key[0] == "a" else 1.0) for key, x in data.items()}
-    assert report.together(data, "ab", "x", "y") == report.together(
-        scaled, "ab", "x", "y"
-    )
-    doubled = data | {(p, "x"): 2 * data[p, "y"] for p in "ab"}
-    assert report.together(doubled, "ab", "x", "y").startswith("+100% [")
+def test_the_probability_of_improvement_is_of_pairs_of_seeds():
+    data = {
+        ("a", "x"): np.array([3.0, 1.0]),
+        ("a", "y"): np.array([2.0, 1.0]),
+        ("b", "x"): np.array([9.0, 9.0]),
+        ("b", "y"): np.array([-1.0, 8.0]),
+    }
+    # 2 of 4 pairs and half of another on one task, and all 4 on the other.
+    assert report.improvement(data, "ab", "x", "y").startswith("0.81 [")
+    assert report.improvement(data, "ab", "y", "x").startswith("0.19 [")
+    assert report.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
+
+
+def test_every_task_counts_alike_in_the_aggregate(tmp_path):
+    """Tasks have other units and numbers of seeds; one with more seeds weighs alike."""
+    arms = ("ppo", "ppo+gasil")
+    panels = {
+        **grid(("hopper",), arms, (1,), base=None, seeds=8),
+        **grid(("hopper",), arms, (20,), base=None, seeds=16),
+        **grid(("swimmer",), arms, (1, 20), base=None, seeds=8),
+    }
+    unit, ratio = {"hopper": 1000.0, "swimmer": 50.0}, {"hopper": 2.0, "swimmer": 4.0}
+    store, records = Store(tmp_path / "runs"), {}
+    for curve in (x for curves in panels.values() for x in curves.values()):
+        delayed = curve.agent == "ppo+gasil" and curve.reward_delay > 1
+        value = unit[curve.env] * (ratio[curve.env] if delayed else 1.0)
+        for run in curve.runs(store):
+            values = np.full(10, value)
+            records[run] = Record(np.arange(1, 11), values, values, {"physics": "mjx"})
+    store.add(records)
+    page = Page("x", store, figure=Figure("", "", panels))
+    _, _, *rows = page.aggregate().splitlines()
+    assert rows[0] == "| dense | ppo | 2 | 1.00 [1.00, 1.00] |"
+    assert rows[3] == "| delayed | ppo+gasil | 2 | 3.00 [3.00, 3.00] |"
+
+
+def test_others_returns_stand_beside_ours(tmp_path):
+    panels = grid(("hopper", "ant"), ("ppo",), (1, 20), base=None, seeds=8)
+    store = Store(tmp_path / "runs")
+    for run in panels["ant-delayed"]["ppo"].runs(store):
+        store.add({run: Record(*[np.full(10, 700.0)] * 3, {"physics": "mjx"})})
+    page = Page("x", store, figure=Figure("", "", panels))
+    head, _, ours, *others = page.published("delayed", "ppo", "gasil").splitlines()
+    assert head.split(" | ")[3:] == [*search.TASKS[:-1], f"{search.TASKS[-1]} |"]
+    empty = "|  " * 4
+    assert ours == f"| ours, ppo | v5 | 8 {empty}| 700 [700, 700] |  |"
+    assert len(others) == 2 and all("nnabla-rl" in row for row in others)
+    assert "| 2370 | 3494 |" in page.published("dense", "ppo")
 
 
 FIGURE = Figure(
@@ -117,21 +156,19 @@ def page(tmp_path):
             for i, run in enumerate(curve.runs(store)):
                 values = np.full(10, mean + i)
                 store.add({run: Record(np.arange(1, 11), values, nan, by)})
-    return Page("mujoco", store, figure=FIGURE)
+    return Page("matrix", store, figure=FIGURE)
 
 
 def test_a_table_and_a_tally(page):
     assert "| one | other | 6 | 102 [101, 104] | 100 [" in page.table()
     assert page.table().count(" better |") == 1 == page.table().count(" not clear |")
     (line,) = page.tally().splitlines()
-    assert line.startswith(
-        "- ours against other: better on 1, not clear on 1 of 2; over"
-    )
-    assert page.tally("two") == "- ours against other: not clear on 1 of 1."
-    words = "ours is better than other on one (100 ["
-    assert page.value("compared", "one", "ours", "other").startswith(words)
-    words = f"so {page.tally('two')}."
-    assert report.fill("so {{tally two}}.", page.value) == words
+    words = "- ours against other: better on 1, not clear on 1 of 2; probability of"
+    assert line.startswith(f"{words} improvement 0.75 [")
+    assert page.tally("two").startswith("- ours against other: not clear on 1 of 1; ")
+    assert "- one, ours - other: 100 [" in page.value("differences")
+    words = f"so {page.tally('two')}"
+    assert report.fill("so {{tally two}}", page.value) == words
     assert "commit c, changed" in page.settings()
 
 
@@ -139,65 +176,20 @@ def test_what_lacks_seeds_is_not_compared(page, tmp_path):
     curve = dataclasses.replace(FIGURE.panels["one"]["ours"], seeds=7)
     panels = {**FIGURE.panels, "one": {**FIGURE.panels["one"], "ours": curve}}
     lacking = dataclasses.replace(FIGURE, panels=panels)
-    page = Page("mujoco", page.searched, figure=lacking)
+    page = Page("matrix", page.searched, figure=lacking)
     assert "| one | ours | 6 of 7 |" in page.table()
     assert ("one", "ours", "other") not in page.comparisons
     assert "Not trained yet: 1 of 25 runs." in page.text()
-    with pytest.raises(InputError, match="compared one ours other in mujoco"):
-        page.value("compared", "one", "ours", "other")
+    with pytest.raises(InputError, match="tally three in matrix"):
+        page.value("tally", "three")
     with pytest.raises(InputError, match="slot is nonsense"):
         page.value("nonsense")
 
 
 def test_a_page_is_written_with_its_plot(page, tmp_path):
     page.write(tmp_path)
-    assert (tmp_path / "mujoco.png").read_bytes().startswith(b"\x89PNG")
-    assert (tmp_path / "mujoco.md").read_text() == page.text()
-
-
-def test_lock_step_is_told_as_long_as_runs_have_it(page):
-    assert report.IN_STEP not in page.text()
-    changes = {"stagger_episodes": False}
-    store = page.searched
-    for curves in FIGURE.panels.values():
-        for curve in curves.values():
-            run = dataclasses.replace(curve, changes=changes).runs(store)[0]
-            store.add({run: store[curve.runs(store)[0]]})
-    together = {
-        panel: {
-            n: dataclasses.replace(x, changes=changes, seeds=1) for n, x in c.items()
-        }
-        for panel, c in FIGURE.panels.items()
-    }
-    figure = dataclasses.replace(FIGURE, panels=together)
-    assert report.IN_STEP in Page("mujoco", store, figure=figure).text()
-
-
-def test_the_figure_on_geometry_is_drawn_and_compared(tmp_path):
-    figure, store = FIGURES["batch_geometry"], Store(tmp_path / "runs")
-    rng, nan = np.random.default_rng(0), np.full(10, np.nan)
-    by = {
-        "physics": "mjx",
-        "device": None,
-        "versions": None,
-        "commit": "c",
-        "clean": True,
-    }
-    records = {}
-    for curve in figure.panels["swimmer"].values():
-        drawn = curve.changes["stagger_episodes"] and curve.changes["num_envs"] == 128
-        for run in curve.runs(store):
-            values = np.full(10, rng.normal(90.0 if drawn else 30.0, 1.0))
-            records[run] = Record(np.arange(1, 11), values, nan, by)
-    store.add(records)
-    page = Page("batch_geometry", store)
-    rows = page.geometry().splitlines()[2:]
-    assert len(rows) == 8
-    verdicts = {tuple(row.split(" | ")[1:3]): row.split(" | ")[-1] for row in rows}
-    for (_, count), verdict in verdicts.items():
-        assert verdict.startswith("better" if count == "128" else "not clear")
-    page.write(tmp_path)
-    assert (tmp_path / "batch_geometry.png").stat().st_size > 5000
+    assert (tmp_path / "matrix.png").read_bytes().startswith(b"\x89PNG")
+    assert (tmp_path / "matrix.md").read_text() == page.text()
 
 
 def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
@@ -224,16 +216,14 @@ def test_every_arm_has_a_color(page, tmp_path, count):
     arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
     panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
     figure = Figure("Arms", "", panels, favourite="ppo")
-    drawn = report._draw(Page("mujoco", page.searched, figure=figure))
+    drawn = report._draw(Page("matrix", page.searched, figure=figure))
     colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
     assert len(set(colors)) == len(colors) == count + 1
 
 
 @pytest.mark.parametrize("name", FIGURES)
 def test_a_published_page_is_what_the_stored_runs_say(name):
-    page, path = Page(name, STORE), RESULTS / f"{name}.md"
-    assert path.exists() == page.begun
-    assert not page.begun or path.read_text() == page.text()
+    assert (RESULTS / f"{name}.md").read_text() == Page(name, STORE).text()
 
 
 def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
@@ -242,11 +232,7 @@ def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
     text = summary.README.read_text()
     assert report.fill_blocks(text, made.value) == text
     assert text.count("<!-- begin ") == text.count("<!-- end -->") > 0
-    # Said as long as it is so.
-    guide = summary.README.parent / "docs" / "reproducing.md"
-    for document in (text, guide.read_text()):
-        told = "reset together, which" in " ".join(document.split())
-        assert told == (report.IN_STEP in made.text())
+    assert presets.TUNED.read_text() == made.tuned()
 
 
 def test_seeds_in_words():
@@ -256,12 +242,12 @@ def test_seeds_in_words():
 
 def test_a_block_is_made_anew():
     made = summary.Summary(STORE)
-    text = "before\n<!-- begin tuned -->\nold\n<!-- end -->\nafter"
+    text = "before\n<!-- begin claims -->\nold\n<!-- end -->\nafter"
     filled = report.fill_blocks(text, made.value)
-    assert filled == text.replace("old\n", f"\n{made.tuned()}\n\n")
+    assert filled == text.replace("old\n", f"\n{made.claims()}\n\n")
     assert report.fill_blocks(filled, made.value) == filled
     with pytest.raises(InputError, match="slot is nonsense: it must be one of claims"):
-        report.fill_blocks(text.replace("tuned", "nonsense"), made.value)
+        report.fill_blocks(text.replace("claims", "nonsense"), made.value)
 
 
 #: Settings, and names: what may stand in a note in digits.

@@ -140,19 +140,6 @@ def test_a_setting_that_the_package_has_not_is_told(tmp_path, monkeypatch):
         read(path)
 
 
-def test_files_without_evaluations_are_read():
-    """Older files have an evaluation after training, or none."""
-    evaluated = {
-        path.stem: sum(len(x.evaluation_return) for x in read(path).values())
-        for path in (RESULTS / "runs").glob("*.npz")
-    }
-    assert evaluated.pop("halfcheetah") == 640 and evaluated.pop("swimmer") == 320
-    assert set(evaluated.values()) == {0}
-    for kept in read(RESULTS / "runs" / "swimmer.npz").values():
-        assert list(kept.evaluation_steps) in ([], [kept.env_steps[-1]])
-        assert np.isfinite(kept.evaluation_return).all()
-
-
 def test_a_run_that_is_there_stays(tmp_path):
     store = Store(tmp_path)
     assert store.add({run(): record(1.0), run(env="ant"): record(2.0)}) == 2

@@ -20,6 +20,7 @@ FLAGS = (
     *("--env", "point_mass", "--agent", "ppo", "--total-steps", str(ITERATIONS * 128)),
     *("--num-envs", "4", "--batch-steps", "128", "--minibatch-size", "32"),
     *("--num-epochs", "1", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
+    *("--preset", "paper"),
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
 

@@ -22,6 +22,8 @@ from gasil_jax.sweeps.points import PAPER_RANGES
 SMALL = (
     "--env",
     "point_mass",
+    "--preset",
+    "paper",
     "--total-steps",
     "512",
     "--batch-steps",
