@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 import gasil_envs
-from gasil_envs.physics import batching, constraints, dynamics, native, newton
+from gasil_envs.physics import (
+    batching,
+    constraints,
+    dynamics,
+    native,
+    newton,
+    newton_kernel,
+)
 from gasil_envs.physics.interface import PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics
 from gasil_jax import rollout
@@ -130,6 +137,23 @@ def test_linear_solve_against_numpy():
     result = jax.jit(jax.vmap(newton.linear_solve))(problem.inertia, problem.force)
     expected = np.linalg.solve(arrays["inertia"], arrays["force"][..., None])[..., 0]
     np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("size", [1, 5, 16, 23, 32])
+def test_the_gpu_s_elimination_solves_the_same(size):
+    """Its operations are run by XLA; that it compiles for a GPU is another test."""
+    _, problem = problems((20,), size, [])
+    pair = jnp.moveaxis(problem.inertia, 0, -1), problem.force.T
+    kernel = jax.jit(lambda *x: newton_kernel.solve_linear(*x, interpret=True))
+    expected = jax.jit(newton.eliminate)(*pair)
+    np.testing.assert_allclose(kernel(*pair), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_gpu_s_elimination_can_be_lowered_for_one():
+    traced = jax.jit(newton_kernel.solve_linear).trace(
+        jnp.ones((23, 23, 20)), jnp.ones((23, 20))
+    )
+    assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA's CPU backend")

@@ -17,6 +17,11 @@ def on_cpu() -> bool:
     return jax.default_backend() == "cpu"
 
 
+def on_gpu() -> bool:
+    """Whether programs are compiled for a GPU."""
+    return jax.default_backend() == "gpu"
+
+
 _identity = jax.jit(lambda tree: tree)
 
 

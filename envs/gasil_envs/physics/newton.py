@@ -31,7 +31,15 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs.physics.batching import add, batch_last, in_tiles, materialize, on_cpu
+from gasil_envs.physics import newton_kernel
+from gasil_envs.physics.batching import (
+    add,
+    batch_last,
+    in_tiles,
+    materialize,
+    on_cpu,
+    on_gpu,
+)
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges.
@@ -284,8 +292,11 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Return x of A x = b by Gauss-Jordan elimination: (V, V, B), (V, B) -> (V, B).
 
     Symmetric positive matrices need no pivoting. Each step drops the first column and
-    moves the first row to the end, so that all steps are the same.
+    moves the first row to the end, so that all steps are the same. On a GPU it is one
+    kernel.
     """
+    if on_gpu() and matrix.shape[0] <= newton_kernel.MOST_UNKNOWNS:
+        return newton_kernel.solve_linear(matrix, right)
     table = jnp.concatenate([matrix, right[:, None]], axis=1)
     for _ in range(matrix.shape[0]):
         row = table[0, 1:] / table[0, 0]

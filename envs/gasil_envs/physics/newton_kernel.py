@@ -1,0 +1,81 @@
+"""Systems of linear equations, each solved by one warp of a GPU.
+
+Written as XLA's operations, each step of an elimination is a kernel that reads and
+writes all matrices. Here a warp has one matrix in its registers from the first step to
+the last. Arrays are filled up to powers of two, as Triton needs them.
+"""
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.experimental import pallas as pl
+from jax.experimental.pallas import triton
+
+# Shape letters: V unknowns, filled up in a kernel; B batch.
+
+# The registers of a warp have no room for larger matrices.
+MOST_UNKNOWNS = 32
+
+
+def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
+    """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,).
+
+    Gauss-Jordan elimination of the first `size` rows; the others are filled up. Columns
+    that are done would be those of the identity. Instead they mirror what the rows that
+    are done have elsewhere, so that a pivot's row is its column, the factors of all.
+    """
+    index = jax.lax.broadcasted_iota(jnp.int32, right.shape, 0)
+    row_of = jax.lax.broadcasted_iota(jnp.int32, matrix.shape, 0)
+    column_of = jax.lax.broadcasted_iota(jnp.int32, matrix.shape, 1)
+
+    def step(k: jax.Array, carry: Any) -> Any:
+        rest, x = carry
+        row = jnp.sum(jnp.where(row_of == k, rest, 0.0), axis=0)
+        inverse = 1.0 / jnp.sum(jnp.where(index == k, row, 0.0))
+        scaled = jnp.where(index == k, -1.0, row) * inverse
+        found = jnp.sum(jnp.where(index == k, x, 0.0)) * inverse
+        rest = jnp.where(column_of == k, 0.0, rest)
+        rest = rest - row[:, None] * scaled[None, :]
+        return rest, jnp.where(index == k, found, x - row * found)
+
+    return jax.lax.fori_loop(0, size, step, (matrix, right))[1]
+
+
+def _kernel(size: int, matrix: Any, right: Any, out: Any) -> None:
+    """Solve one system; what is filled up lies outside the arrays."""
+    (full,) = out.shape
+    index = jax.lax.broadcasted_iota(jnp.int32, (full,), 0)
+    row_of = jax.lax.broadcasted_iota(jnp.int32, (full, full), 0)
+    column_of = jax.lax.broadcasted_iota(jnp.int32, (full, full), 1)
+    inside = (row_of < size) & (column_of < size)
+    matrix = triton.load(matrix, mask=inside, other=0.0)
+    right = triton.load(right, mask=index < size, other=0.0)
+    out[:] = eliminate(matrix, right, size)
+
+
+def solve_linear(
+    matrix: jax.Array, right: jax.Array, *, interpret: bool = False
+) -> jax.Array:
+    """Return x of A x = b for symmetric positive A: (V, V, B), (V, B) -> (V, B).
+
+    Args:
+      matrix: A.
+      right: b.
+      interpret: run the kernel as XLA's operations, on any device, to test it.
+    """
+    size, batch = right.shape
+    full = max(8, pl.next_power_of_2(size))
+    of_vectors = pl.BlockSpec((None, full), lambda b: (b, 0))
+    result = pl.pallas_call(
+        functools.partial(_kernel, size),
+        grid=(batch,),
+        in_specs=[pl.BlockSpec((None, full, full), lambda b: (b, 0, 0)), of_vectors],
+        out_specs=of_vectors,
+        out_shape=jax.ShapeDtypeStruct((batch, full), jnp.float32),
+        compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
+        interpret=interpret,
+        name="eliminate",
+    )(jnp.moveaxis(matrix, -1, 0), right.T)  # A warp reads a matrix as a whole.
+    return result[:, :size].T
