@@ -295,23 +295,22 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def _repeat(
-    function: Callable[[Any], tuple[Any, jax.Array]], carry: Any, least: int, most: int
+    function: Callable[[Any], tuple[Any, jax.Array]],
+    carry: Any,
+    *,
+    least: int,
+    most: int,
+    unroll: bool,
 ) -> Any:
     """Call a function `least` to `most` times, and on a CPU until nothing changes.
 
     The function returns the carry and whether something has changed. On a GPU each
-    decision would wait for the host, and the loop itself would cost more than its body
-    (a fifth of the time of walker2d). On a CPU unrolling it only costs compile time.
+    decision would wait for the host, and a loop costs more than a small body, so it
+    may be unrolled there. On a CPU unrolling it only costs compile time.
     """
     if not on_cpu():
-        size = jax.tree.leaves(carry)[0].shape[0]
-        return jax.lax.fori_loop(
-            0,
-            most,
-            lambda _, carry: function(carry)[0],
-            carry,
-            unroll=size <= _MOST_DEGREES_UNROLLED,
-        )
+        call = lambda _, carry: function(carry)[0]
+        return jax.lax.fori_loop(0, most, call, carry, unroll=unroll)
 
     def goes_on(state: Any) -> jax.Array:
         count, changed, _ = state
@@ -385,12 +384,13 @@ def solve_many(
         step = jnp.ones_like(linear)
         pushing = is_pushing(distance)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
-        step = _repeat(newton, search, 1, line_search)[0]
+        step = _repeat(newton, search, least=1, most=line_search, unroll=True)[0]
         moved = each(lambda d, s: d + step * s, distance, slope)
         return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
 
     begin = (start, distance_at(start))
-    qacc, distance = _repeat(iterate, begin, 2, iterations)
+    unroll = force.shape[0] <= _MOST_DEGREES_UNROLLED
+    qacc, distance = _repeat(iterate, begin, least=2, most=iterations, unroll=unroll)
     push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
     return Solution(
         qacc=qacc,
