@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from test_figures import DELAYS
 
-from experiments import report, search, summary
+from experiments import comparisons, report, search, summary
+from experiments.comparisons import compare
 from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
-from experiments.report import Page, compare
+from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
@@ -47,10 +48,10 @@ def test_the_correction_is_holm_s():
     order = sorted(alone, key=alone.get)
     rejected = True
     for i, key in enumerate(order):
-        rejected = rejected and alone[key] <= report.LEVEL / (len(order) - i)
+        rejected = rejected and alone[key] <= comparisons.LEVEL / (len(order) - i)
         assert (result[key].verdict != "not clear") == rejected
     # The correction decides something here.
-    assert any(alone[key] <= report.LEVEL < result[key].p for key in order)
+    assert any(alone[key] <= comparisons.LEVEL < result[key].p for key in order)
 
 
 def test_a_contrast_is_a_weighted_sum():
@@ -67,13 +68,13 @@ def test_few_seeds_make_nothing_clear():
     few = {name: x[:3] for name, x in scores(high=9.0, low=0.0).items()}
     (result,) = compare(few, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert report.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
+    assert comparisons.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
     # Nor does a seed that ended no episode.
     none = scores(high=9.0, low=0.0)
     none["a", "low"][0] = np.nan
     (result,) = compare(none, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert report.interval(np.arange(5.0)).startswith("2.0 [")
+    assert comparisons.interval(np.arange(5.0)).startswith("2.0 [")
 
 
 def test_the_probability_of_improvement_is_of_pairs_of_seeds():
@@ -84,9 +85,9 @@ def test_the_probability_of_improvement_is_of_pairs_of_seeds():
         ("b", "y"): np.array([-1.0, 8.0]),
     }
     # 2 of 4 pairs and half of another on one task, and all 4 on the other.
-    assert report.improvement(data, "ab", "x", "y").startswith("0.81 [")
-    assert report.improvement(data, "ab", "y", "x").startswith("0.19 [")
-    assert report.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
+    assert comparisons.improvement(data, "ab", "x", "y").startswith("0.81 [")
+    assert comparisons.improvement(data, "ab", "y", "x").startswith("0.19 [")
+    assert comparisons.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
 
 
 def test_every_task_counts_alike_in_the_aggregate(tmp_path):
@@ -216,7 +217,7 @@ def test_every_arm_has_a_color(page, tmp_path, count):
     arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
     panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
     figure = Figure("Arms", "", panels, favourite="ppo")
-    drawn = report._draw(Page("matrix", page.searched, figure=figure))
+    drawn = Page("matrix", page.searched, figure=figure).picture()
     colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
     assert len(set(colors)) == len(colors) == count + 1
 
