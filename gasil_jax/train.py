@@ -164,7 +164,7 @@ def _init_actor_critic(
 
 @full_precision
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One iteration of Algorithm 1: a batch of experience and the updates from it.
+    """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
     Returns the next state and a dict of float32 scalars. Means over the whole episodes
     that ended in the batch are NaN if none did.
@@ -183,7 +183,13 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     history, buffer = remember(config, state, batch, hyperparameters)
     # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
     rewards, reward_metrics = learner_rewards(
-        env, config, state, batch, history, decompose_key, hyperparameters
+        env,
+        config,
+        state,
+        batch=batch,
+        history=history,
+        key=decompose_key,
+        hyperparameters=hyperparameters,
     )
     context = Context(
         rollout=rewards.batch,
@@ -203,7 +209,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Update the policy.
     actor_critic, imitation, policy_metrics = update_policy(
-        agent, state.actor_critic, imitation, streams, context, (ppo_key, policy_key)
+        agent,
+        state.actor_critic,
+        imitation,
+        rewards=streams,
+        context=context,
+        keys=(ppo_key, policy_key),
     )
     healthy, (actor_critic, imitation, decomposition) = keep_if_finite(
         (actor_critic, imitation, rewards.decomposition),
@@ -327,6 +338,7 @@ def learner_rewards(
     env: Any,
     config: Config,
     state: TrainState,
+    *,
     batch: Rollout,
     history: good_trajectories.History,
     key: jax.Array,
@@ -428,6 +440,7 @@ def update_policy(
     agent: Imitation,
     actor_critic: ActorCritic,
     imitation: Any,
+    *,
     rewards: jax.Array,
     context: Context,
     keys: tuple[jax.Array, jax.Array],
@@ -468,7 +481,7 @@ def update_policy(
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
-    """An update that is not finite is as if it had not been.
+    """Return an update, or what was before it if the update is not finite.
 
     Args:
       new: what was learned, a pytree.
@@ -484,7 +497,7 @@ def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
 def rollout_metrics(
     batch: Rollout, buffer: good_trajectories.GoodTrajectories
 ) -> Metrics:
-    """What a batch and the buffer after it are like.
+    """Return the metrics of a batch and of the buffer after it.
 
     Means over the whole episodes that ended in the batch are NaN if none did.
 
@@ -505,7 +518,7 @@ def rollout_metrics(
 
 
 def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
-    """All metrics of an iteration as float32 scalars, by name.
+    """Return all metrics of an iteration as float32 scalars, by name.
 
     Raises:
       ValueError: an agent's metric has a name that another one has.
@@ -542,7 +555,7 @@ def check(env: Any, config: Config) -> None:
 
 
 class Train(Protocol):
-    """A whole run: a key, consumed, to the last state and metrics (iterations,)."""
+    """A function of a key, consumed, to the last state and metrics (iterations,)."""
 
     def __call__(
         self, key: jax.Array, hyperparameters: Hyperparameters | None = None
@@ -551,7 +564,7 @@ class Train(Protocol):
 
 
 def make_train(env: Any, config: Config) -> Train:
-    """A pure function that trains from nothing to `config.total_steps`.
+    """Return a pure function that trains from nothing to `config.total_steps`.
 
     Args:
       env: one environment with Brax's interface (`gasil_jax.make_env`, or any of
