@@ -218,8 +218,11 @@ def decompose(
     config: Config,
     hyperparameters: Hyperparameters,
     action_range: tuple[Any, Any],
-) -> tuple[Decomposition, Rollout, Metrics]:
+) -> tuple[Decomposition, Rollout, jax.Array, Metrics]:
     """Learn from the windows that were completed, and decompose a batch's rewards.
+
+    The network stays as it was where what it learned is not finite. The rest of the
+    state goes with the history, which no failed update undoes.
 
     Args:
       decomposition: the state before the batch.
@@ -232,8 +235,9 @@ def decompose(
       action_range: the lowest and the highest action that the environment sees.
 
     Returns:
-      The state after the batch, the batch with decomposed rewards, and metrics. The
-      windows of "decomposition_fit" had not been trained on when they were predicted.
+      The state after the batch, the batch with decomposed rewards, whether the update
+      of the network was finite and is kept, (), and metrics. The windows of
+      "decomposition_fit" had not been trained on when they were predicted.
     """
     network = _network(config)
     low, high = action_range
@@ -280,6 +284,7 @@ def decompose(
         config=config,
         step_size=hyperparameters.decomposition_learning_rate,
     )
+    healthy, trained = learner.keep_if_finite(trained, decomposition.network)
     # What the network leaves unexplained of a window is shared by its steps.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
@@ -295,7 +300,7 @@ def decompose(
         open_steps=running[1],
         recorded_steps=recorded_steps,
     )
-    return decomposition, batch.replace(reward=reward), metrics
+    return decomposition, batch.replace(reward=reward), healthy, metrics
 
 
 def _train(

@@ -125,12 +125,6 @@ def init(
     )
 
 
-def is_finite(tree: Any) -> jax.Array:
-    """Return whether every number of every leaf is finite, bool ()."""
-    leaves = jax.tree.leaves(tree)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
-
-
 def collect(
     env: Any,
     policy: Any,

@@ -216,14 +216,13 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         context=context,
         keys=(ppo_key, policy_key),
     )
-    healthy, (actor_critic, imitation, decomposition) = keep_if_finite(
-        (actor_critic, imitation, rewards.decomposition),
-        (state.actor_critic, state.imitation, state.reward_decomposition),
+    healthy, (actor_critic, imitation) = learner.keep_if_finite(
+        (actor_critic, imitation), (state.actor_critic, state.imitation)
     )
     metrics: Metrics = {
         "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
         "learning_rate": jnp.asarray(hyperparameters.learning_rate),
-        "skipped_updates": ~healthy,
+        "skipped_updates": ~(healthy & rewards.healthy),
         **rollout_metrics(batch, buffer),
         **reward_metrics,
     }
@@ -231,7 +230,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         actor_critic=actor_critic,
         # Only now: within an iteration the policy that acts is the one that learns.
         normalizer=normalization.update(state.normalizer, batch.observation),
-        reward_decomposition=decomposition,
+        reward_decomposition=rewards.decomposition,
         reward_normalizer=rewards.normalizer,
         environments=environments,
         history=history,
@@ -324,6 +323,7 @@ class Rewards(NamedTuple):
       scale: (), the number that the batch's rewards were divided by.
       decomposition: after the batch; None where rewards are not decomposed.
       normalizer: after the batch; None where rewards are not normalized.
+      healthy: (), whether what was learned of rewards is finite and was kept.
     """
 
     batch: Rollout
@@ -331,6 +331,7 @@ class Rewards(NamedTuple):
     scale: jax.Array
     decomposition: reward_decomposition.Decomposition | None
     normalizer: reward_normalization.RewardNormalizer | None
+    healthy: jax.Array
 
 
 @jax.named_scope("rewards")
@@ -355,10 +356,10 @@ def learner_rewards(
       key: consumed.
       hyperparameters: their values in this iteration.
     """
-    decomposition = None
+    decomposition, healthy = None, jnp.bool_(True)
     metrics: Metrics = {}
     if state.reward_decomposition is not None:
-        decomposition, batch, metrics = reward_decomposition.decompose(
+        decomposition, batch, healthy, metrics = reward_decomposition.decompose(
             state.reward_decomposition,
             batch,
             history,
@@ -369,9 +370,9 @@ def learner_rewards(
             action_range=wrappers.action_range(env),
         )
         # What is not a number in the history marks an episode without a return.
-        unknown = jnp.isnan(history.reward)
+        has_no_return = jnp.isnan(history.reward)
         history = history.replace(
-            reward=jnp.where(unknown, jnp.nan, decomposition.reward)
+            reward=jnp.where(has_no_return, jnp.nan, decomposition.reward)
         )
     normalizer, scale = None, jnp.float32(1.0)
     if state.reward_normalizer is not None:
@@ -382,7 +383,8 @@ def learner_rewards(
         scale = reward_normalization.scale(normalizer)
         batch = batch.replace(reward=reward)
         metrics = {**metrics, "reward_scale": scale}
-    return Rewards(batch, history, scale, decomposition, normalizer), metrics
+    rewards = Rewards(batch, history, scale, decomposition, normalizer, healthy)
+    return rewards, metrics
 
 
 @jax.named_scope("advantages")
@@ -478,20 +480,6 @@ def update_policy(
         context.config.agent, ppo_metrics, advantage_metrics, own_metrics
     )
     return actor_critic, imitation, metrics
-
-
-def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
-    """Return an update, or what was before it if the update is not finite.
-
-    Args:
-      new: what was learned, a pytree.
-      old: the same before it.
-
-    Returns:
-      whether every number of `new` is finite, (), and `new` if so, else `old`.
-    """
-    healthy = rollout.is_finite(new)
-    return healthy, jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
 
 
 def rollout_metrics(
