@@ -19,6 +19,8 @@ from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 from gasil_jax.host import output_file
 
+#: The color of each agent, the same in all figures.
+_COLOR_OF = dict(zip(AGENTS, plotting.COLORS, strict=False))
 #: The stored runs of each curve, by panel and curve.
 Records = Mapping[tuple[str, str], Sequence[Record]]
 
@@ -69,15 +71,13 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
 def _colors(figure: Figure) -> dict[str, Any]:
     """Return the color of each curve's name, the same in all panels.
 
-    An agent has the same in all figures. Values, and more names than there are colors,
-    are dark to light.
+    Values, and more names than there are colors, are dark to light.
     """
     names = list(dict.fromkeys(x for curves in figure.panels.values() for x in curves))
     if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
         shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
         return dict(zip(names, shades, strict=True))
-    of_agent = dict(zip(AGENTS, plotting.COLORS, strict=False))
-    color_of = {name: of_agent[name] for name in names if name in of_agent}
+    color_of = {name: _COLOR_OF[name] for name in names if name in _COLOR_OF}
     free = (x for x in plotting.COLORS if x not in color_of.values())
     return {name: color_of.get(name) or next(free) for name in names}
 
@@ -112,7 +112,6 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
         line, value = figure.point_of(panel, name)
         lines.setdefault(line, {})[value] = name
     values = sorted({value for points in lines.values() for value in points})
-    agents = list(dict.fromkeys(curve.agent for curve in curves.values()))
     drawn: list[str] = []
     for i, (line, points) in enumerate(lines.items()):
         complete = [x for x in points if (panel, points[x]) in scores]
@@ -129,7 +128,7 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
             np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
             middle,
             [middle - low, high - middle],
-            color=plotting.COLORS[agents.index(agent) % len(plotting.COLORS)],
+            color=_COLOR_OF[agent],
             linestyle=style,
             **{"marker": "o", "markersize": 3, "capsize": 2},
             label=line,

@@ -3,9 +3,9 @@
 A page is ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, filled in.
 """
 
-import contextlib
 import csv
 import dataclasses
+import inspect
 import itertools
 import pathlib
 import re
@@ -24,7 +24,15 @@ from experiments.comparisons import (
     over_tasks,
 )
 from experiments.figures import FIGURES, Curve, Figure, name_of
-from experiments.search import AGENTS, DELAY, TASKS, importance
+from experiments.search import (
+    AGENTS,
+    DELAY,
+    FINALIST_SEEDS,
+    PROTOCOL,
+    SEEDS,
+    TASKS,
+    importance,
+)
 from experiments.store import Record, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
@@ -39,11 +47,12 @@ _READING = """## How to read this
 
 A final return is the interquartile mean over seeds of the mean return over the last
 tenth of training, of the episodes that the acting policy ended; in brackets a 95%
-interval, the percentile bootstrap's over seeds, which is a little too narrow for ten.
-Better, worse and not clear are verdicts on differences, corrected by Holm's method for
-the {} comparisons of this page: the chance that any of them is wrong is 5%. The
-probability of improvement is that of a seed of one curve having more than a seed of the
-other, averaged over the tasks."""
+interval, the percentile bootstrap's over seeds, which of ten covers a little less.
+Better and worse are verdicts on differences, corrected by Holm's method for the {}
+comparisons of this page: with 95% probability none is stated without a difference.
+"Not clear" does not mean that two are equal. The probability of improvement is that of
+a seed of one curve having more than one of the other, averaged over the tasks.
+"""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -131,7 +140,7 @@ class Page:
 
     SLOTS = (
         *("table", "differences", "tally", "aggregate"),
-        *("searches", "importance", "published"),
+        *("protocol", "searches", "importance", "published"),
     )
 
     def __init__(
@@ -191,6 +200,8 @@ class Page:
         Args:
           *panels: the panels; default all.
         """
+        if not set(panels) <= set(self.figure.panels):
+            raise self._no_slot("tally", *panels)
         lines, panels = [], panels or tuple(self.figure.panels)
         for other in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
             with_other = [p for p in panels if other in self.figure.panels[p]]
@@ -241,9 +252,15 @@ class Page:
         dense = self.scores[name_of(env), unit]
         return self.scores[panel, name] / float(interquartile_mean(dense))
 
+    def protocol(self) -> str:
+        """Return how a search chooses its point, in words."""
+        return PROTOCOL
+
     def searches(self) -> str:
         """Return the results of the figure's searches."""
-        head = ["task", "points", "best point", "its mean", "median", "worst"]
+        few, more = len(SEEDS), len(FINALIST_SEEDS)
+        head = ["task", "points", "best point", f"its mean of {more} seeds"]
+        head += [f"all points' median of {few} seeds", "worst"]
         rows = []
         for name, search in self.figure.searches.items():
             points = search.points(self.searched)
@@ -310,13 +327,19 @@ class Page:
         Raises:
           InputError: if there is no such slot, or nothing to stand in it.
         """
-        if slot in self.SLOTS:
-            # Curves that are not complete, or wrong arguments, are reported below.
-            with contextlib.suppress(KeyError, TypeError):
-                return getattr(self, slot)(*arguments) or "Nothing is complete yet."
-        raise InputError(
-            f"slot is {shlex.join([slot, *arguments])} in {self.name}: it must be "
-            f"one of {', '.join(self.SLOTS)}, of complete curves"
+        if slot not in self.SLOTS:
+            raise self._no_slot(slot, *arguments)
+        method = getattr(self, slot)
+        try:
+            inspect.signature(method).bind(*arguments)
+        except TypeError:
+            raise self._no_slot(slot, *arguments) from None
+        return method(*arguments) or "Nothing is complete yet."
+
+    def _no_slot(self, *words: str) -> InputError:
+        return InputError(
+            f"slot is {shlex.join(words)} in {self.name}: it must be one of "
+            f"{', '.join(self.SLOTS)}, with its arguments"
         )
 
     def text(self) -> str:
@@ -332,7 +355,8 @@ class Page:
         if missing := total - sum(stored):
             parts.append(f"Not trained yet: {missing} of {total} runs.")
         if self.results:
-            parts += [_READING.format(len(self.comparisons)), "## Settings"]
+            reading = _READING.format(len(self.comparisons)).strip()
+            parts += [reading, "## Settings"]
             parts.append(self.settings())
         return "\n\n".join(parts) + "\n"
 

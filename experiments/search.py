@@ -32,9 +32,16 @@ PAIR, ADAPTIVE = ("ppo", "ppo+gasil"), "ppo+gasil-adaptive"
 #: Steps of a run in a search.
 STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
 #: Points of each agent's search; their seeds.
-_POINTS, _SEEDS = 12, range(1000, 1002)
+_POINTS, SEEDS = 12, range(1000, 1002)
 #: The number of best points that are trained with more seeds; all their seeds.
-_FINALISTS, _FINALIST_SEEDS = 3, range(1000, 1006)
+_FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
+#: How a search chooses, in words.
+PROTOCOL = (
+    f"For every agent and task {_POINTS} points are drawn, each trained with "
+    f"{len(SEEDS)} seeds. Where the best of them has a value at an end of its grid, "
+    f"the next value beyond is tried too. The best {_FINALISTS} of all are trained "
+    f"with {len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen."
+)
 #: Every agent's hyperparameters, and those of one or two.
 _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
@@ -134,7 +141,7 @@ class Search:
         ).replace(**point)
 
     def runs(
-        self, points: Iterable[Point], seeds: Iterable[int] = _SEEDS
+        self, points: Iterable[Point], seeds: Iterable[int] = SEEDS
     ) -> list[list[Run]]:
         """Return the runs of points, a list for each."""
         seeds = tuple(seeds)
@@ -144,7 +151,7 @@ class Search:
         ]
 
     def scores(
-        self, points: Iterable[Point], store: Store, seeds: Iterable[int] = _SEEDS
+        self, points: Iterable[Point], store: Store, seeds: Iterable[int] = SEEDS
     ) -> np.ndarray | None:
         """Return the mean return over the last fifth of training, (points, seeds).
 
@@ -179,13 +186,13 @@ class Search:
     def requested(self, store: Store) -> list[Run]:
         """Return all runs of the search that are known so far."""
         runs = self.runs(self.points(store))
-        runs += self.runs(self.finalists(store), _FINALIST_SEEDS)
+        runs += self.runs(self.finalists(store), FINALIST_SEEDS)
         return list(dict.fromkeys(itertools.chain(*runs)))
 
     def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
         """Return the best finalist and its scores, or None if runs are missing."""
         finalists = self.finalists(store)
-        scores = self.scores(finalists, store, _FINALIST_SEEDS)
+        scores = self.scores(finalists, store, FINALIST_SEEDS)
         if scores is None or not finalists:
             return None
         chosen = int(scores.mean(axis=1).argmax())
@@ -238,7 +245,7 @@ def importance(agent: str, store: Store) -> dict[str, float]:
     """Return how much of its points' variance each hyperparameter explains alone.
 
     It is the mean of `statistics.importance` over the tasks, dense and delayed, whose
-    drawn points are all stored; empty if there is none.
+    drawn points are all stored and all ended an episode; empty if there is none.
     """
     points, shares = draw(agent), []
     for env, delay in CELLS:
