@@ -15,7 +15,9 @@ arXiv:2111.13485). Minibatches are drawn from all complete windows in the histor
 PPO then sees m + s g instead of the environment's reward. What a window paid beyond
 the sum of that is shared evenly by its steps: so a window's sum is what it paid, before
 the network has learned anything the payout is spread evenly, and where every step pays
-the reward is the environment's own.
+the reward is the environment's own. Of a window that began in an earlier batch only the
+steps of this batch get their share, because PPO has learned from the others already;
+its sum then lacks theirs.
 """
 
 from collections.abc import Callable
@@ -285,7 +287,8 @@ def decompose(
         step_size=hyperparameters.decomposition_learning_rate,
     )
     healthy, trained = learner.keep_if_finite(trained, decomposition.network)
-    # What the network leaves unexplained of a window is shared by its steps.
+    # What the network leaves unexplained of a window is shared by its steps; the shares
+    # of steps in earlier batches are lost.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
     rest = jnp.where(scored, (batch.reward - total) / length, 0.0)

@@ -56,22 +56,36 @@ def _constructors() -> dict[str, Callable[[Settings], Env]]:
     }
 
 
-def _refuse_unknown(kind: str, name: Any, allowed: Iterable[str]) -> None:
-    allowed = tuple(allowed)
-    if not isinstance(name, str):
-        raise ValueError(f"{kind} is {name!r}: it must be one of {', '.join(allowed)}")
-    if name in allowed:
-        return
-    nearest = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
-    raise ValueError(
-        f"{kind} {name!r} is unknown: did you mean {nearest!r}? "
-        f"(one of {', '.join(allowed)})"
-    )
-
-
 #: Prefix of the names of environments in ``brax.envs``.
 BRAX = "brax:"
 _EPISODE_LENGTH = 1000
+
+
+def _refuse_unknown(
+    kind: str, name: Any, allowed: Iterable[str], forms: Iterable[str] = ()
+) -> None:
+    """Raise `ValueError` for a name that is not among the allowed ones.
+
+    Args:
+      kind: what is named.
+      name: the name.
+      allowed: the known names.
+      forms: what other names look like, such as MODULE:NAME.
+    """
+    allowed = tuple(allowed)
+    listed = ", ".join((*allowed, *forms))
+    if not isinstance(name, str):
+        raise ValueError(f"{kind} is {name!r}: it must be one of {listed}")
+    if name in allowed:
+        return
+    # A prefix that all have in common makes no name similar to another.
+    bare = {x.removeprefix(BRAX): x for x in allowed}
+    near = difflib.get_close_matches(name.removeprefix(BRAX), bare, n=1, cutoff=0.7)
+    if not near:
+        raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
+    raise ValueError(
+        f"{kind} {name!r} is unknown: did you mean {bare[near[0]]!r}? (one of {listed})"
+    )
 
 
 def names() -> tuple[str, ...]:
@@ -91,7 +105,7 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     if isinstance(name, str) and ":" in name:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
-    _refuse_unknown("env", name, names())
+    _refuse_unknown("env", name, names(), (f"{BRAX}NAME", "MODULE:NAME"))
     return _constructors()[name]
 
 

@@ -217,7 +217,7 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("nonsense",), "experiment 'nonsense' is unknown: did you mean"),
+        (("nonsense",), "experiment 'nonsense' is unknown: it must be one of"),
         (
             ("matrix", "--only", "hoper"),
             "only 'hoper' is unknown: did you mean 'hopper'",
