@@ -170,6 +170,36 @@ def test_an_unknown_name_is_refused_with_the_nearest():
         gasil_envs.make("walker")
 
 
+@pytest.mark.parametrize("kind", [int, np.int64, np.uint8])
+def test_whole_numbers_of_every_kind_are_taken(kind):
+    env = gasil_envs.make(
+        "point_mass", reward_delay=kind(3), max_episode_steps=kind(7), obs_noise=0.5
+    )
+
+    def one(state, _):
+        state = env.step(state, jnp.zeros(2))
+        return state, (state.reward, state.info["true_reward"], state.done)
+
+    start = env.reset(jax.random.key(0))
+    _, (given, true, done) = jax.lax.scan(one, start, length=7)
+    np.testing.assert_array_equal(done, [0, 0, 0, 0, 0, 0, 1])
+    sums = [true[:3].sum(), true[3:6].sum(), true[6]]
+    np.testing.assert_allclose(given, [0, 0, sums[0], 0, 0, sums[1], sums[2]])
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 3.0, np.float32(3), 0, "3"])
+@pytest.mark.parametrize("name", ["reward_delay", "max_episode_steps"])
+def test_what_is_no_whole_number_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is .*: it must be a whole number"):
+        gasil_envs.make("point_mass", **{name: value})
+
+
+@pytest.mark.parametrize("value", [True, np.True_, -1.0, np.inf, np.nan, "1"])
+def test_noise_that_is_no_number_is_refused(value):
+    with pytest.raises(ValueError, match="obs_noise is .*: it must be finite and 0"):
+        gasil_envs.make("point_mass", obs_noise=value)
+
+
 _OWN = """
 import jax.numpy as jnp
 from brax.envs import Env, State
