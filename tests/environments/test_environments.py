@@ -154,7 +154,7 @@ def test_episodes_start_where_gymnasiums_do(name):
         ):
             error = np.abs(quantity(our, axis=0) - quantity(their, axis=0))
             error = error / their.std(axis=0)
-            print(f"{name}, {field}: {of} differs by up to {error.max():.2f} deviations")
+            print(f"{name}, {field}: {of} differs by {error.max():.2f} deviations")
             assert error.max() < most, (field, of, error.argmax())
 
 
@@ -236,7 +236,7 @@ def test_what_is_no_whole_number_is_refused(name, value):
 
 @pytest.mark.parametrize("value", [True, np.True_, -1.0, np.inf, np.nan, "1"])
 def test_noise_that_is_no_number_is_refused(value):
-    with pytest.raises(ValueError, match="obs_noise is .*: it must be finite and 0"):
+    with pytest.raises(ValueError, match=r"obs_noise is .*: it must be finite and 0"):
         gasil_envs.make("point_mass", obs_noise=value)
 
 
