@@ -1,5 +1,6 @@
 """Collect one batch of experience and keep count of the running episodes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -133,7 +134,7 @@ def is_finite(tree: Any) -> jax.Array:
 
 def collect(
     env: Any,
-    policy: Any,
+    policy: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     environments: EnvironmentStates,
     key: jax.Array,
     *,
