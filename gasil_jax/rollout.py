@@ -1,5 +1,6 @@
 """Collect one batch of experience and keep count of the running episodes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -127,7 +128,7 @@ def init(
 
 def collect(
     env: Any,
-    policy: Any,
+    policy: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     environments: EnvironmentStates,
     key: jax.Array,
     *,

@@ -127,6 +127,13 @@ def _build_of_brax(name: str) -> Env:
     return env
 
 
+def _is_whole(value: Any, low: int, high: int) -> bool:
+    """Return whether a value is a whole number from `low` to `high`; a bool is not."""
+    # NumPy's integers are not `int`, but `bool` is.
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    return whole and low <= value <= high
+
+
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` if `make` would refuse the arguments; builds nothing."""
     _constructor(name)
@@ -145,13 +152,14 @@ def check(name: str, settings: Settings) -> None:
         )
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.
-    if not isinstance(delay, int) or not 1 <= delay < 2**31:
+    if not _is_whole(delay, 1, 2**31 - 1):
         raise ValueError(
             f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
             f"{2**31 - 1}"
         )
     # Numbers are float32.
-    if not isinstance(noise, numbers.Real) or not 0.0 <= noise <= 3.4e38:
+    real = isinstance(noise, numbers.Real) and not isinstance(noise, bool)
+    if not (real and 0.0 <= noise <= 3.4e38):
         raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
 
 
@@ -193,16 +201,15 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if max_episode_steps is not None:
-        whole = isinstance(max_episode_steps, int)
-        if not (whole and 1 <= max_episode_steps <= limit):
+        if not _is_whole(max_episode_steps, 1, limit):
             raise ValueError(
                 f"max_episode_steps is {max_episode_steps!r}: it must be a whole "
                 f"number from 1 to {limit}, the environment's own limit"
             )
-        limit = max_episode_steps
+        limit = int(max_episode_steps)
     env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
-        env = wrappers.RewardDelay(env, chosen.reward_delay)
+        env = wrappers.RewardDelay(env, int(chosen.reward_delay))
     if chosen.obs_noise > 0:
         env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
     return env

@@ -92,15 +92,11 @@ class Solution(struct.PyTreeNode):
 
     Attributes:
       qacc: (V,), acceleration.
-      qacc_smooth: (V,), acceleration without constraints.
-      limit_force: (V,), force of each limit, at least 0.
       edge_forces: (C, E) for each group of contacts, force along each edge.
-      constraint_force: (V,), J' times these forces.
+      constraint_force: (V,), J' times these forces and those of the limits.
     """
 
     qacc: jax.Array
-    qacc_smooth: jax.Array
-    limit_force: jax.Array
     edge_forces: tuple[jax.Array, ...]
     constraint_force: jax.Array
 
@@ -109,11 +105,6 @@ def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Soluti
     """Solve one problem; use `jax.vmap`, nested if needed, for many."""
     function = functools.partial(solve_many, iterations, line_search)
     return batch_last(in_tiles(function))(problem)
-
-
-def linear_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,)."""
-    return batch_last(lambda pair: eliminate(*pair))((matrix, right))
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -394,8 +385,6 @@ def solve_many(
     push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
     return Solution(
         qacc=qacc,
-        qacc_smooth=qacc_smooth,
-        limit_force=push[0],
         edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in push[1:]),
         constraint_force=rows.transposed_times(push),
     )
