@@ -29,6 +29,12 @@ from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
 
+#: A folder of results. Its default is given in full, which the help need not say.
+_Results = Annotated[
+    pathlib.Path,
+    tyro.conf.arg(help_behavior_hint="(default: experiments/results of the checkout)"),
+]
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -38,7 +44,8 @@ class Options:
       quick: train a small version below the folder `runs`: three seeds of the first
         panel, or of those that `only` names, for 100,000 steps each.
       list: only print the missing runs.
-      only: panels and searches to train; default all.
+      only: panels and searches to train; default all. A panel without its searches
+        trains only what complete searches chose.
       part: I/N: train every N-th run, from the I-th on. Other processes or machines
         train the others, and `merge` adds another machine's results.
       results: folder of the pages and, below runs/, of the stored runs. Runs that are
@@ -50,7 +57,7 @@ class Options:
     list: bool = False
     only: tuple[str, ...] = ()
     part: str = "1/1"
-    results: pathlib.Path = RESULTS
+    results: _Results = RESULTS
     setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=engine.Setup
     )
@@ -137,7 +144,7 @@ class MergeOptions:
     """
 
     folder: Annotated[pathlib.Path, tyro.conf.Positional]
-    results: pathlib.Path = RESULTS
+    results: _Results = RESULTS
 
 
 def _merge(options: MergeOptions) -> None:

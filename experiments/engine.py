@@ -29,6 +29,11 @@ from gasil_jax.sweeps import assembly, shards
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
+#: Files and folders of the checkout that experiments write.
+_WRITTEN = (
+    *("experiments/results", "README.md", "gasil_jax/tuned_presets.json"),
+    *("gasil_jax/zoo", "docs/zoo.md"),
+)
 #: The columns of metrics.csv that identify the members of a program.
 _LABELS = ("member", "seed")
 
@@ -63,7 +68,7 @@ class Setup:
 def source(commit: str | None) -> dict[str, Any]:
     """Return the checkout's commit, and whether its files are unchanged.
 
-    Results are left out, because they change while experiments run.
+    What experiments write themselves is left out.
 
     Args:
       commit: the commit to return if there is no repository.
@@ -77,7 +82,8 @@ def source(commit: str | None) -> dict[str, Any]:
             return None
         return answer.stdout.strip() if answer.returncode == 0 else None
 
-    changed = git("status", "--porcelain", "--", ".", ":!experiments/results")
+    written = [f":!{path}" for path in _WRITTEN]
+    changed = git("status", "--porcelain", "--", ".", *written)
     clean = None if changed is None else not changed
     return {"commit": git("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
 
@@ -133,10 +139,12 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     return [Program(ordered(group), setup) for group in groups.values()]
 
 
-def part_of(runs: Sequence[Run], part: shards.Shard) -> list[Run]:
-    """Return every n-th run in the order of their keys, the same on each machine."""
-    chosen = set(sorted(runs, key=lambda run: run.key)[part.number - 1 :: part.count])
-    return [run for run in runs if run in chosen]
+def part_of(runs: Iterable[Run], part: shards.Shard) -> list[Run]:
+    """Return the runs of a part, the same on each machine.
+
+    A run's key alone decides, so that no run changes its part when others join.
+    """
+    return [x for x in runs if int(x.key, 16) % part.count == part.number - 1]
 
 
 def train(program: Program) -> dict[Run, Record]:
@@ -266,4 +274,6 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
             "or name another folder"
         )
     for program in requested:
-        store.add(train(program))
+        # Another process may have added them meanwhile.
+        if Store(store.folder).missing(program.runs):
+            store.add(train(program))

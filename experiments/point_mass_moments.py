@@ -20,7 +20,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import gasil_jax
-from experiments import report
+from experiments import plots
 from experiments.store import RESULTS
 from gasil_jax import normalization, policy
 from gasil_jax.figures import plotting
@@ -153,7 +153,7 @@ def run(options: Options) -> None:
     plotting.point_mass_layout(axes, layout, np.zeros(len(env.unwrapped.objects), bool))
     x, y = layout.start
     axes.text(x, y, "start", ha="center", va="center", fontsize=9)
-    report.save_png(figure, options.out / "point_mass_layout.png", dpi=100)
+    plots.save_png(figure, options.out / "point_mass_layout.png", dpi=100)
 
     titles = [(agent, title) for agent in _COLUMNS for title in _COLUMNS[agent]]
     size = (2.4 * len(titles), 2.5 * len(SHARES))
@@ -169,5 +169,5 @@ def run(options: Options) -> None:
             row[0].set_ylabel(f"{steps:,} steps")
     for panel, (agent, title) in zip(grid[0], titles, strict=True):
         panel.set_title(f"{agent}: {title}", fontsize=9)
-    report.save_png(figure, path, dpi=75)
+    plots.save_png(figure, path, dpi=75)
     print(f"in {path}")

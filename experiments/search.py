@@ -3,9 +3,10 @@
 Environments are out of step and rewards are normalized. Every agent is searched with
 the same number of points on every task, dense and delayed, with two seeds of the
 search's own. Where the best point has a value at an end of its grid, the next value
-beyond is tried too. So one table gives the best point of each task, which is the
-paper's protocol, and the best point over all tasks. Figures train the chosen points
-with seeds of their own.
+beyond is tried too. The best points of all these are trained with more seeds before one
+is chosen, because two seeds decide little on tasks whose outcomes are bimodal. So one
+table gives the best point of each task, which is the paper's protocol, and the best
+point over all tasks. Figures train the chosen points with seeds of their own.
 """
 
 import dataclasses
@@ -31,7 +32,16 @@ PAIR, ADAPTIVE = ("ppo", "ppo+gasil"), "ppo+gasil-adaptive"
 #: Steps of a run in a search.
 STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
 #: Points of each agent's search; their seeds.
-_POINTS, _SEEDS = 12, range(1000, 1002)
+_POINTS, SEEDS = 12, range(1000, 1002)
+#: The number of best points that are trained with more seeds; all their seeds.
+_FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
+#: How a search chooses, in words.
+PROTOCOL = (
+    f"For every agent and task {_POINTS} points are drawn, each trained with "
+    f"{len(SEEDS)} seeds. Where the best of them has a value at an end of its grid, "
+    f"the next value beyond is tried too. The best {_FINALISTS} of all are trained "
+    f"with {len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen."
+)
 #: Every agent's hyperparameters, and those of one or two.
 _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
@@ -130,20 +140,25 @@ class Search:
             decompose_rewards=decompose and self.reward_delay > 1,
         ).replace(**point)
 
-    def runs(self, points: Iterable[Point]) -> list[list[Run]]:
+    def runs(
+        self, points: Iterable[Point], seeds: Iterable[int] = SEEDS
+    ) -> list[list[Run]]:
         """Return the runs of points, a list for each."""
+        seeds = tuple(seeds)
         return [
-            [Run(self.env, self.config(x), seed, self.reward_delay) for seed in _SEEDS]
+            [Run(self.env, self.config(x), seed, self.reward_delay) for seed in seeds]
             for x in points
         ]
 
-    def scores(self, points: Iterable[Point], store: Store) -> np.ndarray | None:
+    def scores(
+        self, points: Iterable[Point], store: Store, seeds: Iterable[int] = SEEDS
+    ) -> np.ndarray | None:
         """Return the mean return over the last fifth of training, (points, seeds).
 
         The result is None if the store lacks a run. A seed that ended no episode in
         that time has -inf.
         """
-        runs = self.runs(points)
+        runs = self.runs(points, seeds)
         if store.missing(itertools.chain(*runs)):
             return None
         finals = np.array([[store[run].part(0.8, 1.0) for run in x] for x in runs])
@@ -158,14 +173,30 @@ class Search:
         best = drawn[int(scores.mean(axis=1).argmax())]
         return (*drawn, *beyond(self.agent, best))
 
-    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """Return the best point and its scores, or None if the search is incomplete."""
+    def finalists(self, store: Store) -> tuple[Point, ...]:
+        """Return the best points, best first, or none if runs of others are missing."""
         points = self.points(store)
         scores = self.scores(points, store)
+        # Until the drawn points are stored, those beyond are unknown.
         if scores is None:
+            return ()
+        order = np.argsort(-scores.mean(axis=1), kind="stable")
+        return tuple(points[i] for i in order[:_FINALISTS])
+
+    def requested(self, store: Store) -> list[Run]:
+        """Return all runs of the search that are known so far."""
+        runs = self.runs(self.points(store))
+        runs += self.runs(self.finalists(store), FINALIST_SEEDS)
+        return list(dict.fromkeys(itertools.chain(*runs)))
+
+    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
+        """Return the best finalist and its scores, or None if runs are missing."""
+        finalists = self.finalists(store)
+        scores = self.scores(finalists, store, FINALIST_SEEDS)
+        if scores is None or not finalists:
             return None
         chosen = int(scores.mean(axis=1).argmax())
-        return points[chosen], scores[chosen]
+        return finalists[chosen], scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
         """Return the chosen point, or None if the search is incomplete."""
@@ -214,7 +245,7 @@ def importance(agent: str, store: Store) -> dict[str, float]:
     """Return how much of its points' variance each hyperparameter explains alone.
 
     It is the mean of `statistics.importance` over the tasks, dense and delayed, whose
-    drawn points are all stored; empty if there is none.
+    drawn points are all stored and all ended an episode; empty if there is none.
     """
     points, shares = draw(agent), []
     for env, delay in CELLS:
@@ -234,8 +265,8 @@ def importance(agent: str, store: Store) -> dict[str, float]:
 class Coverage(NamedTuple):
     """How many runs of an agent on a task are stored and planned.
 
-    A search whose drawn points are not all stored has a plan of these alone, and a
-    search that is incomplete has no final runs yet.
+    A search plans the points beyond and the best points' other seeds only when it knows
+    them, and a search that is incomplete has no final runs yet.
     """
 
     name: str
@@ -263,7 +294,7 @@ def coverage(store: Store, curves: Iterable[Any]) -> list[Coverage]:
     rows = []
     for task in CELLS:
         for name, search in searches(*task).items():
-            runs = list(itertools.chain(*search.runs(search.points(store))))
+            runs = search.requested(store)
             final = of[search].runs(store)
             counts = (stored(runs), len(runs), stored(final), of[search].seeds)
             rows.append(Coverage(name, search, *counts))

@@ -130,9 +130,13 @@ class Summary:
         if not measured:
             return "not measured yet"
         agree = [case for case, agrees in measured.items() if agrees]
-        word = "holds" if len(agree) >= claim.needed else "holds in part"
-        word = word if agree else "does not hold"
         lacking = len(claim.cases) - len(measured)
+        if len(agree) >= claim.needed:
+            word = "holds"
+        elif len(agree) + lacking >= claim.needed:
+            word = "open so far"
+        else:
+            word = "holds in part" if agree else "does not hold"
         words = f"{word}: in {len(agree)} of {len(measured)} cases"
         words += f" ({'; '.join(agree)})" if agree else ""
         return words + (f"; {lacking} not measured yet" if lacking else "")

@@ -40,17 +40,22 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
     """Score the best policy of a run, keep it if it is its task's best, and say so.
 
     Raises:
-      InputError: if it is not the folder of a finished run on a locomotion task.
+      InputError: if it is not the folder of a finished run on a locomotion task, or
+        none of its seeds has a return.
     """
     described = run_folder.read(folder)
     delay = described["settings"].reward_delay
     with command_line.input_checked():
-        weights = numpy_policy.read(folder)
         env = environments.make_env(described["env"])
+        saved = npz.read(folder / "policy.npz")
     if not environments.is_locomotion(env):
         raise InputError(f"run is {folder}: it must be of a locomotion task")
-    saved = npz.read(folder / "policy.npz")
-    seed = int(saved["seeds"][np.nanargmax(saved["final_return"])])
+    final = np.nan_to_num(saved["final_return"], nan=-np.inf)
+    best = int(np.argmax(final))
+    if not np.isfinite(final[best]):
+        raise InputError(f"run is {folder}: none of its seeds ended an episode")
+    seed = int(saved["seeds"][best])
+    weights = numpy_policy.read(folder, seed)
     returns = evaluate_in_gymnasium(
         env.unwrapped.task.gymnasium_id,
         numpy_policy.make(weights),
@@ -76,7 +81,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
     arrays: dict[str, Any] = {
         "about": np.array(json.dumps(about)),
         "seeds": np.array([seed]),
-        "final_return": np.array([np.nanmax(saved["final_return"])]),
+        "final_return": np.array([final[best]]),
         **{x: v if x in ("low", "high") else v[None] for x, v in weights.items()},
     }
     zoo.mkdir(exist_ok=True)

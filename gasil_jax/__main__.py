@@ -12,11 +12,15 @@ from gasil_jax.errors import nearest
 COMMANDS = ("run", "sweep", "merge", "evaluate", "render", "plot", "export_minari")
 
 
+def _first_line(documentation: str | None) -> str:
+    return (documentation or "").partition("\n")[0]
+
+
 def _summary(command: str) -> str:
     """Return the first line of a command's module, without importing it."""
     source = pathlib.Path(__file__).with_name(f"{command}.py").read_text()
-    documentation = ast.get_docstring(ast.parse(source)) or ""
-    return documentation.partition("\n")[0].partition(":")[0].rstrip(".")
+    documentation = ast.get_docstring(ast.parse(source))
+    return _first_line(documentation).partition(":")[0].rstrip(".")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,16 +29,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if list(given) == ["--version"]:
         print(gasil_jax.__version__)
     elif not given or list(given) in (["-h"], ["--help"]):
-        print(f"gasil_jax {gasil_jax.__version__}: {gasil_jax.__doc__}")
+        print(f"gasil_jax {gasil_jax.__version__}: {_first_line(gasil_jax.__doc__)}")
         print("\nCommands, each with --help:")
         for command in COMMANDS:
             print(f"  python -m gasil_jax.{command:14} {_summary(command)}")
     else:
         close = nearest(given[0], [*COMMANDS, "--version"])
-        meant = f" {close}" if close == "--version" else f".{close}"
+        meant = ""
+        if close is not None:
+            end = f" {close}" if close == "--version" else f".{close}"
+            meant = f": did you mean python -m gasil_jax{end}?"
         print(
-            f"error: {given[0]!r} is unknown: did you mean python -m gasil_jax{meant}? "
-            "(without an argument all commands are listed)",
+            f"error: {given[0]!r} is unknown{meant} (without an argument all commands "
+            "are listed)",
             file=sys.stderr,
         )
         return 2

@@ -195,8 +195,8 @@ class Config:
     """Factor that multiplies PPO's clip range, given in the same way."""
     alpha_schedule: Schedule = ()
     """Factor that multiplies alpha, given in the same way. The paper's rule for
-    Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is ((2e6, 0), (3e6,
-    1))."""
+    Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is 2e6 0 3e6 1 on the
+    command line and ((2e6, 0), (3e6, 1)) in Python."""
     normalize_rewards: bool = False
     """Whether to divide PPO's rewards by the standard deviation of their running
     discounted sum (as in OpenAI baselines' ppo2). Alpha is then in that unit, not in
@@ -216,8 +216,8 @@ class Config:
     """Widths of the tanh layers of that network."""
     stagger_episodes: bool = True
     """Whether each environment's first episode begins at a random age, so that a batch
-    holds steps from all parts of an episode. Otherwise environments whose episodes
-    never end early stay in lock-step for the whole run."""
+    holds steps from all parts of an episode. Otherwise all begin at age 0, and where
+    episodes never end early a batch is one thin slice of them."""
     expert: str | None = None
     """Expert that GAIL imitates: an .npz file with arrays "observation" and "action",
     or minari:NAME for a Minari data set."""
@@ -364,7 +364,7 @@ def validate(config: Config, agents: Sequence[str]) -> None:
     if not isinstance(config.expert, str | None):
         raise _refusal("expert", config.expert, "a text or None")
     if config.agent not in agents and ":" not in config.agent:
-        raise ValueError(unknown("agent", config.agent, agents))
+        raise ValueError(unknown("agent", config.agent, agents, ["MODULE:NAME"]))
     hyperparameters_of(config.agent)
     _validate_sizes(config)
     for name in ("num_envs", "minibatch_size"):

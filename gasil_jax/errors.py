@@ -1,6 +1,7 @@
 """The error for bad input, and its wording. Every layer may import this module."""
 
 import difflib
+import shlex
 from collections.abc import Sequence
 
 
@@ -12,14 +13,32 @@ class NotImportable(InputError):
     """A MODULE:NAME that can't be imported here."""
 
 
-def nearest(name: str, allowed: Sequence[str]) -> str:
-    """Return the allowed name that is most similar to `name`."""
-    return difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
+def nearest(name: str, allowed: Sequence[str]) -> str | None:
+    """Return the allowed name that `name` may be a slip for, or None."""
+    return next(iter(difflib.get_close_matches(name, allowed, n=1, cutoff=0.7)), None)
 
 
-def unknown(kind: str, name: str, allowed: Sequence[str]) -> str:
-    """Return the error message for a name that is not among the allowed ones."""
-    return (
-        f"{kind} {name!r} is unknown: did you mean {nearest(name, allowed)!r}? "
-        f"(one of {', '.join(allowed)})"
-    )
+def unknown(
+    kind: str, name: str, allowed: Sequence[str], forms: Sequence[str] = ()
+) -> str:
+    """Return the error message for a name that is not among the allowed ones.
+
+    Args:
+      kind: what is named.
+      name: the unknown name.
+      allowed: the known names.
+      forms: what other names look like, such as MODULE:NAME.
+    """
+    return f"{kind} {name!r} is unknown: {instead(name, allowed, forms)}"
+
+
+def instead(name: str, allowed: Sequence[str], forms: Sequence[str] = ()) -> str:
+    """Return what is allowed in place of a name: the nearest, if one is near, and all.
+
+    Names with spaces are quoted, as on a command line.
+    """
+    listed = ", ".join(shlex.quote(x) for x in (*allowed, *forms))
+    close = nearest(name, allowed)
+    if close is None:
+        return f"it must be one of {listed}"
+    return f"did you mean {close!r}? (one of {listed})"

@@ -3,6 +3,7 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import optax
 from flax import struct
 
@@ -44,3 +45,18 @@ def descend(
     updates, optimizer_state = transform.update(gradient, learner.optimizer_state)
     params = jax.tree.map(lambda p, u: p - step_size * u, learner.params, updates)
     return Learner(params, optimizer_state)
+
+
+def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
+    """Return an update, or what was before it if the update is not finite.
+
+    Args:
+      new: what was learned, a pytree.
+      old: the same before it.
+
+    Returns:
+      whether every number of `new` is finite, (), and `new` if so, else `old`.
+    """
+    finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(new)]
+    healthy = jnp.all(jnp.stack(finite))
+    return healthy, jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)

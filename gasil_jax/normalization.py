@@ -5,6 +5,9 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+# From there, because a saved policy runs without JAX.
+from gasil_jax.numpy_policy import CLIP
+
 # From C MuJoCo (mjMAXVAL), for which a larger number means a failed simulation.
 _LARGEST = 1e10
 
@@ -65,9 +68,7 @@ def moments(normalizer: Normalizer) -> tuple[jax.Array, jax.Array]:
     return normalizer.mean, jnp.sqrt(variance + 1e-8)
 
 
-def normalize(
-    normalizer: Normalizer, observation: jax.Array, clip: float = 10.0
-) -> jax.Array:
-    """Scale observations (..., obs) to mean 0 and variance 1, clipped to +-`clip`."""
+def normalize(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
+    """Scale observations (..., obs) to mean 0 and variance 1, clipped to +-`CLIP`."""
     mean, scale = moments(normalizer)
-    return jnp.clip((observation - mean) / scale, -clip, clip)
+    return jnp.clip((observation - mean) / scale, -CLIP, CLIP)

@@ -2,13 +2,15 @@
 
 A row overrides the defaults of `Config` and `Hyperparameters`; a flag overrides a row.
 
-"tuned" holds only what was measured: what a search chose for a task, with the number of
+"tuned" holds what a search chose for an agent and a task, with the number of
 environments and the unit of rewards that it ran with. A flag that changes the unit
-needs another alpha. Adaptive imitation has one setting for all tasks.
+needs another alpha. Where the stored search is complete, the row is what it chose; the
+other rows are from earlier searches. Adaptive imitation has one setting for all
+locomotion tasks. An agent without a row for a task starts from the defaults.
 
 "paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
-gives for a task. The rest are the defaults, which are the appendix's too. A single
-environment is slow, because only the seeds share the cost of a step.
+gives for a task. The rest are the defaults, which are the appendix's where it gives
+them. A single environment is slow, because only the seeds share the cost of a step.
 """
 
 import json
@@ -26,13 +28,13 @@ Overrides = Mapping[str, Any]
 Rows = Mapping[tuple[str, str], Overrides]
 
 
-#: What the searches of `experiments` chose, by "dense" or "delayed", environment and
-#: agent; `python -m experiments report` writes the rows of complete searches.
+#: What searches chose, by "dense" or "delayed", environment and agent; `python -m
+#: experiments report` writes the rows of complete searches and leaves the others.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _LOCOMOTION = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 # One setting for every locomotion task, chosen on two seeds a task with rewards delayed
-# by 20 steps (docs/algorithm.md).
+# by 20 steps (experiments/notes/adaptive_ablation.md).
 _ADAPTIVE = {
     "normalize_rewards": True,
     "num_envs": 32,
@@ -110,5 +112,15 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
         raise ValueError(unknown("preset", name, names()))
     find_agent(agent)
     chosen = PRESETS[name]
+    row = _row(chosen, env, agent, reward_delay) or {}
+    return Config(agent=agent).replace(**{**chosen.every, **row})
+
+
+def is_tuned(env: str, agent: str, reward_delay: int = 1) -> bool:
+    """Return whether the preset "tuned" has a row for an agent on a task."""
+    return _row(PRESETS["tuned"], env, agent, reward_delay) is not None
+
+
+def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides | None:
     rows = chosen.delayed if reward_delay > 1 else chosen.dense
-    return Config(agent=agent).replace(**{**chosen.every, **rows.get((env, agent), {})})
+    return rows.get((env, agent))

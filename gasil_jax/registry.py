@@ -25,7 +25,7 @@ def find(name: Any) -> Any:
     if ":" not in name:
         importlib.import_module("gasil_jax.imitation")  # It fills the table.
         if name not in AGENTS:
-            raise ValueError(unknown("agent", name, tuple(AGENTS)))
+            raise ValueError(unknown("agent", name, tuple(AGENTS), ["MODULE:NAME"]))
         return AGENTS[name]
     from gasil_envs import own_code
 

@@ -15,7 +15,9 @@ arXiv:2111.13485). Minibatches are drawn from all complete windows in the histor
 PPO then sees m + s g instead of the environment's reward. What a window paid beyond
 the sum of that is shared evenly by its steps: so a window's sum is what it paid, before
 the network has learned anything the payout is spread evenly, and where every step pays
-the reward is the environment's own.
+the reward is the environment's own. Of a window that began in an earlier batch only the
+steps of this batch get their share, because PPO has learned from the others already;
+its sum then lacks theirs.
 """
 
 from collections.abc import Callable
@@ -218,8 +220,11 @@ def decompose(
     config: Config,
     hyperparameters: Hyperparameters,
     action_range: tuple[Any, Any],
-) -> tuple[Decomposition, Rollout, Metrics]:
+) -> tuple[Decomposition, Rollout, jax.Array, Metrics]:
     """Learn from the windows that were completed, and decompose a batch's rewards.
+
+    The network stays as it was where what it learned is not finite. The rest of the
+    state goes with the history, which no failed update undoes.
 
     Args:
       decomposition: the state before the batch.
@@ -232,8 +237,9 @@ def decompose(
       action_range: the lowest and the highest action that the environment sees.
 
     Returns:
-      The state after the batch, the batch with decomposed rewards, and metrics. The
-      windows of "decomposition_fit" had not been trained on when they were predicted.
+      The state after the batch, the batch with decomposed rewards, whether the update
+      of the network was finite and is kept, (), and metrics. The windows of
+      "decomposition_fit" had not been trained on when they were predicted.
     """
     network = _network(config)
     low, high = action_range
@@ -280,7 +286,9 @@ def decompose(
         config=config,
         step_size=hyperparameters.decomposition_learning_rate,
     )
-    # What the network leaves unexplained of a window is shared by its steps.
+    healthy, trained = learner.keep_if_finite(trained, decomposition.network)
+    # What the network leaves unexplained of a window is shared by its steps; the shares
+    # of steps in earlier batches are lost.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
     rest = jnp.where(scored, (batch.reward - total) / length, 0.0)
@@ -295,7 +303,7 @@ def decompose(
         open_steps=running[1],
         recorded_steps=recorded_steps,
     )
-    return decomposition, batch.replace(reward=reward), metrics
+    return decomposition, batch.replace(reward=reward), healthy, metrics
 
 
 def _train(

@@ -1,5 +1,6 @@
 """Collect one batch of experience and keep count of the running episodes."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -125,15 +126,9 @@ def init(
     )
 
 
-def is_finite(tree: Any) -> jax.Array:
-    """Return whether every number of every leaf is finite, bool ()."""
-    leaves = jax.tree.leaves(tree)
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in leaves]))
-
-
 def collect(
     env: Any,
-    policy: Any,
+    policy: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
     environments: EnvironmentStates,
     key: jax.Array,
     *,

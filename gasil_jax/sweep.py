@@ -41,6 +41,8 @@ class Options(run_options.Options):
     """Train every point of a grid, or random points, with many seeds each.
 
     Attributes:
+      out: folder of the sweep, created if it is missing; default
+        runs/ENV-AGENT-TIME.
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: number of points to draw from the grid or, without a grid, from the
         ranges of the paper's appendix. The draw's seed is first_seed.
@@ -247,7 +249,8 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")
     if options.shards is None or options.shards < 1:
-        raise InputError(f"shards is {options.shards}: --launcher needs 1 or more")
+        given = f"shards is {options.shards}: "
+        raise InputError(f"{given}--launcher needs --shards, 1 or more")
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
     points, programs = plan(options)

@@ -43,7 +43,13 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
     )
     history, buffer = train.remember(config, state, batch, hyperparameters)
     rewards, _ = train.learner_rewards(
-        env, config, state, batch, history, decompose_key, hyperparameters
+        env,
+        config,
+        state,
+        batch=batch,
+        history=history,
+        key=decompose_key,
+        hyperparameters=hyperparameters,
     )
     return Context(
         rollout=rewards.batch,

@@ -164,7 +164,7 @@ def _init_actor_critic(
 
 @full_precision
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
-    """One iteration of Algorithm 1: a batch of experience and the updates from it.
+    """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
     Returns the next state and a dict of float32 scalars. Means over the whole episodes
     that ended in the batch are NaN if none did.
@@ -183,7 +183,13 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     history, buffer = remember(config, state, batch, hyperparameters)
     # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
     rewards, reward_metrics = learner_rewards(
-        env, config, state, batch, history, decompose_key, hyperparameters
+        env,
+        config,
+        state,
+        batch=batch,
+        history=history,
+        key=decompose_key,
+        hyperparameters=hyperparameters,
     )
     context = Context(
         rollout=rewards.batch,
@@ -203,16 +209,20 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Update the policy.
     actor_critic, imitation, policy_metrics = update_policy(
-        agent, state.actor_critic, imitation, streams, context, (ppo_key, policy_key)
+        agent,
+        state.actor_critic,
+        imitation,
+        rewards=streams,
+        context=context,
+        keys=(ppo_key, policy_key),
     )
-    healthy, (actor_critic, imitation, decomposition) = keep_if_finite(
-        (actor_critic, imitation, rewards.decomposition),
-        (state.actor_critic, state.imitation, state.reward_decomposition),
+    healthy, (actor_critic, imitation) = learner.keep_if_finite(
+        (actor_critic, imitation), (state.actor_critic, state.imitation)
     )
     metrics: Metrics = {
         "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
         "learning_rate": jnp.asarray(hyperparameters.learning_rate),
-        "skipped_updates": ~healthy,
+        "skipped_updates": ~(healthy & rewards.healthy),
         **rollout_metrics(batch, buffer),
         **reward_metrics,
     }
@@ -220,7 +230,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         actor_critic=actor_critic,
         # Only now: within an iteration the policy that acts is the one that learns.
         normalizer=normalization.update(state.normalizer, batch.observation),
-        reward_decomposition=decomposition,
+        reward_decomposition=rewards.decomposition,
         reward_normalizer=rewards.normalizer,
         environments=environments,
         history=history,
@@ -313,6 +323,7 @@ class Rewards(NamedTuple):
       scale: (), the number that the batch's rewards were divided by.
       decomposition: after the batch; None where rewards are not decomposed.
       normalizer: after the batch; None where rewards are not normalized.
+      healthy: (), whether what was learned of rewards is finite and was kept.
     """
 
     batch: Rollout
@@ -320,6 +331,7 @@ class Rewards(NamedTuple):
     scale: jax.Array
     decomposition: reward_decomposition.Decomposition | None
     normalizer: reward_normalization.RewardNormalizer | None
+    healthy: jax.Array
 
 
 @jax.named_scope("rewards")
@@ -327,6 +339,7 @@ def learner_rewards(
     env: Any,
     config: Config,
     state: TrainState,
+    *,
     batch: Rollout,
     history: good_trajectories.History,
     key: jax.Array,
@@ -343,10 +356,10 @@ def learner_rewards(
       key: consumed.
       hyperparameters: their values in this iteration.
     """
-    decomposition = None
+    decomposition, healthy = None, jnp.bool_(True)
     metrics: Metrics = {}
     if state.reward_decomposition is not None:
-        decomposition, batch, metrics = reward_decomposition.decompose(
+        decomposition, batch, healthy, metrics = reward_decomposition.decompose(
             state.reward_decomposition,
             batch,
             history,
@@ -357,9 +370,9 @@ def learner_rewards(
             action_range=wrappers.action_range(env),
         )
         # What is not a number in the history marks an episode without a return.
-        unknown = jnp.isnan(history.reward)
+        has_no_return = jnp.isnan(history.reward)
         history = history.replace(
-            reward=jnp.where(unknown, jnp.nan, decomposition.reward)
+            reward=jnp.where(has_no_return, jnp.nan, decomposition.reward)
         )
     normalizer, scale = None, jnp.float32(1.0)
     if state.reward_normalizer is not None:
@@ -370,7 +383,8 @@ def learner_rewards(
         scale = reward_normalization.scale(normalizer)
         batch = batch.replace(reward=reward)
         metrics = {**metrics, "reward_scale": scale}
-    return Rewards(batch, history, scale, decomposition, normalizer), metrics
+    rewards = Rewards(batch, history, scale, decomposition, normalizer, healthy)
+    return rewards, metrics
 
 
 @jax.named_scope("advantages")
@@ -428,6 +442,7 @@ def update_policy(
     agent: Imitation,
     actor_critic: ActorCritic,
     imitation: Any,
+    *,
     rewards: jax.Array,
     context: Context,
     keys: tuple[jax.Array, jax.Array],
@@ -467,24 +482,10 @@ def update_policy(
     return actor_critic, imitation, metrics
 
 
-def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
-    """An update that is not finite is as if it had not been.
-
-    Args:
-      new: what was learned, a pytree.
-      old: the same before it.
-
-    Returns:
-      whether every number of `new` is finite, (), and `new` if so, else `old`.
-    """
-    healthy = rollout.is_finite(new)
-    return healthy, jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
-
-
 def rollout_metrics(
     batch: Rollout, buffer: good_trajectories.GoodTrajectories
 ) -> Metrics:
-    """What a batch and the buffer after it are like.
+    """Return the metrics of a batch and of the buffer after it.
 
     Means over the whole episodes that ended in the batch are NaN if none did.
 
@@ -505,7 +506,7 @@ def rollout_metrics(
 
 
 def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
-    """All metrics of an iteration as float32 scalars, by name.
+    """Return all metrics of an iteration as float32 scalars, by name.
 
     Raises:
       ValueError: an agent's metric has a name that another one has.
@@ -542,7 +543,7 @@ def check(env: Any, config: Config) -> None:
 
 
 class Train(Protocol):
-    """A whole run: a key, consumed, to the last state and metrics (iterations,)."""
+    """A function of a key, consumed, to the last state and metrics (iterations,)."""
 
     def __call__(
         self, key: jax.Array, hyperparameters: Hyperparameters | None = None
@@ -551,7 +552,7 @@ class Train(Protocol):
 
 
 def make_train(env: Any, config: Config) -> Train:
-    """A pure function that trains from nothing to `config.total_steps`.
+    """Return a pure function that trains from nothing to `config.total_steps`.
 
     Args:
       env: one environment with Brax's interface (`gasil_jax.make_env`, or any of

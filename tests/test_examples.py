@@ -12,7 +12,6 @@ import pytest
 
 import gasil_jax
 from gasil_jax.host import policy_file
-from gasil_jax.imitation import AGENTS
 from gasil_jax.sweeps import saved_states
 
 EXAMPLES = pathlib.Path(__file__).parent.parent / "docs" / "examples"
@@ -64,10 +63,10 @@ def test_an_environment_of_ones_own_trains(run_script, monkeypatch):
 
 
 def test_an_agent_of_ones_own_trains(run_script, monkeypatch):
-    monkeypatch.setitem(AGENTS, "ppo+nearest", None)  # and away again
+    monkeypatch.syspath_prepend(EXAMPLES)  # as a script's own folder is
     printed = run_script("own_agent.py", "--steps", 4096)
     agents = re.findall(r"^(\S+): return", printed, re.MULTILINE)
-    assert agents == ["ppo", "ppo+nearest"]
+    assert agents == ["ppo", "own_agent:NEAREST"]
     without, with_bonus = numbers(printed)
     assert np.isfinite(without) and with_bonus != without
 

@@ -32,6 +32,7 @@ sys.exit(gasil_jax.run.main({arguments}))
 def test_the_commands_are_listed(capsys):
     assert package.main([]) == 0
     printed = capsys.readouterr().out
+    assert "__init__" not in printed
     for command in package.COMMANDS:
         assert importlib.util.find_spec(f"gasil_jax.{command}")
         (line,) = [x for x in printed.splitlines() if f"gasil_jax.{command} " in x]
@@ -40,6 +41,8 @@ def test_the_commands_are_listed(capsys):
     assert capsys.readouterr().out == f"{gasil_jax.__version__}\n"
     assert package.main(["evalute"]) == 2
     assert "did you mean python -m gasil_jax.evaluate?" in capsys.readouterr().err
+    assert package.main(["foo"]) == 2
+    assert "'foo' is unknown (without an argument" in capsys.readouterr().err
 
 
 def test_a_config_can_be_made_before_anything_else():

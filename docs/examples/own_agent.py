@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 import gasil_jax
-from gasil_jax import good_trajectories, imitation, normalization
+from gasil_jax import good_trajectories, normalization
 from gasil_jax.imitation.interface import Imitation, leave_policy
 
 
@@ -38,7 +38,7 @@ def update_and_reward(state, context, key):
     return state, reward, {"closeness": jnp.mean(closeness)}
 
 
-imitation.AGENTS["ppo+nearest"] = Imitation(
+NEAREST = Imitation(
     init, update_and_reward, leave_policy, fields=("alpha", "buffer_steps")
 )
 
@@ -52,7 +52,8 @@ def main() -> None:
     options = parser.parse_args()
 
     env = gasil_jax.make_env(options.env)
-    for agent in ("ppo", "ppo+nearest"):
+    # The second is found by the name of this file, from here or on the command line.
+    for agent in ("ppo", "own_agent:NEAREST"):
         config = gasil_jax.Config(agent=agent, total_steps=options.steps)
         train = gasil_jax.make_train(env, config.replace(alpha=options.alpha))
         _, metrics = jax.jit(train)(jax.random.key(0))

@@ -56,22 +56,36 @@ def _constructors() -> dict[str, Callable[[Settings], Env]]:
     }
 
 
-def _refuse_unknown(kind: str, name: Any, allowed: Iterable[str]) -> None:
-    allowed = tuple(allowed)
-    if not isinstance(name, str):
-        raise ValueError(f"{kind} is {name!r}: it must be one of {', '.join(allowed)}")
-    if name in allowed:
-        return
-    nearest = difflib.get_close_matches(name, allowed, n=1, cutoff=0.0)[0]
-    raise ValueError(
-        f"{kind} {name!r} is unknown: did you mean {nearest!r}? "
-        f"(one of {', '.join(allowed)})"
-    )
-
-
 #: Prefix of the names of environments in ``brax.envs``.
 BRAX = "brax:"
 _EPISODE_LENGTH = 1000
+
+
+def _refuse_unknown(
+    kind: str, name: Any, allowed: Iterable[str], forms: Iterable[str] = ()
+) -> None:
+    """Raise `ValueError` for a name that is not among the allowed ones.
+
+    Args:
+      kind: what is named.
+      name: the name.
+      allowed: the known names.
+      forms: what other names look like, such as MODULE:NAME.
+    """
+    allowed = tuple(allowed)
+    listed = ", ".join((*allowed, *forms))
+    if not isinstance(name, str):
+        raise ValueError(f"{kind} is {name!r}: it must be one of {listed}")
+    if name in allowed:
+        return
+    # A prefix that all have in common makes no name similar to another.
+    bare = {x.removeprefix(BRAX): x for x in allowed}
+    near = difflib.get_close_matches(name.removeprefix(BRAX), bare, n=1, cutoff=0.7)
+    if not near:
+        raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
+    raise ValueError(
+        f"{kind} {name!r} is unknown: did you mean {bare[near[0]]!r}? (one of {listed})"
+    )
 
 
 def names() -> tuple[str, ...]:
@@ -91,7 +105,7 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     if isinstance(name, str) and ":" in name:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
-    _refuse_unknown("env", name, names())
+    _refuse_unknown("env", name, names(), (f"{BRAX}NAME", "MODULE:NAME"))
     return _constructors()[name]
 
 
@@ -113,6 +127,13 @@ def _build_of_brax(name: str) -> Env:
     return env
 
 
+def _is_whole(value: Any, low: int, high: int) -> bool:
+    """Return whether a value is a whole number from `low` to `high`; a bool is not."""
+    # NumPy's integers are not `int`, but `bool` is.
+    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
+    return whole and low <= value <= high
+
+
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` if `make` would refuse the arguments; builds nothing."""
     _constructor(name)
@@ -131,13 +152,14 @@ def check(name: str, settings: Settings) -> None:
         )
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.
-    if not isinstance(delay, int) or not 1 <= delay < 2**31:
+    if not _is_whole(delay, 1, 2**31 - 1):
         raise ValueError(
             f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
             f"{2**31 - 1}"
         )
     # Numbers are float32.
-    if not isinstance(noise, numbers.Real) or not 0.0 <= noise <= 3.4e38:
+    real = isinstance(noise, numbers.Real) and not isinstance(noise, bool)
+    if not (real and 0.0 <= noise <= 3.4e38):
         raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
 
 
@@ -179,16 +201,15 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if max_episode_steps is not None:
-        whole = isinstance(max_episode_steps, int)
-        if not (whole and 1 <= max_episode_steps <= limit):
+        if not _is_whole(max_episode_steps, 1, limit):
             raise ValueError(
                 f"max_episode_steps is {max_episode_steps!r}: it must be a whole "
                 f"number from 1 to {limit}, the environment's own limit"
             )
-        limit = max_episode_steps
+        limit = int(max_episode_steps)
     env = wrappers.EpisodeLimit(env, limit)
     if chosen.reward_delay > 1:
-        env = wrappers.RewardDelay(env, chosen.reward_delay)
+        env = wrappers.RewardDelay(env, int(chosen.reward_delay))
     if chosen.obs_noise > 0:
         env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
     return env

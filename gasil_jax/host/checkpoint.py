@@ -19,7 +19,7 @@ import math
 import os
 import pathlib
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple, TypedDict
 
 import jax
@@ -187,12 +187,8 @@ class _Manifest(TypedDict):
     record: _Record
 
 
-def read(folder: pathlib.Path, required: Sequence[str] = ()) -> Checkpoint:
+def read(folder: pathlib.Path) -> Checkpoint:
     """Return the checkpoint in `folder` after checking its manifest and its hashes.
-
-    Args:
-      folder: the checkpoint's folder.
-      required: names that its record must have.
 
     Raises:
       ValueError: if it is damaged.
@@ -202,9 +198,6 @@ def read(folder: pathlib.Path, required: Sequence[str] = ()) -> Checkpoint:
     except (OSError, ValueError) as error:
         raise ValueError(f"{folder} is damaged: {error}") from None
     files, record = manifest["files"], manifest["record"]
-    for name in required:
-        if name not in record:
-            raise ValueError(f"{folder} is damaged: its record has no {name}")
     hashes = _hashes(folder)
     if hashes != files:
         name = min(
@@ -214,19 +207,12 @@ def read(folder: pathlib.Path, required: Sequence[str] = ()) -> Checkpoint:
     return Checkpoint(folder, int(folder.name), record)
 
 
-def latest(
-    root: pathlib.Path, required: Sequence[str] = ()
-) -> tuple[Checkpoint | None, list[str]]:
-    """Return the newest undamaged checkpoint, and the errors of damaged newer ones.
-
-    Args:
-      root: folder of the checkpoints.
-      required: names that a checkpoint's record must have.
-    """
+def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
+    """Return the newest undamaged checkpoint, and the errors of damaged newer ones."""
     damages: list[str] = []
     for folder in reversed(_folders(root)):
         try:
-            return read(folder, required), damages
+            return read(folder), damages
         except ValueError as error:
             damages.append(str(error))
     return None, damages
@@ -270,6 +256,12 @@ def set_aside(root: pathlib.Path, newer_than: int) -> None:
                 number += 1
                 other = folder.with_name(f"{folder.name}{_DAMAGED}.{number}")
             folder.rename(other)
+
+
+def delete_partial(root: pathlib.Path) -> None:
+    """Delete what killed processes have half written; no other process may write."""
+    for folder in root.glob(f"*{_PARTIAL}"):
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def prune(root: pathlib.Path, keep: int) -> None:

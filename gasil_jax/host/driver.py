@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, command_line, metrics_files
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.interval import Interval
@@ -204,13 +205,23 @@ def _restored(
     """Return states, iteration and record of the newest undamaged checkpoint.
 
     Without one they are None, 0 and None. Newer, damaged checkpoints are set aside with
-    a warning.
+    a warning, and those that are half written are deleted.
+
+    Raises:
+      InputError: if the checkpoint is of another state or has not seen a table.
     """
     with progress.aside("reading the checkpoints"):
-        newest, damages = checkpoint.latest(root, [f"{table}_size" for table in tables])
+        newest, damages = checkpoint.latest(root)
+    for name in [f"{table}_size" for table in tables]:
+        if newest is not None and name not in newest.record:
+            raise InputError(
+                f"{newest.folder} is whole, but its record has no {name}: it is of a "
+                "training with other options"
+            )
     for damage in damages:
         instead = "starting anew" if newest is None else f"using {newest.folder.name}"
         print(f"warning: {damage}; {instead}", file=sys.stderr)
+    checkpoint.delete_partial(root)
     checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
     if newest is None:
         return None, 0, None
@@ -262,7 +273,8 @@ def drive(
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint is of another state, or if a table is damaged.
+      InputError: if the checkpoint is of another state or has not seen a table, or if a
+        table is damaged.
       OSError: if the folder can't be written, or if the disk is full.
     """
     config, last = members.config, members.config.num_iterations

@@ -62,8 +62,9 @@ def fit(
       seeds: number of seeds, from 0 on; or their numbers.
       folder: folder of metrics.csv, evaluations.csv and checkpoints/, created if it is
         missing; None keeps nothing.
-      resume: continue the training in the folder from its newest checkpoint; only
-        `total_steps` may differ, and only grow. The environment is not compared. If
+      resume: continue the training in the folder from its newest checkpoint. Of the
+        seeds, the config and the evaluations only `total_steps` may differ, and only
+        grow. The environment, and schedules that are functions, are not compared. If
         the folder holds no training yet, a new one begins.
       checkpoint_every: environment steps per seed between two checkpoints, rounded up
         to whole iterations; default a checkpoint every ten minutes and at the end.
@@ -100,7 +101,12 @@ def fit(
             # Ctrl-C ends training at once, because there is nothing to save.
             where = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         else:
-            described = {"seeds": tuple(members.seeds), **run_folder.flat(vars(config))}
+            described = {
+                "seeds": tuple(members.seeds),
+                "evaluate_every": evaluate_every,
+                "evaluate_episodes": evaluate_episodes if evaluate_every else None,
+                **run_folder.flat(vars(config)),
+            }
             where = pathlib.Path(folder)
             stack.enter_context(_opened(where, described, resume))
             stack.enter_context(interruption)
@@ -166,7 +172,7 @@ def _opened(
         # A function has no other form in JSON.
         now = {x: "a function" if callable(y) else y for x, y in described.items()}
         if begun:
-            before = json_reader.read(path, dict[str, Any])
+            before = _described(path)
             if changes := run_folder.differences(before, now):
                 raise ValueError(
                     f"resume continues with {folder}, where {'; '.join(changes)}: "
@@ -178,6 +184,24 @@ def _opened(
         except Interrupted as interrupted:
             interrupted.add_note("continue with the same arguments and resume=True")
             raise
+
+
+def _described(path: pathlib.Path) -> dict[str, Any]:
+    """Return what fit.json says of the training that has begun in its folder.
+
+    Raises:
+      ValueError: if it is damaged, or does not say how the policies were evaluated.
+    """
+    described = json_reader.read(path, dict[str, Any])
+    # Older versions wrote nothing of evaluations. Their table tells if there were any.
+    names = ("evaluate_every", "evaluate_episodes")
+    missing = [name for name in names if name not in described]
+    if missing and path.with_name("evaluations.csv").exists():
+        raise ValueError(
+            f"{path} is of an older version: add {' and '.join(missing)}, the numbers "
+            "that its policies were evaluated with"
+        )
+    return dict.fromkeys(missing) | described
 
 
 def _table(path: pathlib.Path, num_members: int) -> dict[str, np.ndarray]:

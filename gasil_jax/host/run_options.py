@@ -32,8 +32,8 @@ class Options:
         humanoid; one of Brax's as brax:NAME, for example brax:inverted_pendulum; or
         your own as MODULE:NAME.
       seeds: number of seeds to train.
-      first_seed: number of the first seed. A seed's result depends only on its
-        number.
+      first_seed: number of the first seed. A seed's random numbers depend only on
+        its number.
       out: run folder, created if it is missing; default runs/ENV-AGENT-TIME.
       resume: continue the run in the folder `out` from its last checkpoint, with its
         settings; only total_steps may differ, and only grow. If the folder holds no
@@ -229,6 +229,17 @@ def tell_without_effect(options: Options, num_members: int) -> None:
         command_line.note(
             f"devices is {options.devices}, of which {num_members} are used, one for "
             "each seed"
+        )
+
+
+def tell_if_untuned(options: Options) -> None:
+    """Print a note if the preset "tuned" has nothing for the agent on the task."""
+    agent, delay = options.config.agent, options.settings.reward_delay
+    if options.preset == "tuned" and not presets.is_tuned(options.env, agent, delay):
+        rewards = "delayed" if delay > 1 else "dense"
+        command_line.note(
+            f"preset 'tuned' has nothing for agent {agent!r} on {options.env} with "
+            f"{rewards} rewards: what is not given is the default"
         )
 
 

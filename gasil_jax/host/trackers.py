@@ -99,7 +99,7 @@ def check(names: Sequence[str]) -> None:
     for name in names:
         if name not in TRACKERS:
             allowed = ", ".join(TRACKERS)
-            raise ValueError(f"log is {name!r}: it must be of {allowed}")
+            raise ValueError(f"log is {name!r}: it must be one of {allowed}")
         package = TRACKERS[name][0]
         try:
             importlib.import_module(package)

@@ -104,7 +104,10 @@ def check(source: str | None, observation_size: int, action_size: int) -> None:
       ValueError: if it is missing, can't be read, or has other sizes.
     """
     if source is None:
-        raise ValueError("expert is missing: agent 'gail' needs a file or data set")
+        raise ValueError(
+            "expert is missing: agent 'gail' needs a file, FILE.npz, or a data set, "
+            "minari:NAME"
+        )
     observation, action = load(source)
     sizes = (observation.shape[1], action.shape[1])
     if sizes != (observation_size, action_size):

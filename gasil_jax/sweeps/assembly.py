@@ -92,6 +92,7 @@ def prepare(
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
         )
+    run_options.tell_if_untuned(options)
     run_options.tell_without_effect(options, num_members)
     tell_if_no_episode_ends(env, [program.config for program in programs])
     return env

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.config import Config, Hyperparameters, own_names, ranges, validate
-from gasil_jax.errors import InputError, nearest
+from gasil_jax.errors import InputError, instead
 from gasil_jax.host.command_line import whole_number
 from gasil_jax.imitation import agents, unused
 
@@ -59,9 +59,13 @@ def parse_grid(grid: Sequence[str], agent: str) -> dict[str, tuple[Any, ...]]:
             numbers = [read(value) for value in listed.split(",")]
             values[name] = tuple(dict.fromkeys(numbers))
         except ValueError:
-            kind = "numbers" if allowed[name] is float else "whole numbers"
+            kind, example = (
+                ("numbers", "0.1,0.2")
+                if allowed[name] is float
+                else ("whole numbers", "10,20")
+            )
             raise InputError(
-                f"grid has {entry!r}: it must be {name}= and {kind}, commas between"
+                f"grid has {entry!r}: it must be {kind}, like {name}={example}"
             ) from None
     return values
 
@@ -129,10 +133,7 @@ def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> 
 
 
 def _unknown_name(name: str, allowed: Iterable[str]) -> str:
-    return (
-        f"{name!r} can't vary: did you mean {nearest(name, tuple(allowed))!r}? "
-        f"(one of {', '.join(allowed)})"
-    )
+    return f"{name!r} can't vary: {instead(name, tuple(allowed))}"
 
 
 def _refuse_unused(names: Iterable[str], agent: str) -> None:

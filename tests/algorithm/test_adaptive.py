@@ -126,7 +126,7 @@ def test_the_control_is_paid_for_every_step():
 
 
 def test_a_form_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match=r"bonus 'softmax' is unknown: .*'softplus'"):
+    with pytest.raises(ValueError, match=r"bonus 'softmax' is unknown: .*softplus"):
         gasil_jax.make_train(ENV, SMALL.replace(bonus="softmax"))
     with pytest.raises(ValueError, match=r"imitation_rule 'bot' is unknown: .*'both'"):
         gasil_jax.make_train(ENV, SMALL.replace(imitation_rule="bot"))

@@ -32,7 +32,10 @@ def test_it_is_the_networks_gaussian(saved, seed):
     env, config, states, folder = saved
     state = gasil_jax.member(states, 1 if seed is None else seed - 5)
     observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
+    # The last one is far beyond the clip.
+    observation = observation.at[-1].multiply(1e3)
     normalized = normalization.normalize(state.normalizer, observation)
+    assert jnp.abs(normalized).max() == numpy_policy.CLIP
     network = Policy(config.hidden_sizes, env.action_size)
     mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 

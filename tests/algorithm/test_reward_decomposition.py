@@ -65,7 +65,7 @@ def random_batches(seed, num_batches, delay=5):
 
 @functools.cache
 def decompose_once():
-    def step(decomposition, history, batch, key):
+    def step(decomposition, history, batch, key, learning_rate):
         history = good_trajectories.record(
             history,
             batch.observation,
@@ -74,14 +74,17 @@ def decompose_once():
             batch.ended,
             batch.next_observation,
         )
-        decomposition, batch, metrics = reward_decomposition.decompose(
+        hyperparameters = CONFIG.hyperparameters.replace(
+            decomposition_learning_rate=learning_rate
+        )
+        decomposition, batch, _, metrics = reward_decomposition.decompose(
             decomposition,
             batch,
             history,
             normalization.init(OBS),
             key,
             config=CONFIG,
-            hyperparameters=CONFIG.hyperparameters,
+            hyperparameters=hyperparameters,
             action_range=(-1.0, 1.0),
         )
         return decomposition, history, batch.reward, metrics
@@ -89,14 +92,19 @@ def decompose_once():
     return jax.jit(step)
 
 
-def decompose_all(batches):
+def decompose_all(batches, failed=()):
+    """Decompose all batches; updates of the network after some of them are infinite."""
     history = good_trajectories.init_history(
         NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True
     )
     decomposition = reward_decomposition.init(jax.random.key(0), CONFIG, history, ACT)
     for i, batch in enumerate(batches):
         decomposition, history, reward, metrics = decompose_once()(
-            decomposition, history, batch, jax.random.key(i)
+            decomposition,
+            history,
+            batch,
+            jax.random.key(i),
+            jnp.inf if i in failed else 1e-3,
         )
         yield decomposition, history, np.asarray(reward), metrics
 
@@ -130,27 +138,48 @@ def test_windows_of_the_history_are_those_of_a_plain_loop():
             assert result.payout[place] == np.float32(payout)
 
 
-def test_a_window_is_given_what_it_paid_and_predictions_are_scored():
-    """Against a plain loop over the network's own rewards."""
+def test_a_window_is_given_what_it_paid():
+    """A window within a batch; one that began before lacks its share of that."""
     batches = list(random_batches(1, 6))
-    open_steps = [[] for _ in range(NUM_ENVS)]
+    assert sum(batch.faulty.sum() for batch in batches) > 0
+    begins_here = np.ones(NUM_ENVS, bool)
     for batch, (_, _, reward, _) in zip(batches, decompose_all(batches), strict=True):
         for env in range(NUM_ENVS):
-            begins_here, running = True, []
-            begins_here = not open_steps[env]
+            running = []
             for t in range(NUM_STEPS):
                 running.append(reward[t, env])
                 paid = batch.reward[t, env]
                 if paid == 0 and not batch.ended[t, env]:
                     continue
-                # A window that began in an earlier batch lacks its share of that.
-                if begins_here and not batch.faulty[t, env]:
+                if begins_here[env] and not batch.faulty[t, env]:
                     np.testing.assert_allclose(sum(running), paid, rtol=1e-4, atol=1e-5)
-                if len(running) == 1 and begins_here:
-                    assert reward[t, env] == paid
-                begins_here, running = True, []
-            open_steps[env] = running
-    np.testing.assert_array_equal(reward[batch.faulty], 0.0)
+                    if len(running) == 1:
+                        assert reward[t, env] == paid
+                begins_here[env], running = True, []
+            begins_here[env] = not running
+        np.testing.assert_array_equal(reward[batch.faulty], 0.0)
+
+
+def test_a_failed_update_leaves_the_network_and_nothing_else():
+    batches = list(random_batches(2, 5))
+    usual = list(decompose_all(batches))
+    failed = list(decompose_all(batches, failed=(1,)))
+    before, after = (decomposition for decomposition, *_ in failed[:2])
+    for old, new in zip(
+        jax.tree.leaves(before.network), jax.tree.leaves(after.network), strict=True
+    ):
+        np.testing.assert_array_equal(old, new)
+    for (left, history, _, _), (right, _, reward, _) in zip(usual, failed, strict=True):
+        assert np.isfinite(reward).all()
+        assert left.recorded_steps == right.recorded_steps
+        np.testing.assert_array_equal(left.open_steps, right.open_steps)
+        np.testing.assert_array_equal(left.rates.mean, right.rates.mean)
+        for mine, other in zip(
+            reward_decomposition.windows(history, left.recorded_steps),
+            reward_decomposition.windows(history, right.recorded_steps),
+            strict=True,
+        ):
+            np.testing.assert_array_equal(mine, other)
 
 
 def test_fit_is_r_squared_of_the_windows_that_count():

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import rollout
+from gasil_jax import learner, rollout
 from gasil_jax import train as training
 
 SMALL = gasil_jax.Config(
@@ -123,10 +123,10 @@ def test_double_precision_is_refused():
 def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
     old = {"weights": jnp.array([1.0, 2.0]), "count": jnp.int32(3)}
     fine = {"weights": jnp.array([5.0, 6.0]), "count": jnp.int32(4)}
-    healthy, kept = training.keep_if_finite(fine, old)
+    healthy, kept = learner.keep_if_finite(fine, old)
     assert healthy and kept["weights"].tolist() == [5.0, 6.0] and kept["count"] == 4
     bad = {"weights": jnp.array([5.0, jnp.inf]), "count": jnp.int32(4)}
-    healthy, kept = training.keep_if_finite(bad, old)
+    healthy, kept = learner.keep_if_finite(bad, old)
     assert not healthy and kept["weights"].tolist() == [1.0, 2.0] and kept["count"] == 3
 
 

@@ -105,7 +105,7 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:AN_OPTION", "'seeds', a name that is taken by an option"),
         ("my_agents:BARE", "'bare' without a range: .* gasil_jax.config.number"),
         ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
-        ("my_agents", "agent 'my_agents' is unknown: did you mean"),
+        ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
     ],
 )
 def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):

@@ -131,7 +131,9 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'?"),
+        ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'? (one"),
+        ("--env zoo", "env 'zoo' is unknown: it must be one of point_mass, hopper"),
+        ("--env zoo", "humanoid, brax:NAME, MODULE:NAME"),
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
         ("--env hopper --seeds 0", "seeds is 0: it must be from 1 to"),
         ("--env hopper --seeds 1e30", "must be from 1 to 1,048,576"),
@@ -153,6 +155,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env hopper --total-step 5", "--total-steps"),
         ("--env hopper --resume=3", "resume is '3': it takes no value"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
+        ("--env brax:zoo", "env 'brax:zoo' is unknown: it must be one of brax:"),
         ("--env brax:ant --physics mujoco", "brax:ant has its own"),
         ("--env nowhere:Line", "'nowhere:Line' can't be imported: No module"),
         ("--env json:Line", "has no attribute 'Line'"),
@@ -222,6 +225,26 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(messages)
     assert all(message in line for message, line in zip(messages, lines, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("walker2d --agent ppo+bonus", "for agent 'ppo+bonus' on walker2d with dense"),
+        ("point_mass --agent ppo --reward-delay 2", "on point_mass with delayed"),
+        ("brax:ant", "nothing for agent 'ppo+gasil' on brax:ant with dense rewards"),
+        ("walker2d --agent ppo+bonus --preset paper", None),
+        ("walker2d --agent ppo --reward-delay 20", None),
+    ],
+)
+def test_a_task_without_a_tuned_preset_is_told(arguments, message, capsys):
+    words = ["--env", *arguments.split()]
+    run_options.tell_if_untuned(
+        run_options.parse(run_options.Options, words, "gasil_jax.run")
+    )
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == (message is not None)
+    assert all(message in line for line in lines)
 
 
 def test_an_environment_that_brax_itself_breaks_is_refused(

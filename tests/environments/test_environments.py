@@ -6,6 +6,7 @@ import chex
 import gymnasium
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -100,8 +101,8 @@ def test_one_step_equals_gymnasiums(name, physics):
         lambda x: jnp.zeros((BATCH, *x.shape), x.dtype),
         jax.eval_shape(env.reset, jax.random.key(0)),
     )
-    physics = PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
-    inner = state.pipeline_state.replace(physics=physics, position=position)
+    begin = PhysicsState(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart)
+    inner = state.pipeline_state.replace(physics=begin, position=position)
     state = step(state.replace(pipeline_state=inner), action)
     error = np.abs(state.obs - observation) / (1.0 + np.abs(observation))
     error = error.max(axis=1)  # the worst entry of each step
@@ -116,6 +117,45 @@ def test_one_step_equals_gymnasiums(name, physics):
     assert np.median(reward_error) < 1e-5
     assert np.quantile(reward_error, 0.99) < 2e-2
     np.testing.assert_array_equal(state.done, terminated)
+
+
+def gymnasium_resets(name):
+    """The model, and qpos and qvel (BATCH, ...) at the start of its episodes."""
+    env = gymnasium.make(locomotion.TASKS[name].gymnasium_id).unwrapped
+    env.reset(seed=0)
+    starts = []
+    for _ in range(BATCH):
+        env.reset()
+        starts.append((env.data.qpos.copy(), env.data.qvel.copy()))
+    return env.model, *map(np.stack, zip(*starts))
+
+
+# With MuJoCo's physics, whose resets the test above compiles too.
+@pytest.mark.parametrize("name", EACH_NAME[1:])
+def test_episodes_start_where_gymnasiums_do(name):
+    _, reset, _ = env_and_functions(name, "mujoco")
+    physics = reset(jax.random.split(jax.random.key(0), BATCH)).pipeline_state.physics
+    model, *theirs = gymnasium_resets(name)
+    ours = [np.asarray(physics.qpos), np.asarray(physics.qvel)]
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE:
+        # Gymnasium leaves it to MuJoCo to make a rotation's quaternion a unit.
+        np.testing.assert_allclose(np.linalg.norm(ours[0][:, 3:7], axis=1), 1, 1e-6)
+        tangents = lambda qpos: qpos[:, 4:7] / qpos[:, 3:4]
+        for x in ours, theirs:
+            x[0] = np.concatenate([x[0][:, :3], tangents(x[0]), x[0][:, 7:]], axis=1)
+    for field, our, their in zip(("qpos", "qvel"), ours, theirs):
+        normal = field == "qvel" and locomotion.TASKS[name].normal_velocity_noise
+        for of, quantity, most in (
+            ("deviation", np.std, 0.3),
+            ("mean", np.mean, 0.5),
+            # The largest of many normal numbers varies more than that of uniform ones.
+            ("lowest", np.min, 2.5 if normal else 0.2),
+            ("highest", np.max, 2.5 if normal else 0.2),
+        ):
+            error = np.abs(quantity(our, axis=0) - quantity(their, axis=0))
+            error = error / their.std(axis=0)
+            print(f"{name}, {field}: {of} differs by {error.max():.2f} deviations")
+            assert error.max() < most, (field, of, error.argmax())
 
 
 def test_point_mass_against_a_plain_python_twin():
@@ -168,6 +208,36 @@ def test_point_mass_layout_is_data():
 def test_an_unknown_name_is_refused_with_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'walker2d'"):
         gasil_envs.make("walker")
+
+
+@pytest.mark.parametrize("kind", [int, np.int64, np.uint8])
+def test_whole_numbers_of_every_kind_are_taken(kind):
+    env = gasil_envs.make(
+        "point_mass", reward_delay=kind(3), max_episode_steps=kind(7), obs_noise=0.5
+    )
+
+    def one(state, _):
+        state = env.step(state, jnp.zeros(2))
+        return state, (state.reward, state.info["true_reward"], state.done)
+
+    start = env.reset(jax.random.key(0))
+    _, (given, true, done) = jax.lax.scan(one, start, length=7)
+    np.testing.assert_array_equal(done, [0, 0, 0, 0, 0, 0, 1])
+    sums = [true[:3].sum(), true[3:6].sum(), true[6]]
+    np.testing.assert_allclose(given, [0, 0, sums[0], 0, 0, sums[1], sums[2]])
+
+
+@pytest.mark.parametrize("value", [True, np.True_, 3.0, np.float32(3), 0, "3"])
+@pytest.mark.parametrize("name", ["reward_delay", "max_episode_steps"])
+def test_what_is_no_whole_number_is_refused(name, value):
+    with pytest.raises(ValueError, match=f"{name} is .*: it must be a whole number"):
+        gasil_envs.make("point_mass", **{name: value})
+
+
+@pytest.mark.parametrize("value", [True, np.True_, -1.0, np.inf, np.nan, "1"])
+def test_noise_that_is_no_number_is_refused(value):
+    with pytest.raises(ValueError, match=r"obs_noise is .*: it must be finite and 0"):
+        gasil_envs.make("point_mass", obs_noise=value)
 
 
 _OWN = """

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import gasil_envs
+from gasil_envs import locomotion
 from gasil_envs.physics import (
     batching,
     constraints,
@@ -102,17 +103,15 @@ def plain_newton(inertia, force, jacobian, reference, weight):
 def test_newton_against_plain_numpy(size, groups):
     arrays, problem = problems((20,), size, groups)
     solution = jax.jit(jax.vmap(lambda p: newton.solve(p, 20)))(problem)
-    forces = [solution.limit_force, *solution.edge_forces]
-    row_force = np.concatenate([x.reshape(20, -1) for x in forces], axis=1)
+    edge_forces = [np.zeros((20, 0)), *solution.edge_forces]
+    edge_forces = np.concatenate([x.reshape(20, -1) for x in edge_forces], axis=1)
     for i in range(20):
         qacc, force = plain_newton(**{name: x[i] for name, x in arrays.items()})
         np.testing.assert_allclose(solution.qacc[i], qacc, rtol=1e-3, atol=3e-4)
-        # A limit without a sign pushes with nothing.
-        in_play = np.abs(arrays["jacobian"][i]).sum(axis=1) > 0
         scale = np.abs(force).max()
-        np.testing.assert_allclose(
-            row_force[i][in_play], force[in_play], atol=2e-3 * scale
-        )
+        # The rows of the limits, one for each degree of freedom, are the first.
+        np.testing.assert_allclose(edge_forces[i], force[size:], atol=2e-3 * scale)
+        # What the edges leave of this is the limits'.
         np.testing.assert_allclose(
             solution.constraint_force[i],
             arrays["jacobian"][i].T @ force,
@@ -132,11 +131,14 @@ def test_a_problem_alone_equals_itself_in_nested_batches(batch):
     )
 
 
-def test_linear_solve_against_numpy():
+def test_elimination_against_numpy():
     arrays, problem = problems((7,), 23, [])
-    result = jax.jit(jax.vmap(newton.linear_solve))(problem.inertia, problem.force)
+    batch_last = lambda x: jnp.moveaxis(x, 0, -1)
+    result = jax.jit(newton.eliminate)(
+        batch_last(problem.inertia), batch_last(problem.force)
+    )
     expected = np.linalg.solve(arrays["inertia"], arrays["force"][..., None])[..., 0]
-    np.testing.assert_allclose(result, expected, rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(result.T, expected, rtol=1e-3, atol=1e-3)
 
 
 @pytest.mark.parametrize("size", [1, 5, 16, 23, 32])
@@ -190,6 +192,56 @@ def test_a_model_that_the_small_solver_cant_take_falls_back(cone, caplog):
     mujoco.mj_step(model, data, 10)
     np.testing.assert_allclose(state.qpos, data.qpos, atol=2e-5)
     np.testing.assert_allclose(state.qvel, data.qvel, atol=2e-4)
+
+
+# A body that moves in a plane and slips on the ground.
+SLIPPING = """<mujoco><option timestep="0.01"/><default><geom friction="0.3"/></default>
+<worldbody><geom type="plane" size="5 5 1" {ground}/>
+<body pos="0 0 0.09"><joint type="slide" axis="{along}"/>
+<joint type="slide" axis="0 0 1"/><joint type="hinge" axis="{hinge}"/>
+<geom size="0.1" mass="1" {geom}/>{more}</body>{fixed}</worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("is_flat", "changes"),
+    [
+        (True, {}),
+        (True, {"along": "0 1 0", "hinge": "-1 0 0"}),
+        (True, {"geom": 'type="capsule" fromto="0.1 0 0 -0.1 0 0.02"'}),
+        (True, {"ground": 'euler="0 20 0"'}),
+        (True, {"more": '<geom pos="0 0.2 0" size="0.12" mass="1"/>'}),
+        (True, {"fixed": '<geom pos="0.15 0 0.1" size="0.1"/>'}),
+        # Here MuJoCo's tangents are neither in the plane nor across it.
+        (False, {"along": "1 -1 0", "hinge": "1 1 0"}),
+        (False, {"geom": 'type="capsule" fromto="0.1 0.1 0 -0.1 -0.1 0.02"'}),
+        (False, {"ground": 'euler="20 0 0"'}),
+        (False, {"fixed": '<geom pos="0.1 0.1 0.1" size="0.1"/>'}),
+    ],
+)
+def test_motion_in_a_plane_against_mujoco(is_flat, changes):
+    parts = {"ground": "", "along": "1 0 0", "hinge": "0 1 0", "geom": ""}
+    parts |= {"more": "", "fixed": ""}
+    model = mujoco.MjModel.from_xml_string(SLIPPING.format(**parts | changes))
+    small = dynamics.make(model, iterations=20)
+    for group in small.layout.groups:
+        assert group.edges == (FLAT if is_flat else PYRAMID)
+    data = mujoco.MjData(model)
+    data.qvel[:] = [2.0, -0.5, -3.0]
+    state = (data.qpos, data.qvel, np.zeros(3))
+    state = PhysicsState(*(jnp.float32(x)[:, None] for x in state))
+    step = jax.jit(lambda state: dynamics.step(small, state, jnp.zeros((0, 1)), 10)[0])
+    state = step(state)
+    mujoco.mj_step(model, data, 10)
+    np.testing.assert_allclose(state.qpos[:, 0], data.qpos, atol=1e-4)
+    np.testing.assert_allclose(state.qvel[:, 0], data.qvel, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["hopper", "walker2d", "halfcheetah", "ant"])
+def test_tasks_in_a_plane_have_the_pyramid_of_a_plane(name):
+    model = locomotion.Locomotion(name, physics="mujoco").model
+    groups = [x for x in constraints.layout(model).groups if x.edges != SIMPLE]
+    expected = PYRAMID if name == "ant" else FLAT
+    assert [group.edges for group in groups] == [expected]
 
 
 # Each kind of joint, rotated bodies, a spring, a medium, and contacts of a sphere and

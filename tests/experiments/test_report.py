@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 from test_figures import DELAYS
 
-from experiments import report, search, summary
+from experiments import comparisons, plots, report, search, summary
+from experiments.comparisons import compare
 from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
-from experiments.report import Page, compare
+from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
@@ -47,10 +48,10 @@ def test_the_correction_is_holm_s():
     order = sorted(alone, key=alone.get)
     rejected = True
     for i, key in enumerate(order):
-        rejected = rejected and alone[key] <= report.LEVEL / (len(order) - i)
+        rejected = rejected and alone[key] <= comparisons.LEVEL / (len(order) - i)
         assert (result[key].verdict != "not clear") == rejected
     # The correction decides something here.
-    assert any(alone[key] <= report.LEVEL < result[key].p for key in order)
+    assert any(alone[key] <= comparisons.LEVEL < result[key].p for key in order)
 
 
 def test_a_contrast_is_a_weighted_sum():
@@ -67,13 +68,13 @@ def test_few_seeds_make_nothing_clear():
     few = {name: x[:3] for name, x in scores(high=9.0, low=0.0).items()}
     (result,) = compare(few, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert report.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
+    assert comparisons.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
     # Nor does a seed that ended no episode.
     none = scores(high=9.0, low=0.0)
     none["a", "low"][0] = np.nan
     (result,) = compare(none, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert report.interval(np.arange(5.0)).startswith("2.0 [")
+    assert comparisons.interval(np.arange(5.0)).startswith("2.0 [")
 
 
 def test_the_probability_of_improvement_is_of_pairs_of_seeds():
@@ -84,9 +85,9 @@ def test_the_probability_of_improvement_is_of_pairs_of_seeds():
         ("b", "y"): np.array([-1.0, 8.0]),
     }
     # 2 of 4 pairs and half of another on one task, and all 4 on the other.
-    assert report.improvement(data, "ab", "x", "y").startswith("0.81 [")
-    assert report.improvement(data, "ab", "y", "x").startswith("0.19 [")
-    assert report.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
+    assert comparisons.improvement(data, "ab", "x", "y").startswith("0.81 [")
+    assert comparisons.improvement(data, "ab", "y", "x").startswith("0.19 [")
+    assert comparisons.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
 
 
 def test_every_task_counts_alike_in_the_aggregate(tmp_path):
@@ -209,6 +210,11 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
     assert tally[3].startswith("- ppo+gasil-1000 against ppo-1000: better on 2 of 2;")
     page.write(tmp_path)
     assert (tmp_path / "delays.png").stat().st_size > 3000
+    # An agent has the color that it has where learning curves are drawn.
+    colors = plots._colors(FIGURES["matrix"])
+    lines = {x.get_label(): x for x in page.picture().axes[0].containers}
+    for agent in ("ppo", "ppo+gasil"):
+        assert lines[agent].lines[0].get_color() == colors[agent]
 
 
 @pytest.mark.parametrize("count", [3, 9])
@@ -216,7 +222,7 @@ def test_every_arm_has_a_color(page, tmp_path, count):
     arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
     panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
     figure = Figure("Arms", "", panels, favourite="ppo")
-    drawn = report._draw(Page("matrix", page.searched, figure=figure))
+    drawn = Page("matrix", page.searched, figure=figure).picture()
     colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
     assert len(set(colors)) == len(colors) == count + 1
 
@@ -250,25 +256,50 @@ def test_a_block_is_made_anew():
         report.fill_blocks(text.replace("claims", "nonsense"), made.value)
 
 
-#: Settings, and names: what may stand in a note in digits.
-_SETTINGS = re.compile(
-    r"walker2d|ppo[12]|\(http\S+\)|`[^`]*`|95%"
-    r"|[Ff]igures? [2-8](?:,? (?:and|to) [2-8])?"
-    r"|\d+M steps|all \dM|until 2M|at 3M|\"from-2M\"|[13]e-\d"
-    r"|30,000 steps|of 128 drawn|2048 steps|128 environments|16 steps|1, 8, 32 and 128"
-    r"|at 0 as|is 0 until|to 0\.02|log 2|at 0\.1\b|alpha 1 |20 updates|1,000 steps"
-    r"|buffer\s+of 500|first stage: 32 of|256|all 32 points"
-)
-
-
 @pytest.mark.parametrize(
-    "path", sorted(report.NOTES.glob("*.md")), ids=lambda x: x.stem
+    ("verdicts", "words"),
+    [
+        ([], "not measured yet"),
+        (["worse"], "open so far: in 0 of 1 cases; 2 not measured yet"),
+        (["better", "better"], "holds: in 2 of 2 cases (0; 1); 1 not measured yet"),
+        (["worse", "worse"], "does not hold: in 0 of 2 cases; 1 not measured yet"),
+        (["worse", "better", "worse"], "holds in part: in 1 of 3 cases (1)"),
+    ],
 )
-def test_no_number_of_a_note_is_typed_by_hand(path):
+def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words):
+    made = summary.Summary(STORE)
+    keys = [("panel", "ppo+gasil", f"other {i}") for i in range(3)]
+    middle = {"better": 1.0, "worse": -1.0}
+    made.pages["matrix"].comparisons = {
+        key: comparisons.Comparison(middle[verdict], 0.0, 0.0, 0.0)
+        for key, verdict in zip(keys, verdicts, strict=False)
+    }
+    cases = {f"{i}": [(key, "better")] for i, key in enumerate(keys)}
+    claim = summary.Claim("It is ahead on most", "matrix", cases, needed=2)
+    assert made.verdict(claim) == words
+
+
+#: Settings, and names: what may stand in a note in digits.
+_SETTINGS = (
+    *("walker2d", "`[^`]*`", "[Ff]igures? [2-8](?: and [2-8])?", r"\dM steps"),
+    *("is 0 until", r"to 0\.02 at 3M", '"from-2M"'),
+    *("30,000 steps", "of 128 drawn", "1,000 steps", r"buffer\s+of 500"),
+)
+_NOTES = {x.stem: x.read_text() for x in sorted(report.NOTES.glob("*.md"))}
+
+
+@pytest.mark.parametrize("name", _NOTES)
+def test_no_number_of_a_note_is_typed_by_hand(name):
     """Every digit is of a slot, or of a setting."""
-    text = re.sub(r"{{.+?}}", "", path.read_text())
-    rest = _SETTINGS.sub("", text)
+    rest = re.sub(r"{{.+?}}", "", _NOTES[name])
+    for setting in _SETTINGS:
+        rest = re.sub(setting, "", rest)
     assert not re.findall(r".*\d.*", rest)
+
+
+@pytest.mark.parametrize("setting", _SETTINGS)
+def test_every_number_that_a_note_may_have_is_in_one(setting):
+    assert any(re.search(setting, note) for note in _NOTES.values())
 
 
 def test_no_verdict_of_a_note_is_typed_by_hand():

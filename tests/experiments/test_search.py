@@ -12,13 +12,13 @@ from experiments.search import AGENTS, CELLS, SPACES, TASKS, Search, SingleSetti
 from experiments.store import Record, Store
 
 
-def fill(store, one, points, scores):
+def fill(store, one, points, scores, seeds=(1000, 1001)):
     """As if each point's seeds all had ended with its score."""
     steps, nan = np.arange(1, 11) * 100, np.full(10, np.nan)
     store.add(
         {
             run: Record(steps, np.full(10, float(score)), nan, {"physics": "mjx"})
-            for runs, score in zip(one.runs(points), scores, strict=True)
+            for runs, score in zip(one.runs(points, seeds), scores, strict=True)
             for run in runs
         }
     )
@@ -49,8 +49,15 @@ def test_the_best_of_all_points_is_chosen(tmp_path):
     assert one.chosen(store) is None  # until those beyond have been tried
     further = one.points(store)[len(drawn) :]
     fill(store, one, further, [0.0] * (len(further) - 1) + [99.0])
-    point, best = one.best(store)
-    assert point == further[-1] and best.tolist() == [99.0, 99.0]
+    assert one.best(store) is None  # until the best have been trained with more seeds
+    finalists = one.finalists(store)
+    assert finalists == (further[-1], drawn[-1], drawn[-2])
+    requested = one.requested(store)
+    assert len(requested) == 2 * len(drawn + further) + 4 * len(finalists)
+    fill(store, one, finalists, [0.0, 50.0, 60.0], range(1002, 1006))
+    assert not store.missing(requested)
+    point, best = one.best(store)  # (99 + 99) / 6 and (10 + 10 + 4 * 60) / 6
+    assert point == drawn[-2] and best.tolist() == [10.0, 10.0, *[60.0] * 4]
     for run in one.runs(further)[-1]:
         assert run.config.normalize_rewards and run.config.num_envs == 32
         assert not run.config.decompose_rewards and run.reward_delay == 20
@@ -111,11 +118,11 @@ def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
     assert len(rows) == len(CELLS) * len(AGENTS) + len(TASKS)
     mine, other = rows[one], rows[Search("hopper", "ppo", 1)]
     assert mine.searched == 2 * len(drawn) < mine.to_search
-    assert (mine.trained, mine.to_train) == (0, 10) and not mine.complete
+    assert (mine.trained, mine.to_train) == (0, 20) and not mine.complete
     assert (other.searched, other.to_train) == (0, 10)
     monkeypatch.setattr(__main__, "RESULTS", tmp_path)
     assert __main__.main(["coverage"]) == 1
     printed = capsys.readouterr().out
     line = next(x for x in printed.splitlines() if x.startswith("hopper-delayed"))
-    words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 10"
+    words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 20"
     assert line.split() == words.split()

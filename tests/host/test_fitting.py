@@ -1,5 +1,6 @@
 """`gasil_jax.fit` trains as the command line does."""
 
+import json
 import os
 import signal
 
@@ -10,6 +11,7 @@ import test_members
 
 import gasil_jax
 from gasil_jax import run
+from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, metrics_files
 from gasil_jax.host.interruption import Interrupted
 
@@ -23,6 +25,7 @@ FLAGS = (
     *("--preset", "paper"),
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
+BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +96,8 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         gasil_jax.fit(env, CONFIG, **arguments)
     with pytest.raises(ValueError, match=r"alpha was 0.1, is 0.2: only total_steps"):
         gasil_jax.fit(env, CONFIG.replace(alpha=0.2), resume=True, **arguments)
+    with pytest.raises(ValueError, match="evaluate_every was 5120, is None"):
+        gasil_jax.fit(env, CONFIG, resume=True, **arguments)
     # A program that is interrupted continues like one that was stopped.
     interrupt = lambda progress: os.kill(os.getpid(), signal.SIGTERM)
     with pytest.raises(Interrupted) as interrupted:
@@ -101,6 +106,45 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         )
     assert "resume=True" in interrupted.value.__notes__[0]
     same(gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED), commanded)
+
+
+def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
+    """It was not evaluated if it has no evaluations; else the user has to say how."""
+    description, root = tmp_path / "fit.json", tmp_path / "checkpoints"
+
+    def describe(**evaluated):
+        described = json.loads(description.read_text())
+        for name in EVALUATED:
+            described.pop(name, None)
+        description.write_text(json.dumps(described | evaluated))
+
+    def fit(**arguments):
+        # It stops after a chunk.
+        once = lambda progress: True
+        return gasil_jax.fit(env, CONFIG, folder=tmp_path, callback=once, **arguments)
+
+    before = fit().metrics["policy_loss"].shape[1]
+    (root / "00000099.partial" / "state").mkdir(parents=True)
+    saved = sorted(root.rglob("*"))
+    describe()
+    with pytest.raises(ValueError, match="evaluate_every was None, is 5120"):
+        fit(resume=True, **EVALUATED)
+    # Its checkpoints are whole, and no reason to start anew.
+    describe(**EVALUATED)
+    with pytest.raises(InputError, match=f"0000000{before} .* no evaluations_size"):
+        fit(resume=True, **EVALUATED)
+    assert sorted(root.rglob("*")) == saved
+
+    describe()
+    assert fit(resume=True).metrics["policy_loss"].shape[1] > before
+    assert json.loads(description.read_text())["evaluate_every"] is None
+    # What a killed process had half written is deleted.
+    assert saved[0] in root.iterdir() and not list(root.glob("*.partial"))
+
+    describe()
+    (tmp_path / "evaluations.csv").touch()
+    with pytest.raises(ValueError, match=r"fit.json .* add evaluate_every and evalua"):
+        fit(resume=True, **EVALUATED)
 
 
 @pytest.mark.parametrize(
@@ -118,11 +162,18 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         ({"config": CONFIG.replace(alpha=-1)}, "alpha is -1"),
         ({"folder": "/proc/none"}, "folder is /proc/none"),
         ({"folder": "full"}, "folder is .* not empty"),
+        (BEGUN | {"evaluate_every": None}, "evaluate_every was 128, is None"),
+        (BEGUN | {"evaluate_every": 256}, "evaluate_every was 128, is 256: only total"),
+        (BEGUN | {"evaluate_episodes": 3}, "evaluate_episodes was 10, is 3: only tot"),
+        (BEGUN | {"seeds": 2}, r"seeds was \(0,\), is \(0, 1\): only total_steps"),
     ],
 )
 def test_what_is_wrong_is_refused_by_name(env, changes, why, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
+    (tmp_path / "begun").mkdir()
+    described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
+    (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(env, **{"config": CONFIG, **changes})

@@ -138,7 +138,7 @@ def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
     assert run.main([*SMALL, "--log", "tensorbord"]) == 2
-    assert "log is 'tensorbord': it must be of tensorboard" in capsys.readouterr().err
+    assert "log is 'tensorbord': it must be one of tens" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert run.main([*SMALL, "--log", "wandb"]) == 2
     assert 'pip install "gasil_jax[wandb]"' in capsys.readouterr().err

@@ -7,8 +7,9 @@ differ from MJX:
 - The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
   C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
   therefore the motion, depends on the tangent.
-- In a model that can only move in a plane, the tangent across the plane is left out.
-  Nothing moves along it, so its two edges would both equal the normal.
+- In a model that can only move in a plane, and whose contacts' tangents are in it or
+  across it, the tangent across is left out. Nothing moves along it, so its two edges
+  would both equal the normal.
 
 Shape letters: C contacts, A axes, B batch.
 """

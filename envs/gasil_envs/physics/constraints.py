@@ -193,7 +193,7 @@ def layout(model: mujoco.MjModel) -> Layout:
         mjx_model = mjx.put_model(model)
         collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
         contact = jax.tree.map(np.asarray, collide(mjx.make_data(model)))
-    flat = _plane(model)
+    flat = _plane(model, contact.geom.reshape(-1, 2))
     pyramid = _PYRAMID if flat is None else _FLAT_PYRAMID
     groups = [
         _group(model, contact, dim, edges, flat)
@@ -202,19 +202,39 @@ def layout(model: mujoco.MjModel) -> Layout:
     return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
 
 
-def _plane(model: mujoco.MjModel) -> np.ndarray | None:
-    """Return the normal of the plane that contains all motion, or None if none does."""
+def _plane(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
+    """Return the normal of the plane that contains all motion, or None if none does.
+
+    It is also None if a contact's tangents may be neither in the plane nor across it:
+    the edges of its pyramid are then others. MuJoCo makes tangents of a coordinate axis
+    or of a capsule's axis.
+
+    Args:
+      model: the model.
+      geoms: (C, 2), the geoms of each possible contact; a plane is the first.
+    """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     hinge = model.jnt_type == mujoco.mjtJoint.mjJNT_HINGE
     slide = model.jnt_type == mujoco.mjtJoint.mjJNT_SLIDE
     if not hinge.any() or not (hinge | slide).all():
         return None
-    # Turning about the normal leaves both properties as they are.
+    # Turning about the normal leaves all of these properties as they are.
     normal = data.xaxis[hinge][0]
+    is_all = lambda x, value: np.allclose(x, value, atol=1e-6)
     across = np.abs(data.xaxis @ normal)
-    flat = np.allclose(across[hinge], 1.0) and np.allclose(across[slide], 0.0)
-    return normal.astype(np.float32) if flat else None
+    moves_in_it = is_all(across[hinge], 1.0) and is_all(across[slide], 0.0)
+    is_coordinate_axis = is_all(np.abs(normal).max(), 1.0)
+    # The third axis of a frame is a plane's normal, and the direction of a capsule.
+    across = data.geom_xmat.reshape(-1, 3, 3)[:, :, 2] @ normal
+    has_direction = model.geom_type[geoms] != mujoco.mjtGeom.mjGEOM_SPHERE
+    lies_in_it = is_all(across[geoms][has_direction], 0.0)
+    # On a plane it does not matter where along the normal a geom is.
+    first, second = geoms[model.geom_type[geoms[:, 0]] != mujoco.mjtGeom.mjGEOM_PLANE].T
+    offset = (data.geom_xpos[second] - data.geom_xpos[first]) @ normal
+    if moves_in_it and is_coordinate_axis and lies_in_it and is_all(offset, 0.0):
+        return normal.astype(np.float32)
+    return None
 
 
 def _group(

@@ -100,15 +100,11 @@ class Solution(struct.PyTreeNode):
 
     Attributes:
       qacc: (V,), acceleration.
-      qacc_smooth: (V,), acceleration without constraints.
-      limit_force: (V,), force of each limit, at least 0.
       edge_forces: (C, E) for each group of contacts, force along each edge.
-      constraint_force: (V,), J' times these forces.
+      constraint_force: (V,), J' times these forces and those of the limits.
     """
 
     qacc: jax.Array
-    qacc_smooth: jax.Array
-    limit_force: jax.Array
     edge_forces: tuple[jax.Array, ...]
     constraint_force: jax.Array
 
@@ -117,11 +113,6 @@ def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Soluti
     """Solve one problem; use `jax.vmap`, nested if needed, for many."""
     function = functools.partial(solve_many, iterations, line_search)
     return batch_last(in_tiles(function))(problem)
-
-
-def linear_solve(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,)."""
-    return batch_last(lambda pair: eliminate(*pair))((matrix, right))
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -292,10 +283,10 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     """Return x of A x = b by Gauss-Jordan elimination: (V, V, B), (V, B) -> (V, B).
 
     Symmetric positive matrices need no pivoting. Each step drops the first column and
-    moves the first row to the end, so that all steps are the same. On a GPU it is one
-    kernel.
+    moves the first row to the end, so that all steps are the same. On a GPU larger
+    matrices are eliminated in one kernel.
     """
-    if on_gpu() and matrix.shape[0] <= newton_kernel.MOST_UNKNOWNS:
+    if on_gpu() and matrix.shape[0] in newton_kernel.SIZES:
         return newton_kernel.solve_linear(matrix, right)
     table = jnp.concatenate([matrix, right[:, None]], axis=1)
     for _ in range(matrix.shape[0]):
@@ -306,23 +297,22 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 
 
 def _repeat(
-    function: Callable[[Any], tuple[Any, jax.Array]], carry: Any, least: int, most: int
+    function: Callable[[Any], tuple[Any, jax.Array]],
+    carry: Any,
+    *,
+    least: int,
+    most: int,
+    unroll: bool,
 ) -> Any:
     """Call a function `least` to `most` times, and on a CPU until nothing changes.
 
     The function returns the carry and whether something has changed. On a GPU each
-    decision would wait for the host, and the loop itself would cost more than its body
-    (a fifth of the time of walker2d). On a CPU unrolling it only costs compile time.
+    decision would wait for the host, and a loop costs more than a small body, so it
+    may be unrolled there. On a CPU unrolling it only costs compile time.
     """
     if not on_cpu():
-        size = jax.tree.leaves(carry)[0].shape[0]
-        return jax.lax.fori_loop(
-            0,
-            most,
-            lambda _, carry: function(carry)[0],
-            carry,
-            unroll=size <= _MOST_DEGREES_UNROLLED,
-        )
+        call = lambda _, carry: function(carry)[0]
+        return jax.lax.fori_loop(0, most, call, carry, unroll=unroll)
 
     def goes_on(state: Any) -> jax.Array:
         count, changed, _ = state
@@ -396,17 +386,16 @@ def solve_many(
         step = jnp.ones_like(linear)
         pushing = is_pushing(distance)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
-        step = _repeat(newton, search, 1, line_search)[0]
+        step = _repeat(newton, search, least=1, most=line_search, unroll=True)[0]
         moved = each(lambda d, s: d + step * s, distance, slope)
         return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
 
     begin = (start, distance_at(start))
-    qacc, distance = _repeat(iterate, begin, 2, iterations)
+    unroll = force.shape[0] <= _MOST_DEGREES_UNROLLED
+    qacc, distance = _repeat(iterate, begin, least=2, most=iterations, unroll=unroll)
     push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
     return Solution(
         qacc=qacc,
-        qacc_smooth=qacc_smooth,
-        limit_force=push[0],
         edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in push[1:]),
         constraint_force=rows.transposed_times(push),
     )

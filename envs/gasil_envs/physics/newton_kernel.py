@@ -15,8 +15,9 @@ from jax.experimental.pallas import triton
 
 # Shape letters: V unknowns, filled up in a kernel; B batch.
 
-# The registers of a warp have no room for larger matrices.
-MOST_UNKNOWNS = 32
+# On an H100 the elimination of 14 and of 23 unknowns is faster in a kernel, that of 9 is
+# not. The registers of a warp have no room for matrices of more than 32.
+SIZES = range(12, 33)
 
 
 def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
@@ -35,10 +36,10 @@ def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
         row = jnp.sum(jnp.where(row_of == k, rest, 0.0), axis=0)
         inverse = 1.0 / jnp.sum(jnp.where(index == k, row, 0.0))
         scaled = jnp.where(index == k, -1.0, row) * inverse
-        found = jnp.sum(jnp.where(index == k, x, 0.0)) * inverse
+        unknown = jnp.sum(jnp.where(index == k, x, 0.0)) * inverse
         rest = jnp.where(column_of == k, 0.0, rest)
         rest = rest - row[:, None] * scaled[None, :]
-        return rest, jnp.where(index == k, found, x - row * found)
+        return rest, jnp.where(index == k, unknown, x - row * unknown)
 
     return jax.lax.fori_loop(0, size, step, (matrix, right))[1]
 

@@ -1,0 +1,153 @@
+"""Comparisons of final returns, with their intervals, in numbers and in words.
+
+Verdicts are corrected for the number of comparisons of their family by Holm's method.
+"""
+
+import dataclasses
+import functools
+import math
+import zlib
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from experiments.figures import Comparisons
+from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
+
+#: The probability that any verdict of a family is wrong, at most.
+LEVEL = 0.05
+_DRAWS = 10_000
+#: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
+_FEWEST_SEEDS = 5
+_VERDICTS = ("better", "not clear", "worse")
+#: Scores, (seeds,), by panel and curve.
+Scores = Mapping[tuple[str, str], np.ndarray]
+
+
+@dataclasses.dataclass(frozen=True)
+class Comparison:
+    """A difference, its 95% interval, and its p-value, corrected by Holm's method."""
+
+    middle: float
+    low: float
+    high: float
+    p: float
+
+    @property
+    def verdict(self) -> str:
+        """Better, worse or not clear."""
+        if not self.p <= LEVEL:
+            return "not clear"
+        return "better" if self.middle > 0 else "worse"
+
+    def __str__(self) -> str:
+        return in_words(self.middle, self.low, self.high)
+
+
+@functools.cache
+def _draws(name: str, scores: tuple[float, ...]) -> np.ndarray:
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    rows = rng.integers(len(scores), size=(_DRAWS, len(scores)))
+    return interquartile_mean(np.array(scores)[rows], axis=1)
+
+
+def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
+    """Return interquartile means of bootstrap samples of a curve's seeds: (draws,)."""
+    return _draws(f"{panel}/{curve}", tuple(scores[panel, curve].tolist()))
+
+
+def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
+    """Return the differences of interquartile means whose curves all have scores.
+
+    The p-value is the percentile bootstrap's: the share of draws on the other side of
+    0, times two. In Holm's method the smallest is multiplied by the number of
+    comparisons, the next by one less, and none is smaller than the one before.
+    """
+    raw = {}
+    for key, terms in family.items():
+        if not all((panel, curve) in scores for _, panel, curve in terms):
+            continue
+        sides = [scores[panel, curve] for _, panel, curve in terms]
+        drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
+        middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
+        low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
+        beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
+        enough = all(len(x) >= _FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
+        p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
+        raw[key] = Comparison(middle, low, high, p_value)
+    corrected, least = {}, 0.0
+    for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):
+        least = max(least, min(1.0, raw[key].p * (len(raw) - i)))
+        corrected[key] = dataclasses.replace(raw[key], p=least)
+    return {key: corrected[key] for key in raw}
+
+
+def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
+    """Return the probability of improvement over the panels, in words.
+
+    It is the probability that a seed of `ours` has more than one of `other`, in the
+    mean over the panels, with the 95% percentile bootstrap interval over seeds, drawn
+    within each panel (Agarwal et al. 2021).
+    """
+    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
+
+    def probability(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        more, same = (
+            a[..., :, None] > b[..., None, :],
+            a[..., :, None] == b[..., None, :],
+        )
+        return (more + 0.5 * same).mean(axis=(-1, -2))
+
+    def resampled(values: np.ndarray) -> np.ndarray:
+        return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
+
+    pairs = [(scores[panel, ours], scores[panel, other]) for panel in panels]
+    middle = np.mean([probability(*pair) for pair in pairs])
+    drawn = [probability(*map(resampled, pair)) for pair in pairs]
+    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
+    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+
+
+def counted(verdicts: Sequence[str]) -> str:
+    """Return how often there is each verdict, in words."""
+    words = [word for word in _VERDICTS if word in verdicts]
+    return ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
+
+
+def number(value: float) -> str:
+    """Return a score as text, without decimals from 100 on."""
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+
+
+def in_words(middle: float, low: float, high: float) -> str:
+    """Return a number and its interval as text."""
+    return f"{number(middle)} [{number(low)}, {number(high)}]"
+
+
+def interval(scores: np.ndarray) -> str:
+    """Return interquartile mean and 95% interval of (seeds,); of few seeds the mean."""
+    middle = float(interquartile_mean(scores))
+    if len(scores) < _FEWEST_SEEDS:
+        return number(middle)
+    return in_words(middle, *map(float, bootstrap_interval(scores)))
+
+
+def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
+    """Return the interquartile mean over the seeds of all tasks, in words.
+
+    Every task counts alike. The 95% interval is the percentile bootstrap's over seeds,
+    drawn within each task.
+
+    Args:
+      name: what the random numbers are drawn for.
+      scores: the scores of each task, (seeds,), in one unit.
+    """
+    most = math.lcm(*map(len, scores))
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    drawn = []
+    for _ in range(_DRAWS // 10):
+        parts = [rng.choice(x, len(x)).repeat(most // len(x)) for x in scores]
+        drawn.append(interquartile_mean(np.concatenate(parts)))
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    every = np.concatenate([x.repeat(most // len(x)) for x in scores])
+    return f"{float(interquartile_mean(every)):.2f} [{low:.2f}, {high:.2f}]"

@@ -1,0 +1,150 @@
+"""Plots of figures: learning curves, or final returns over a setting."""
+
+import io
+import math
+import pathlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure as Picture
+from PIL import Image
+
+from experiments.comparisons import Scores
+from experiments.figures import Figure
+from experiments.search import AGENTS
+from experiments.store import Record
+from gasil_jax.figures import plotting
+from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.host import output_file
+
+#: The color of each agent, the same in all figures.
+_COLOR_OF = dict(zip(AGENTS, plotting.COLORS, strict=False))
+#: The stored runs of each curve, by panel and curve.
+Records = Mapping[tuple[str, str], Sequence[Record]]
+
+
+def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
+    """Return a plot with axes for each panel.
+
+    Args:
+      figure: what it is a plot of.
+      records: the stored runs of each curve.
+      scores: the final returns of the complete curves.
+    """
+    panels = list(dict.fromkeys(panel for panel, _ in records))
+    count = len(panels)
+    # Four panels are drawn in a square, so that none is alone in its row.
+    columns = min({4: 2}.get(count, 4 if count > 6 else 3), count)
+    rows = math.ceil(count / columns)
+    size = (3.6 * columns, 2.8 * rows)
+    picture = Picture(figsize=size, layout="constrained")
+    grid = picture.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat[count:]:
+        axes.set_visible(False)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        if figure.over:
+            _draw_over(figure, panel, scores, axes)
+        else:
+            _draw_curves(figure, panel, records, axes)
+        axes.set_title(panel)
+    shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
+    handle_of = {
+        name: x
+        for handles, names in shown
+        for x, name in zip(handles, names, strict=True)
+    }
+    if count > 1 and len(handle_of) > 4:
+        # So many names would hide the curves.
+        below: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
+        picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
+    else:
+        for axes, (_, names) in zip(grid.flat, shown, strict=False):
+            if names:
+                axes.legend(frameon=False, fontsize=7)
+    for row in grid:
+        row[0].set_ylabel("episode return")
+    return picture
+
+
+def _colors(figure: Figure) -> dict[str, Any]:
+    """Return the color of each curve's name, the same in all panels.
+
+    Values, and more names than there are colors, are dark to light.
+    """
+    names = list(dict.fromkeys(x for curves in figure.panels.values() for x in curves))
+    if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
+        shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
+        return dict(zip(names, shades, strict=True))
+    color_of = {name: _COLOR_OF[name] for name in names if name in _COLOR_OF}
+    free = (x for x in plotting.COLORS if x not in color_of.values())
+    return {name: color_of.get(name) or next(free) for name in names}
+
+
+def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> None:
+    """Draw learning curves: interquartile mean and 95% interval over seeds."""
+    color_of = _colors(figure)
+    for label in figure.panels[panel]:
+        if (panel, label) not in records:
+            continue
+        seeds = records[panel, label]
+        # Returns are compared at the steps of the record with the fewest rows.
+        steps = min((record.env_steps for record in seeds), key=len)
+        returns = np.array(
+            [np.interp(steps, x.env_steps, x.episode_return) for x in seeds]
+        )
+        finite = np.isfinite(returns).all(axis=0)
+        if finite.any():
+            color = color_of[label]
+            steps, returns = steps[finite] / 1e6, returns[:, finite]
+            low, high = bootstrap_interval(returns, resamples=500)
+            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+            axes.plot(steps, interquartile_mean(returns, 0), color=color, label=label)
+    axes.set_xlabel("million steps")
+
+
+def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
+    """Draw final returns over a setting: a line for the curves that differ in it."""
+    curves = figure.panels[panel]
+    lines: dict[str, dict[Any, str]] = {}
+    for name in curves:
+        line, value = figure.point_of(panel, name)
+        lines.setdefault(line, {})[value] = name
+    values = sorted({value for points in lines.values() for value in points})
+    drawn: list[str] = []
+    for i, (line, points) in enumerate(lines.items()):
+        complete = [x for x in points if (panel, points[x]) in scores]
+        agent = next(curves[name].agent for name in points.values())
+        style = ("-", "--", ":", "-.")[drawn.count(agent) % 4]
+        drawn.append(agent)
+        if not complete:
+            continue
+        finals = [scores[panel, points[x]] for x in complete]
+        middle = np.array([interquartile_mean(x) for x in finals])
+        low, high = np.array([bootstrap_interval(x) for x in finals]).T
+        axes.errorbar(
+            # Shifted sideways, so that no interval hides another.
+            np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
+            middle,
+            [middle - low, high - middle],
+            color=_COLOR_OF[agent],
+            linestyle=style,
+            **{"marker": "o", "markersize": 3, "capsize": 2},
+            label=line,
+        )
+    _, label = figure.over or ("", "")
+    limits = (0.7 * values[0], 1.4 * values[-1])
+    axes.set(xlabel=label, xscale="log", xlim=limits)
+    axes.set_xticks(values, list(map(str, values)))
+    axes.minorticks_off()
+
+
+def save_png(picture: Picture, path: pathlib.Path, dpi: int = 80) -> None:
+    """Write a small PNG, of 256 colors."""
+    with io.BytesIO() as buffer:
+        picture.savefig(buffer, format="png", dpi=dpi)
+        image = Image.open(buffer).convert("RGB").quantize(256)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with output_file.whole(path) as partial:
+        image.save(partial, optimize=True)
