@@ -1,10 +1,13 @@
 """The constraint solver against plain NumPy, and C MuJoCo on the host."""
 
+import inspect
+
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh
 
 import gasil_envs
 from gasil_envs import locomotion
@@ -152,10 +155,16 @@ def test_the_gpu_s_elimination_solves_the_same(size):
 
 
 def test_the_gpu_s_elimination_can_be_lowered_for_one():
-    traced = jax.jit(newton_kernel.solve_linear).trace(
-        jnp.ones((23, 23, 20)), jnp.ones((23, 20))
-    )
-    assert "triton" in traced.lower(lowering_platforms=("cuda",)).as_text()
+    fields = {"device_kind": "NVIDIA H100", "num_cores": None, "platform": "gpu"}
+    names = inspect.signature(AbstractDevice).parameters  # Each jax has others.
+    device = AbstractDevice(**{name: fields[name] for name in names})
+    mesh = AbstractMesh((), (), abstract_device=device)
+    with jax.sharding.use_abstract_mesh(mesh):
+        traced = jax.jit(newton_kernel.solve_linear).trace(
+            jnp.ones((23, 23, 20)), jnp.ones((23, 20))
+        )
+        lowered = traced.lower(lowering_platforms=("cuda",))
+    assert "triton" in lowered.as_text()
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="of XLA's CPU backend")
