@@ -15,8 +15,8 @@ from jax.experimental.pallas import triton
 
 # Shape letters: V unknowns, filled up in a kernel; B batch.
 
-# On an H100 the elimination of 14 and of 23 unknowns is faster in a kernel, that of 9 is
-# not. The registers of a warp have no room for matrices of more than 32.
+# On an H100 the elimination of 14 and of 23 unknowns is faster in a kernel, and that of
+# 9 is not. The registers of a warp have no room for matrices of more than 32.
 SIZES = range(12, 33)
 
 
