@@ -319,10 +319,13 @@ def _at_delay(env: str, agent: str, delay: int) -> Search:
     return Search(env, agent, DELAY if delay > 1 else 1)
 
 
-def _matrix() -> Panels:
-    """Return all agents on all tasks, each with what its search on the task chose.
+def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
+    """Return all agents on tasks, each with what its search on the task chose.
 
     Three tasks whose outcomes are bimodal get more seeds where rewards are delayed.
+
+    Args:
+      cells: tasks, each with its delay; default all.
     """
     return joined(
         grid(
@@ -332,7 +335,7 @@ def _matrix() -> Panels:
             base=functools.partial(Search, decompose_rewards=search.decompose_rewards),
             seeds=20 if delay > 1 and env in TASKS[:3] else 10,
         )
-        for env, delay in CELLS
+        for env, delay in cells
         for name, search in searches(env, delay).items()
     )
 
@@ -355,6 +358,12 @@ FIGURES: Mapping[str, Figure] = {
             for task in CELLS
             for name, search in searches(*task).items()
         },
+    ),
+    "delayed_rewards": Figure(
+        "Delayed rewards: adaptive imitation beside all others",
+        "",
+        _matrix(cell for cell in CELLS if cell[1] > 1),
+        favourite=ADAPTIVE,
     ),
     "single_setting": Figure(
         "All agents on delayed tasks, each with a single setting",

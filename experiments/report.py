@@ -21,6 +21,7 @@ from experiments.comparisons import (
     counted,
     improvement,
     interval,
+    number,
     over_tasks,
 )
 from experiments.figures import FIGURES, Curve, Figure, name_of
@@ -139,7 +140,7 @@ class Page:
     """
 
     SLOTS = (
-        *("table", "differences", "tally", "aggregate"),
+        *("table", "returns", "differences", "tally", "aggregate"),
         *("protocol", "searches", "importance", "published"),
     )
 
@@ -184,6 +185,26 @@ class Page:
                 cells += [str(against), against.verdict] if against else ["", ""]
             rows.append(cells)
         return markdown_table(head, rows)
+
+    def returns(self, *panels: str) -> str:
+        """Return final returns without intervals: a row a curve, a column a panel.
+
+        Args:
+          *panels: the panels.
+        """
+        if not panels or not set(panels) <= set(self.figure.panels):
+            raise self._no_slot("returns", *panels)
+        rows = []
+        for name in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
+            row = [name]
+            for panel in panels:
+                scores = self.scores.get((panel, name))
+                if scores is None:
+                    row.append("")
+                else:
+                    row.append(number(float(interquartile_mean(scores))))
+            rows.append(row)
+        return markdown_table(["agent", *panels], rows)
 
     def differences(self) -> str:
         """Return every comparison of the page, each in a line."""

@@ -1,12 +1,12 @@
 """The plan: what is searched, alike for every agent, and how much of it is stored.
 
-Environments are out of step and rewards are normalized. Every agent is searched with
-the same number of points on every task, dense and delayed, with two seeds of the
-search's own. Where the best point has a value at an end of its grid, the next value
-beyond is tried too. The best points of all these are trained with more seeds before one
-is chosen, because two seeds decide little on tasks whose outcomes are bimodal. So one
-table gives the best point of each task, which is the paper's protocol, and the best
-point over all tasks. Figures train the chosen points with seeds of their own.
+Episodes are staggered and rewards are normalized. Every agent is searched with the same
+number of points on every task, dense and delayed, with two seeds of the search's own.
+Where the best point has a value at an end of its grid, the next value beyond is tried
+too. The best points of all these are trained with more seeds before one is chosen,
+because two seeds decide little on tasks whose outcomes are bimodal. So one table gives
+the best point of each task, which is the paper's protocol, and the best point over all
+tasks. Figures train the chosen points with seeds of their own.
 """
 
 import dataclasses

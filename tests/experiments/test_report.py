@@ -173,6 +173,17 @@ def test_a_table_and_a_tally(page):
     assert "commit c, changed" in page.settings()
 
 
+def test_returns_of_curves_beside_each_other(page):
+    head, _, ours, other = page.value("returns", "two", "one").splitlines()
+    assert head == "| agent | two | one |"
+    assert (ours, other) == ("| ours | 7.5 | 202 |", "| other | 7.5 | 102 |")
+    del page.scores["two", "other"]
+    assert "| other |  | 102 |" in page.returns("two", "one")
+    for panels in ((), ("three",)):
+        with pytest.raises(InputError, match="slot is returns"):
+            page.value("returns", *panels)
+
+
 def test_what_lacks_seeds_is_not_compared(page, tmp_path):
     curve = dataclasses.replace(FIGURE.panels["one"]["ours"], seeds=7)
     panels = {**FIGURE.panels, "one": {**FIGURE.panels["one"], "ours": curve}}
