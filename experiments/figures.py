@@ -360,10 +360,10 @@ FIGURES: Mapping[str, Figure] = {
         },
     ),
     "delayed_rewards": Figure(
-        "Delayed rewards: adaptive imitation beside all others",
+        "Delayed rewards: PPO on decomposed rewards beside all others",
         "",
         _matrix(cell for cell in CELLS if cell[1] > 1),
-        favourite=ADAPTIVE,
+        favourite="ppo, decomposed",
     ),
     "single_setting": Figure(
         "All agents on delayed tasks, each with a single setting",

@@ -177,11 +177,11 @@ class Summary:
             for search in page.figure.searches.values():
                 point = search.chosen(page.searched)
                 # Adaptive imitation has one setting for all tasks.
-                own = search.decompose_rewards or search.agent == ADAPTIVE
-                if point is None or own:
+                if point is None or search.agent == ADAPTIVE:
                     continue
                 config = report.changed(search.config(point))
                 kind = "delayed" if search.reward_delay > 1 else "dense"
+                kind = "decomposed" if search.decompose_rewards else kind
                 of_task = rows[kind].setdefault(search.env, {})
                 of_task[search.agent] = dict(sorted(config.items()))
         return json.dumps(rows, indent=1, sort_keys=True) + "\n"

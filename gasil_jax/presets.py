@@ -8,6 +8,8 @@ needs another alpha. Where the stored search is complete, the row is what it cho
 other rows are from earlier searches. Adaptive imitation has one setting for all
 locomotion tasks. An agent without a row for a task starts from the defaults.
 
+"decomposed" holds what a search chose for PPO where it decomposes delayed rewards.
+
 "paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
 gives for a task. The rest are the defaults, which are the appendix's where it gives
 them. A single environment is slow, because only the seeds share the cost of a step.
@@ -28,8 +30,9 @@ Overrides = Mapping[str, Any]
 Rows = Mapping[tuple[str, str], Overrides]
 
 
-#: What searches chose, by "dense" or "delayed", environment and agent; `python -m
-#: experiments report` writes the rows of complete searches and leaves the others.
+#: What searches chose, by "dense", "delayed" or "decomposed", environment and agent;
+#: `python -m experiments report` writes the rows of complete searches and leaves the
+#: others.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _LOCOMOTION = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
@@ -48,15 +51,20 @@ _ADAPTIVE = {
 _ADAPTIVE_DELAYED = {**_ADAPTIVE, "decompose_rewards": True}
 
 
-def _tuned(rewards: str, adaptive: Overrides) -> Rows:
-    """Return the rows that searches chose, and those of adaptive imitation."""
+def _searched(rewards: str) -> Rows:
+    """Return the rows that searches chose."""
     tasks = json.loads(TUNED.read_text())[rewards]
-    rows = {
+    return {
         (env, agent): row
         for env, agents in tasks.items()
         for agent, row in agents.items()
     }
-    return rows | {(env, "ppo+gasil-adaptive"): adaptive for env in _LOCOMOTION}
+
+
+def _tuned(rewards: str, adaptive: Overrides) -> Rows:
+    """Return the rows that searches chose, and those of adaptive imitation."""
+    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _LOCOMOTION}
+    return {**_searched(rewards), **rows}
 
 
 class Preset(NamedTuple):
@@ -75,6 +83,7 @@ class Preset(NamedTuple):
 
 PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(_tuned("dense", _ADAPTIVE), _tuned("delayed", _ADAPTIVE_DELAYED)),
+    "decomposed": Preset({}, _searched("decomposed")),
     "paper": Preset(
         {
             # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.
@@ -116,9 +125,10 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
     return Config(agent=agent).replace(**{**chosen.every, **row})
 
 
-def is_tuned(env: str, agent: str, reward_delay: int = 1) -> bool:
-    """Return whether the preset "tuned" has a row for an agent on a task."""
-    return _row(PRESETS["tuned"], env, agent, reward_delay) is not None
+def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> bool:
+    """Return whether a preset changes any default for an agent on a task."""
+    chosen = PRESETS[name]
+    return bool(chosen.every or _row(chosen, env, agent, reward_delay))
 
 
 def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides | None:

@@ -47,9 +47,10 @@ class Options:
         by default none. The scores are undelayed returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
-      preset: the hyperparameters to start from: tuned, by environment and agent, or
-        paper, with the paper's single environment per seed, which is slow where
-        seeds are few. Flags override them.
+      preset: the hyperparameters to start from: tuned, by environment and agent;
+        decomposed, for PPO that decomposes delayed rewards; or paper, with the
+        paper's single environment per seed, which is slow where seeds are few. Flags
+        override them.
       devices: number of host devices to spread the seeds over; default one for each
         core.
       settings: settings of the environment.
@@ -233,13 +234,13 @@ def tell_without_effect(options: Options, num_members: int) -> None:
 
 
 def tell_if_untuned(options: Options) -> None:
-    """Print a note if the preset "tuned" has nothing for the agent on the task."""
+    """Print a note if the preset has nothing for the agent on the task."""
     agent, delay = options.config.agent, options.settings.reward_delay
-    if options.preset == "tuned" and not presets.is_tuned(options.env, agent, delay):
+    if not presets.has_overrides(options.env, agent, options.preset, delay):
         rewards = "delayed" if delay > 1 else "dense"
         command_line.note(
-            f"preset 'tuned' has nothing for agent {agent!r} on {options.env} with "
-            f"{rewards} rewards: what is not given is the default"
+            f"preset {options.preset!r} has nothing for agent {agent!r} on "
+            f"{options.env} with {rewards} rewards: what is not given is the default"
         )
 
 

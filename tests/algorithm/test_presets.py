@@ -37,6 +37,15 @@ def test_the_tuned_rows_are_what_the_searches_chose(env, reward_delay):
             assert tuned == search.config(point)
 
 
+@pytest.mark.parametrize("env", TASKS)
+def test_the_rows_on_decomposed_rewards_are_what_the_searches_chose(env):
+    search = Search(env, "ppo", DELAY, decompose_rewards=True)
+    point = search.chosen(Store(RESULTS / "runs"))
+    row = gasil_jax.preset(env, "ppo", "decomposed", reward_delay=DELAY)
+    assert row == (Config(agent="ppo") if point is None else search.config(point))
+    assert row.decompose_rewards == (point is not None)
+
+
 def test_the_command_line_starts_from_the_preset():
     assert parse("point_mass", "--agent", "gasil") == gasil_jax.preset(
         "point_mass", "gasil"
