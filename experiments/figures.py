@@ -135,6 +135,11 @@ class Figure:
             (panel, name, x) for panel, curves in panels for name, x in curves.items()
         ]
 
+    def names(self, panels: Iterable[str] | None = None) -> list[str]:
+        """Return the names of the curves of panels, each once; by default of all."""
+        chosen = self.panels if panels is None else panels
+        return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
+
     def point_of(self, panel: str, name: str) -> tuple[str, Any]:
         """Return the line that a curve is a point of, and its place on the axis."""
         if self.over is None:

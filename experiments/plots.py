@@ -73,7 +73,7 @@ def _colors(figure: Figure) -> dict[str, Any]:
 
     Values, and more names than there are colors, are dark to light.
     """
-    names = list(dict.fromkeys(x for curves in figure.panels.values() for x in curves))
+    names = figure.names()
     if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
         shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
         return dict(zip(names, shades, strict=True))

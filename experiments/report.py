@@ -52,8 +52,7 @@ interval, the percentile bootstrap's over seeds, which of ten covers a little le
 Better and worse are verdicts on differences, corrected by Holm's method for the {}
 comparisons of this page: with 95% probability none is stated without a difference.
 "Not clear" does not mean that two are equal. The probability of improvement is that of
-a seed of one curve having more than one of the other, averaged over the tasks.
-"""
+a seed of one curve having more than one of the other, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -194,16 +193,14 @@ class Page:
         """
         if not panels or not set(panels) <= set(self.figure.panels):
             raise self._no_slot("returns", *panels)
-        rows = []
-        for name in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
-            row = [name]
-            for panel in panels:
-                scores = self.scores.get((panel, name))
-                if scores is None:
-                    row.append("")
-                else:
-                    row.append(number(float(interquartile_mean(scores))))
-            rows.append(row)
+        means = {
+            key: number(float(interquartile_mean(scores)))
+            for key, scores in self.scores.items()
+        }
+        rows = [
+            [name, *(means.get((panel, name), "") for panel in panels)]
+            for name in self.figure.names(panels)
+        ]
         return markdown_table(["agent", *panels], rows)
 
     def differences(self) -> str:
@@ -224,7 +221,7 @@ class Page:
         if not set(panels) <= set(self.figure.panels):
             raise self._no_slot("tally", *panels)
         lines, panels = [], panels or tuple(self.figure.panels)
-        for other in dict.fromkeys(x for p in panels for x in self.figure.panels[p]):
+        for other in self.figure.names(panels):
             with_other = [p for p in panels if other in self.figure.panels[p]]
             ours = str(self.figure.rival(with_other[0], other))
             complete = [p for p in with_other if (p, ours, other) in self.comparisons]
@@ -254,10 +251,7 @@ class Page:
                 dense.setdefault(delayed, []).append(panel)
         rows = []
         for kind, panels in dense.items():
-            names = list(
-                dict.fromkeys(x for p in panels for x in self.figure.panels[p])
-            )
-            for name in names:
+            for name in self.figure.names(panels):
                 having = [panel for panel in panels if (panel, name) in self.scores]
                 if having == panels:
                     words = over_tasks(
@@ -376,8 +370,7 @@ class Page:
         if missing := total - sum(stored):
             parts.append(f"Not trained yet: {missing} of {total} runs.")
         if self.results:
-            reading = _READING.format(len(self.comparisons)).strip()
-            parts += [reading, "## Settings"]
+            parts += [_READING.format(len(self.comparisons)), "## Settings"]
             parts.append(self.settings())
         return "\n\n".join(parts) + "\n"
 

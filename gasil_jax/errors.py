@@ -26,7 +26,7 @@ def unknown(
     Args:
       kind: what is named.
       name: the unknown name.
-      allowed: the known names.
+      allowed: the names that exist.
       forms: what other names look like, such as MODULE:NAME.
     """
     return f"{kind} {name!r} is unknown: {instead(name, allowed, forms)}"

@@ -35,6 +35,7 @@ Rows = Mapping[tuple[str, str], Overrides]
 #: others.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
+_CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
 _LOCOMOTION = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 # One setting for every locomotion task, chosen on two seeds a task with rewards delayed
 # by 20 steps (experiments/notes/adaptive_ablation.md).
@@ -53,10 +54,9 @@ _ADAPTIVE_DELAYED = {**_ADAPTIVE, "decompose_rewards": True}
 
 def _searched(rewards: str) -> Rows:
     """Return the rows that searches chose."""
-    tasks = json.loads(TUNED.read_text())[rewards]
     return {
         (env, agent): row
-        for env, agents in tasks.items()
+        for env, agents in _CHOSEN[rewards].items()
         for agent, row in agents.items()
     }
 

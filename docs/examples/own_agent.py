@@ -52,7 +52,7 @@ def main() -> None:
     options = parser.parse_args()
 
     env = gasil_jax.make_env(options.env)
-    # The second is found by the name of this file, from here or on the command line.
+    # The second is MODULE:NAME, here and on the command line; this file is the module.
     for agent in ("ppo", "own_agent:NEAREST"):
         config = gasil_jax.Config(agent=agent, total_steps=options.steps)
         train = gasil_jax.make_train(env, config.replace(alpha=options.alpha))

@@ -69,7 +69,7 @@ def _refuse_unknown(
     Args:
       kind: what is named.
       name: the name.
-      allowed: the known names.
+      allowed: the names that exist.
       forms: what other names look like, such as MODULE:NAME.
     """
     allowed = tuple(allowed)
