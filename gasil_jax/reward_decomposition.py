@@ -238,8 +238,8 @@ def decompose(
 
     Returns:
       The state after the batch, the batch with decomposed rewards, whether the update
-      of the network was finite and is kept, (), and metrics. The windows of
-      "decomposition_fit" had not been trained on when they were predicted.
+      of the network was finite and is kept, (), and metrics: the `fit` of the windows
+      of more than one step, which had not been trained on when they were predicted.
     """
     network = _network(config)
     low, high = action_range
@@ -269,7 +269,7 @@ def decompose(
     before = step_rewards(decomposition.network.params, decomposition.rates)
     total, length, _ = window_sums(before, ends, *running)
     rate = batch.reward / length
-    metrics = fit(total / length, rate, scored)
+    metrics = fit(total / length, rate, scored & (length > 1))
     rates = normalization.update(
         decomposition.rates, jnp.where(scored, rate, jnp.nan)[..., None]
     )
@@ -317,7 +317,12 @@ def _train(
     config: Config,
     step_size: jax.Array | float,
 ) -> Learner:
-    """Take gradient steps on windows drawn from the history, if there are any."""
+    """Take gradient steps on windows drawn from the history, if one is long enough.
+
+    Windows of a single step need no network. So a run whose every step pays takes no
+    gradient steps at all, also in a batch of such runs: a loop that is vmapped ends
+    with its last member.
+    """
     num_windows = config.decomposition_minibatch_size
     num_rows = config.decomposition_window_steps
     steps = complete.ends.shape[1]
@@ -336,8 +341,8 @@ def _train(
         predicted = jnp.sum(weight * output.reshape(weight.shape), axis=1)
         return jnp.mean((predicted - target) ** 2)
 
-    def step(network: Learner, key: jax.Array) -> Any:
-        window_key, step_key = jax.random.split(key)
+    def step(i: jax.Array, network: Learner) -> Learner:
+        window_key, step_key = jax.random.split(keys[i])
         rank = jax.random.uniform(window_key, (num_windows,)) * counts[-1]
         index = jnp.searchsorted(counts, jnp.floor(rank).astype(jnp.int32), "right")
         env, end = jnp.divmod(jnp.minimum(index, counts.size - 1), steps)
@@ -347,14 +352,11 @@ def _train(
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
         drawn = (env, position, weight, target)
         gradient = mean_gradient(jax.grad(objective), network.params, drawn, parts)
-        return learner.descend(network, gradient, learner.adam(), step_size), None
+        return learner.descend(network, gradient, learner.adam(), step_size)
 
-    trained, _ = jax.lax.scan(
-        step, network, jax.random.split(key, config.decomposition_updates)
-    )
-    return jax.tree.map(
-        lambda new, old: jnp.where(counts[-1] > 0, new, old), trained, network
-    )
+    keys = jax.random.split(key, config.decomposition_updates)
+    late = jnp.any(complete.ends & (complete.length > 1))
+    return jax.lax.fori_loop(0, jnp.where(late, len(keys), 0), step, network)
 
 
 def num_parts(num_windows: int, window_numbers: int) -> int:
