@@ -5,8 +5,8 @@ number of points on every task, dense and delayed, with two seeds of the search'
 Where the best point has a value at an end of its grid, the next value beyond is tried
 too. The best points of all these are trained with more seeds before one is chosen,
 because two seeds decide little on tasks whose outcomes are bimodal. So one table gives
-the best point of each task, which is the paper's protocol, and the best point over all
-tasks. Figures train the chosen points with seeds of their own.
+the best point of each task, which is the paper's protocol, and the best single point of
+all delayed tasks. Figures train the chosen points with seeds of their own.
 """
 
 import dataclasses
@@ -203,6 +203,19 @@ class Search:
         best = self.best(store)
         return None if best is None else best[0]
 
+    def leading(self, store: Store) -> Point | None:
+        """Return the chosen point or, until it is known, the best by the first seeds.
+
+        It is None if runs of the drawn points are missing.
+        """
+        if (chosen := self.chosen(store)) is not None:
+            return chosen
+        for points in (self.points(store), draw(self.agent)):
+            scores = self.scores(points, store)
+            if scores is not None:
+                return points[int(scores.mean(axis=1).argmax())]
+        return None
+
 
 #: Every task with its delay, delayed ones first.
 CELLS = tuple((env, delay) for delay in (DELAY, 1) for env in TASKS)
@@ -223,18 +236,17 @@ def searches(env: str, reward_delay: int) -> dict[str, Search]:
 
 @dataclasses.dataclass(frozen=True)
 class SingleSetting(Search):
-    """The search of one agent for one point for all tasks, dense and delayed."""
+    """The search of one agent for one point for all tasks, at one reward delay."""
 
     def chosen(self, store: Store) -> Point | None:
         """Return the drawn point of the best mean rank, or None if runs are missing.
 
-        Points are ranked within each task and delay, because returns of tasks have
-        different units.
+        Points are ranked within each task, because returns of tasks have different
+        units.
         """
         ranks, drawn = [], draw(self.agent)
-        for env, delay in CELLS:
-            search = dataclasses.replace(self, env=env, reward_delay=delay)
-            scores = search.scores(drawn, store)
+        for env in TASKS:
+            scores = dataclasses.replace(self, env=env).scores(drawn, store)
             if scores is None:
                 return None
             ranks.append(scores.mean(axis=1).argsort().argsort())

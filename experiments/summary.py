@@ -171,11 +171,16 @@ class Summary:
         return report.fill((report.NOTES / "README.md").read_text(), self.value)
 
     def tuned(self) -> str:
-        """Return the presets "tuned", with what complete searches chose, as JSON."""
+        """Return the presets' rows, with what complete searches chose, as JSON.
+
+        Rows of decomposed rewards have no earlier search to fall back on. There an
+        incomplete search gives its best point so far.
+        """
         rows = json.loads(presets.TUNED.read_text())
         for page in self.pages.values():
             for search in page.figure.searches.values():
-                point = search.chosen(page.searched)
+                choose = search.leading if search.decompose_rewards else search.chosen
+                point = choose(page.searched)
                 # Adaptive imitation has one setting for all tasks.
                 if point is None or search.agent == ADAPTIVE:
                     continue

@@ -8,7 +8,8 @@ needs another alpha. Where the stored search is complete, the row is what it cho
 other rows are from earlier searches. Adaptive imitation has one setting for all
 locomotion tasks. An agent without a row for a task starts from the defaults.
 
-"decomposed" holds what a search chose for PPO where it decomposes delayed rewards.
+"decomposed" holds what a search chose for PPO where it decomposes delayed rewards, or
+the best point so far where the search is not complete.
 
 "paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
 gives for a task. The rest are the defaults, which are the appendix's where it gives
