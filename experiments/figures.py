@@ -308,6 +308,10 @@ _PARTS = [
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
 _DECOMPOSED = Arm("ppo, decomposed", "ppo")
+_ONE_SETTING = (
+    Arm("ppo+gasil-adaptive, one setting", ADAPTIVE),
+    Arm("the same without imitation", ADAPTIVE, {"imitation_weight": 0.0}),
+)
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
     "on most of them."
@@ -318,13 +322,9 @@ _DELAYED = (
 )
 
 
-#: PPO on decomposed rewards, with one setting for all delayed tasks.
-_SINGLE_DECOMPOSED = functools.partial(SingleSetting, decompose_rewards=True)
-
-
-def _at_delay(base: Callable[[str, str, int], Search]) -> Any:
-    """Return a base that has what was chosen for the usual delay at every delay."""
-    return lambda env, agent, delay: base(env, agent, DELAY)
+def _usual_delay(decompose_rewards: bool) -> Callable[[str, str, int], Search]:
+    """Return a base that has at every delay what was chosen for the usual one."""
+    return lambda env, agent, delay: Search(env, agent, DELAY, decompose_rewards)
 
 
 def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
@@ -379,12 +379,15 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), panel="{env}", base=base)
             for arms, base in (
-                ([Arm("ppo, decomposed, one setting", "ppo")], _SINGLE_DECOMPOSED),
-                ([Arm("ppo+gasil-adaptive, one setting", ADAPTIVE)], "tuned"),
+                (_ONE_SETTING, "tuned"),
+                (
+                    [Arm("ppo, decomposed, one setting", "ppo")],
+                    functools.partial(SingleSetting, decompose_rewards=True),
+                ),
                 (_PAPERS, Search),
             )
         ),
-        favourite="ppo, decomposed, one setting",
+        favourite=_ONE_SETTING[0].name,
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",
@@ -429,9 +432,9 @@ FIGURES: Mapping[str, Figure] = {
                 seeds=5,
             )
             for arms, base in (
-                (PAIR, _at_delay(Search)),
+                (PAIR, _usual_delay(decompose_rewards=False)),
                 ((ADAPTIVE,), "tuned"),
-                ([_DECOMPOSED], _at_delay(_SINGLE_DECOMPOSED)),
+                ([_DECOMPOSED], _usual_delay(decompose_rewards=True)),
             )
         ),
         favourite="ppo, decomposed",

@@ -27,12 +27,14 @@ from experiments.comparisons import (
 from experiments.figures import FIGURES, Curve, Figure, name_of
 from experiments.search import (
     AGENTS,
+    CELLS,
     DELAY,
     FINALIST_SEEDS,
     PROTOCOL,
     SEEDS,
     TASKS,
     importance,
+    mean_ranks,
 )
 from experiments.store import Record, Run, Store
 from gasil_jax.config import Config
@@ -140,7 +142,7 @@ class Page:
 
     SLOTS = (
         *("table", "returns", "differences", "tally", "aggregate"),
-        *("protocol", "searches", "importance", "published"),
+        *("protocol", "searches", "importance", "ranks", "published"),
     )
 
     def __init__(
@@ -299,6 +301,23 @@ class Page:
             if x
         ]
         return markdown_table(["agent", *names], rows)
+
+    def ranks(self, name: str) -> str:
+        """Return which values of a hyperparameter do well on each task.
+
+        Args:
+          name: the hyperparameter.
+        """
+        tasks = {
+            name_of(*task): mean_ranks(name, *task, self.searched) for task in CELLS
+        }
+        values = sorted({value for of_task in tasks.values() for value in of_task})
+        rows = [
+            [task, *(f"{of_task[value]:.2f}" for value in values)]
+            for task, of_task in tasks.items()
+            if of_task
+        ]
+        return markdown_table([f"{name}:", *(f"{value:g}" for value in values)], rows)
 
     def published(self, rewards: str, *names: str) -> str:
         """Return others' published returns beside those of some of our curves.

@@ -274,6 +274,26 @@ def importance(agent: str, store: Store) -> dict[str, float]:
     )
 
 
+def mean_ranks(
+    name: str, env: str, reward_delay: int, store: Store
+) -> dict[Any, float]:
+    """Return how well points with each value of a hyperparameter do on a task.
+
+    An agent's drawn points are ranked from 0, the worst, to 1. The result is the mean
+    rank of the points with a value, over the agents whose drawn points are all stored
+    and whose search has the hyperparameter; empty if there is none.
+    """
+    ranks: dict[Any, list[float]] = {}
+    for search in searches(env, reward_delay).values():
+        points = draw(search.agent)
+        scores = search.scores(points, store)
+        if scores is not None and name in points[0]:
+            order = scores.mean(axis=1).argsort().argsort() / (len(points) - 1)
+            for point, rank in zip(points, order, strict=True):
+                ranks.setdefault(point[name], []).append(float(rank))
+    return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}
+
+
 class Coverage(NamedTuple):
     """How many runs of an agent on a task are stored and planned.
 

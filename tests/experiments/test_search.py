@@ -96,6 +96,22 @@ def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
     assert single.chosen(store) == points[1]
 
 
+def test_which_values_suit_a_task_is_told(tmp_path):
+    store, points = Store(tmp_path), search.draw("ppo")
+    assert search.mean_ranks("gamma", "ant", 20, store) == {}
+    fill(store, Search("ant", "ppo", 20), points, [1e4 * x["gamma"] for x in points])
+    # PPO on decomposed rewards has the same points, the other way round.
+    decomposed = Search("ant", "ppo", 20, decompose_rewards=True)
+    fill(store, decomposed, points, [-x["gamma"] for x in points])
+    low, high = search.mean_ranks("gamma", "ant", 20, store).values()
+    assert low == pytest.approx(high) == pytest.approx(0.5)
+    assert search.mean_ranks("alpha", "ant", 20, store) == {}
+    row = next(
+        x for x in Page("matrix", store).ranks("gamma").splitlines() if "| ant" in x
+    )
+    assert row == "| ant-delayed | 0.50 | 0.50 |"
+
+
 def test_what_matters_is_told(tmp_path):
     store, points = Store(tmp_path), search.draw("ppo")
     assert search.importance("ppo", store) == {}
