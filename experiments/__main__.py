@@ -46,7 +46,7 @@ class Options:
       list: only print the missing runs.
       only: panels and searches to train; default all. A panel without its searches
         trains only what complete searches chose.
-      part: I/N: train every N-th run, from the I-th on. Other processes or machines
+      part: I/N: train only the I-th of N parts of the runs. Other processes or machines
         train the others, and `merge` adds another machine's results.
       results: folder of the pages and, below runs/, of the stored runs. Runs that are
         stored there are not trained again.
@@ -128,10 +128,12 @@ def _train(name: str, options: Options) -> None:
         for program in engine.programs(missing, setup):
             print(f"  {program}")
         return
-    Page(name, stored, searched, figure if options.quick else None).write(results)
-    print(f"in {results / name}.md")
     if results == RESULTS:
-        Summary(stored).write()
+        # Other pages have some of the same runs.
+        _write_all_pages()
+    else:
+        Page(name, stored, searched, figure if options.quick else None).write(results)
+    print(f"in {results / name}.md")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,14 +175,18 @@ def _coverage(options: CoverageOptions) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class ReportOptions:
-    """Write all pages and plots, and the README's tables, from the stored runs."""
+    """Write all pages, plots and presets, and the README's tables, from stored runs."""
 
 
-def _report(options: ReportOptions) -> None:
+def _write_all_pages() -> None:
     stored = Store(RESULTS / "runs")
     for name in FIGURES:
         Page(name, stored).write(RESULTS)
     Summary(stored).write()
+
+
+def _report(options: ReportOptions) -> None:
+    _write_all_pages()
     print(f"in {RESULTS}")
 
 

@@ -56,12 +56,38 @@ def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
     return _draws(f"{panel}/{curve}", tuple(scores[panel, curve].tolist()))
 
 
+@functools.cache
+def _permuted(ours: tuple[float, ...], other: tuple[float, ...]) -> np.ndarray:
+    """Return differences of interquartile means of seeds dealt anew: (draws,)."""
+    rng = np.random.default_rng(0)
+    rows = rng.permuted(np.tile((*ours, *other), (_DRAWS, 1)), axis=1)
+    first, second = np.split(rows, [len(ours)], axis=1)
+    return interquartile_mean(first, axis=1) - interquartile_mean(second, axis=1)
+
+
+def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
+    """Return the p-value of a permutation test for two curves, of (seeds,) each.
+
+    It is the share of all ways to deal the seeds to the two curves whose interquartile
+    means are at least as far apart, estimated by random ones. Unlike the bootstrap's it
+    is right for a few seeds too: five against five can have no less than 0.008.
+    """
+    # Both orders are the same test, and so have the same random numbers.
+    pair = sorted([tuple(ours.tolist()), tuple(other.tolist())])
+    distance = abs(float(interquartile_mean(ours) - interquartile_mean(other)))
+    # Sums in another order differ by rounding.
+    as_far = np.abs(_permuted(*pair)) >= distance * (1 - 1e-9)
+    return float((1 + as_far.sum()) / (1 + _DRAWS))
+
+
 def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
     """Return the differences of interquartile means whose curves all have scores.
 
     The p-value is the percentile bootstrap's: the share of draws on the other side of
-    0, times two. In Holm's method the smallest is multiplied by the number of
-    comparisons, the next by one less, and none is smaller than the one before.
+    0, times two. That is too small where seeds are few, so that the difference of two
+    curves has the permutation test's if it is larger. In Holm's method the smallest is
+    multiplied by the number of comparisons, the next by one less, and none is smaller
+    than the one before.
     """
     raw = {}
     for key, terms in family.items():
@@ -74,6 +100,8 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
         enough = all(len(x) >= _FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
         p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
+        if enough and len(sides) == 2:
+            p_value = max(p_value, permutation_p(*sides))
         raw[key] = Comparison(middle, low, high, p_value)
     corrected, least = {}, 0.0
     for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):

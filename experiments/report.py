@@ -49,12 +49,13 @@ PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 _READING = """## How to read this
 
 A final return is the interquartile mean over seeds of the mean return over the last
-tenth of training, of the episodes that the acting policy ended; in brackets a 95%
-interval, the percentile bootstrap's over seeds, which of ten covers a little less.
-Better and worse are verdicts on differences, corrected by Holm's method for the {}
-comparisons of this page: with 95% probability none is stated without a difference.
-"Not clear" does not mean that two are equal. The probability of improvement is that of
-a seed of one curve having more than one of the other, averaged over the tasks."""
+tenth of training, of the episodes that the acting policy ended; in brackets its 95%
+interval, by the percentile bootstrap over seeds, which covers a little less with ten.
+Better and worse are verdicts on differences, by a permutation test and the bootstrap
+together, corrected by Holm's method for the {} comparisons of this page: with 95%
+probability none of them is wrong. "Not clear" does not mean that two are equal. The
+probability of improvement is that of a seed of one curve having more than one of the
+other, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -242,8 +243,8 @@ class Page:
         A seed's return is divided by the interquartile mean of the curve `unit` in the
         panel of the same task with dense rewards. Then every task counts alike in the
         interquartile mean over all seeds of all tasks; its 95% interval is the
-        percentile bootstrap's over seeds, drawn within each task. The curves must have
-        scores on all of these tasks, dense or delayed.
+        percentile bootstrap's over seeds, drawn within each task; the unit is taken as
+        known. The curves must have scores on all of these tasks, dense or delayed.
         """
         dense: dict[str, list[str]] = {}
         for panel, curves in self.figure.panels.items():

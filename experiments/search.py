@@ -257,7 +257,8 @@ def importance(agent: str, store: Store) -> dict[str, float]:
     """Return how much of its points' variance each hyperparameter explains alone.
 
     It is the mean of `statistics.importance` over the tasks, dense and delayed, whose
-    drawn points are all stored and all ended an episode; empty if there is none.
+    drawn points are all stored and all ended an episode, or 0 if that is negative;
+    empty if there is none.
     """
     points, shares = draw(agent), []
     for env, delay in CELLS:
@@ -268,7 +269,10 @@ def importance(agent: str, store: Store) -> dict[str, float]:
             explained = {n: statistics.importance(x, means) for n, x in values.items()}
             shares.append({name: share or 0.0 for name, share in explained.items()})
     return (
-        {name: float(np.mean([x[name] for x in shares])) for name in shares[0]}
+        {
+            name: max(0.0, float(np.mean([x[name] for x in shares])))
+            for name in points[0]
+        }
         if shares
         else {}
     )

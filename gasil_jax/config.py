@@ -157,7 +157,7 @@ class Config:
     """Form of the discriminator's reward: "softplus", -log D, is the paper's."""
     imitation_rule: str = "both"
     """What the share of imitation in the policy's advantage follows, in the agent
-    ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for none of them."""
+    ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for neither."""
     discriminator_minibatch_size: int = _count(128)
     """Steps of the policy, and equally many good steps, in one gradient step of the
     discriminator."""

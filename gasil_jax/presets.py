@@ -11,12 +11,16 @@ locomotion tasks. An agent without a row for a task starts from the defaults.
 "decomposed" holds what a search chose for PPO where it decomposes delayed rewards, or
 the best point so far where the search is not complete.
 
+"scaled" holds one setting for PPO on all locomotion tasks, whose step size and
+exploration follow the number of actions; it decomposes delayed rewards.
+
 "paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
 gives for a task. The rest are the defaults, which are the appendix's where it gives
 them. A single environment is slow, because only the seeds share the cost of a step.
 """
 
 import json
+import math
 import pathlib
 import types
 from collections.abc import Mapping
@@ -37,7 +41,11 @@ Rows = Mapping[tuple[str, str], Overrides]
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
-_LOCOMOTION = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
+#: The locomotion tasks, each with its number of actions.
+_ACTIONS = {
+    **{"hopper": 3, "walker2d": 6, "halfcheetah": 6},
+    **{"swimmer": 2, "ant": 8, "humanoid": 17},
+}
 # One setting for every locomotion task, chosen on two seeds a task with rewards delayed
 # by 20 steps (experiments/notes/adaptive_ablation.md).
 _ADAPTIVE = {
@@ -64,8 +72,28 @@ def _searched(rewards: str) -> Rows:
 
 def _tuned(rewards: str, adaptive: Overrides) -> Rows:
     """Return the rows that searches chose, and those of adaptive imitation."""
-    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _LOCOMOTION}
+    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _ACTIONS}
     return {**_searched(rewards), **rows}
+
+
+def _scaled(decompose_rewards: bool) -> Rows:
+    """Return rows for PPO whose step size and exploration follow the number of actions.
+
+    The more actions a task has, the smaller both must be, as the searches suggest
+    (experiments/results/matrix.md). So the noise on an untrained policy's action has a
+    length of about 1 in every task.
+    """
+    return {
+        (env, "ppo"): {
+            "normalize_rewards": True,
+            "decompose_rewards": decompose_rewards,
+            "num_envs": 32,
+            "gamma": 0.995,
+            "learning_rate": 1.5e-3 / actions,
+            "initial_deviation": 1 / math.sqrt(actions),
+        }
+        for env, actions in _ACTIONS.items()
+    }
 
 
 class Preset(NamedTuple):
@@ -85,6 +113,7 @@ class Preset(NamedTuple):
 PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(_tuned("dense", _ADAPTIVE), _tuned("delayed", _ADAPTIVE_DELAYED)),
     "decomposed": Preset({}, _searched("decomposed")),
+    "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
     "paper": Preset(
         {
             # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.

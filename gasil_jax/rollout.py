@@ -54,7 +54,7 @@ class Rollout(struct.PyTreeNode):
 
     @property
     def completed(self) -> jax.Array:
-        """Whether an episode of full length ended with this step, bool (time, env).
+        """Whether a whole episode ended with this step, bool (time, env).
 
         Only returns of such episodes are reported; one that was cut short is left out.
         """

@@ -182,7 +182,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"({summary['evaluation_seconds']:,.0f} s of evaluations), "
         )
     print(
-        f"final return {'none ended' if mean is None else format(mean, '.1f')} "
+        f"final return {'unknown' if mean is None else format(mean, '.1f')} "
         f"(mean over {options.seeds} seeds), {evaluated}"
         f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}, "
         f"in {folder}"

@@ -119,15 +119,15 @@ def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
     It is epsilon squared, 1 - (S / (n - k)) / (T / (n - 1)), with n points in k groups
     (`groups`), and S and T the sums of squared distances of their returns to the mean
     of their group and to the mean of all. It is near 0 on average for a hyperparameter
-    without effect, however many groups there are; below 0 it is given as 0, and it is 0
-    if all returns are equal. What hyperparameters do only together counts for none.
+    without effect, however many groups there are, and may be below 0; it is 0 if all
+    returns are equal. What hyperparameters do only together counts for none.
 
     Args:
       values: each point's value of the hyperparameter.
       returns: each point's return, (points,), all finite.
 
     Returns:
-      The share, from 0 to 1; None with fewer than eight points, or than two for each
+      The share, at most 1; None with fewer than eight points, or than two for each
       group.
     """
     parts = groups(values)
@@ -137,4 +137,4 @@ def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
         return 0.0
     within = sum(np.var(returns[part]) * len(part) for part in parts)
     rest = within / (len(values) - len(parts))
-    return max(0.0, 1.0 - rest / np.var(returns, ddof=1))
+    return float(1.0 - rest / np.var(returns, ddof=1))

@@ -195,10 +195,10 @@ def read(folder: pathlib.Path) -> Checkpoint:
     """
     try:
         manifest = json_reader.read(folder / _MANIFEST, _Manifest)
+        hashes = _hashes(folder)
     except (OSError, ValueError) as error:
         raise ValueError(f"{folder} is damaged: {error}") from None
     files, record = manifest["files"], manifest["record"]
-    hashes = _hashes(folder)
     if hashes != files:
         name = min(
             name for name in {*hashes, *files} if hashes.get(name) != files.get(name)

@@ -1,5 +1,6 @@
 """Check before compiling that a batch of runs fits the devices and the disk."""
 
+import contextlib
 import math
 import pathlib
 import shutil
@@ -18,6 +19,7 @@ _BATCHES = 8
 # By the same report an evaluated episode needs 7 (point mass) or 25 (hopper) times the
 # memory of its environment's state.
 _STATES = 7
+_CONTROL_GROUP = pathlib.Path("/sys/fs/cgroup")
 
 
 class Need(NamedTuple):
@@ -60,15 +62,29 @@ def available(devices: Sequence[jax.Device]) -> int | None:
             return None
         return len(devices) * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
     free = []
-    for path, read in (
-        ("/proc/meminfo", lambda text: int(text.split("MemAvailable:")[1].split()[0])),
-        ("/sys/fs/cgroup/memory.max", lambda text: int(text) // 1024),
-    ):
-        try:
-            free.append(1024 * read(pathlib.Path(path).read_text()))
-        except (OSError, ValueError, IndexError):
-            continue
+    for read in (_free_on_the_machine, _free_in_the_container):
+        # A file is missing, or there is no limit.
+        with contextlib.suppress(OSError, ValueError, LookupError):
+            free.append(read())
     return min(free, default=None)
+
+
+def _free_on_the_machine() -> int:
+    text = pathlib.Path("/proc/meminfo").read_text()
+    return 1024 * int(text.split("MemAvailable:")[1].split()[0])
+
+
+def _free_in_the_container(group: pathlib.Path = _CONTROL_GROUP) -> int:
+    """Return what is left of a control group's limit, in bytes.
+
+    Files that the kernel only caches count as free.
+    """
+    limit, used = (
+        int((group / name).read_text()) for name in ("memory.max", "memory.current")
+    )
+    lines = (group / "memory.stat").read_text().splitlines()
+    cached = dict(map(str.split, lines))["inactive_file"]
+    return limit - used + int(cached)
 
 
 def check_memory(
@@ -143,19 +159,31 @@ def check_disk(
     Raises:
       ValueError: if they do not fit; the message gives the sizes.
     """
+    written = _size_of_checkpoints(folder)
     while not folder.exists():
         folder = folder.parent
     sizes = [need(env, config).state * num_members for config, num_members in runs]
     # While a checkpoint is being written there is one more.
     required = num_checkpoints * sum(sizes) + max(sizes, default=0)
     free = _free_disk(folder)
-    if free is not None and required > free:
+    # New checkpoints take the place of those that a run to be continued has written.
+    if free is not None and required > free + written:
         members = sum(num_members for _, num_members in runs)
         raise ValueError(
             f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
             f"{num_checkpoints} checkpoints of {members} seeds (over all points), and "
             f"one that is being written, need {_in_words(required)}"
         )
+
+
+def _size_of_checkpoints(folder: pathlib.Path) -> int:
+    """Return the bytes of the checkpoints below a folder, which need not exist."""
+    size = 0
+    for path in folder.glob("**/checkpoints/**/*"):
+        # Another process may delete it meanwhile.
+        with contextlib.suppress(OSError):
+            size += path.stat().st_size if path.is_file() else 0
+    return size
 
 
 def _free_disk(folder: pathlib.Path) -> int | None:

@@ -77,7 +77,10 @@ def _refuse_used(
 ) -> None:
     """Refuse a folder that holds anything but earlier tables of the same shards."""
     if run_folder.is_described(out):
-        _refuse_different((out, run_folder.read(out)), shard)
+        earlier = run_folder.read(out)
+        # The shards may have been continued to more total_steps since.
+        if run_folder.differences(_comparable(earlier), _comparable(shard[1])):
+            _refuse_different((out, earlier), shard)
         used = (out / "programs").is_dir()
     else:
         used = any(path.name not in ("shards", ".lock") for path in out.iterdir())

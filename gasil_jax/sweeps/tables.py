@@ -226,6 +226,8 @@ def write(
     ended = [i for i in range(len(points)) if math.isfinite(mean[i])]
     varied = _varied(parts, names, ended)
     shares = {name: importance(values, mean[ended]) for name, values in varied.items()}
+    # What is below 0 is so by chance.
+    shares = {name: x if x is None else max(0.0, x) for name, x in shares.items()}
     summary = {
         "points": [
             {

@@ -45,6 +45,16 @@ def test_the_rows_on_decomposed_rewards_are_the_best_of_their_searches(env):
     assert row == search.config(point) and row.decompose_rewards
 
 
+@pytest.mark.parametrize("env", TASKS)
+def test_scaled_rows_follow_the_number_of_actions(env):
+    actions = gasil_jax.make_env(env).action_size
+    for delay in (1, DELAY):
+        row = gasil_jax.preset(env, "ppo", "scaled", reward_delay=delay)
+        assert row.hyperparameters.learning_rate * actions == pytest.approx(1.5e-3)
+        assert row.hyperparameters.initial_deviation**2 * actions == pytest.approx(1.0)
+        assert row.decompose_rewards == (delay > 1)
+
+
 def test_the_command_line_starts_from_the_preset():
     assert parse("point_mass", "--agent", "gasil") == gasil_jax.preset(
         "point_mass", "gasil"

@@ -1,6 +1,7 @@
 """Pages are what the stored runs say; verdicts are corrected for their number."""
 
 import dataclasses
+import itertools
 import re
 
 import numpy as np
@@ -14,6 +15,7 @@ from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
+from gasil_jax.figures.statistics import interquartile_mean
 
 STORE = Store(RESULTS / "runs")
 
@@ -52,6 +54,28 @@ def test_the_correction_is_holm_s():
         assert (result[key].verdict != "not clear") == rejected
     # The correction decides something here.
     assert any(alone[key] <= comparisons.LEVEL < result[key].p for key in order)
+
+
+def test_the_permutation_test_is_right_with_few_seeds():
+    """Against all ways to deal the seeds, and for seeds without a difference."""
+    apart = lambda a, b: abs(interquartile_mean(a) - interquartile_mean(b))
+    five = {name: x[:5] for name, x in scores(high=9.0, low=0.0).items()}
+    close = np.array([5.0, 3.0, 9.0]), np.array([1.0, 4.0, 2.0])
+    for ours, other in (close, tuple(five.values())):
+        pooled, distance = np.array([*ours, *other]), apart(ours, other)
+        ways = [
+            apart(pooled[list(x)], np.delete(pooled, x)) >= distance - 1e-9
+            for x in itertools.combinations(range(len(pooled)), len(ours))
+        ]
+        p = comparisons.permutation_p(ours, other)
+        assert p == pytest.approx(np.mean(ways), abs=0.01)
+        assert p == comparisons.permutation_p(other, ours)
+    # The bootstrap's alone would be a hundredth of it.
+    (result,) = compare(five, family(("high", "low"))).values()
+    assert result.p == p > 0.01
+    rng = np.random.default_rng(1)
+    ps = [comparisons.permutation_p(*rng.normal(size=(2, 5))) for _ in range(200)]
+    assert np.mean(np.array(ps) <= 0.1) < 0.16
 
 
 def test_a_contrast_is_a_weighted_sum():

@@ -12,13 +12,13 @@ def test_only_what_decides_the_return_is_important():
     noise = np.random.default_rng(0).normal(scale=0.01, size=len(ALPHA))
     returns = np.log(ALPHA) ** 2 + noise
     assert statistics.importance(ALPHA.tolist(), returns) > 0.99
-    assert statistics.importance(RATE.tolist(), returns) == 0.0
+    assert statistics.importance(RATE.tolist(), returns) < 0.0
     # Epsilon squared: a one-way analysis of variance.
     returns = ALPHA + np.arange(12.0) % 5
     within = sum(((x - x.mean()) ** 2).sum() for x in returns.reshape(3, 4).T)
     total = ((returns - returns.mean()) ** 2).sum()
     assert statistics.importance(ALPHA.tolist(), returns) == pytest.approx(
-        max(0.0, 1 - within / 8 / (total / 11))
+        1 - within / 8 / (total / 11)
     )
 
 
@@ -35,7 +35,7 @@ def test_it_is_zero_on_average_where_there_is_no_effect():
     values = [x % 8 for x in range(16)]
     shares = [statistics.importance(values, draw.normal(size=16)) for _ in range(300)]
     # The share without the correction is (8 - 1) / (16 - 1) on average.
-    assert np.median(shares) < 0.05 and np.mean(shares) < 0.2
+    assert abs(np.mean(shares)) < 0.05
 
 
 def test_what_can_not_be_told():

@@ -52,6 +52,29 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
         resources.check_disk(env, [members, members], tmp_path, 3)
 
 
+def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
+    state = resources.need(gasil_jax.make_env("point_mass"), gasil_jax.Config()).state
+    monkeypatch.setattr(resources, "_free_disk", lambda folder: state)
+    env, members = gasil_jax.make_env("point_mass"), [(gasil_jax.Config(), 1)]
+    with pytest.raises(ValueError, match="3 checkpoints of 1 seeds"):
+        resources.check_disk(env, members, tmp_path, 3)
+    for iteration in ("10", "20", "30"):
+        folder = tmp_path / "checkpoints" / iteration / "state"
+        folder.mkdir(parents=True)
+        (folder / "array").write_bytes(bytes(state))
+    resources.check_disk(env, members, tmp_path, 3)
+
+
+def test_a_container_has_what_others_in_it_leave(tmp_path, monkeypatch):
+    values = {"max": "1000", "current": "700", "stat": "anon 300\ninactive_file 50\n"}
+    for name, text in values.items():
+        (tmp_path / f"memory.{name}").write_text(text)
+    assert resources._free_in_the_container(tmp_path) == 350
+    (tmp_path / "memory.max").write_text("max\n")
+    with pytest.raises(ValueError):
+        resources._free_in_the_container(tmp_path)
+
+
 def test_available_memory_is_read():
     free = resources.available(jax.devices())
     assert free is None or 10**7 < free < 10**14

@@ -193,6 +193,20 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     assert "shards of 2 and of 3" in refused(out)
 
 
+def test_tables_are_written_anew_when_all_shards_have_gone_on(tmp_path, capsys):
+    for shard in ("1/2", "2/2"):
+        train(tmp_path, shard)
+    assert merge.main([str(tmp_path)]) == 0
+    path = tmp_path / "config.json"
+    merged = path.read_text()
+    for earlier, status in (("200", 0), ("400", 2)):
+        changed = merged.replace('"total_steps": 300', f'"total_steps": {earlier}')
+        assert changed != merged
+        path.write_text(changed)
+        assert merge.main([str(tmp_path)]) == status
+    assert "total_steps was 400, is 300" in capsys.readouterr().err
+
+
 def copy(folder):
     return shutil.copytree(folder, folder.parent.parent.parent / "copy")
 
