@@ -147,6 +147,8 @@ def check_disk(
     runs: Sequence[tuple[Config, int]],
     folder: pathlib.Path,
     num_checkpoints: int,
+    *,
+    written: int = 0,
 ) -> None:
     """Check that the checkpoints fit the disk.
 
@@ -155,18 +157,17 @@ def check_disk(
       runs: each config with the number of its members.
       folder: the folder of the checkpoints; it need not exist.
       num_checkpoints: number of checkpoints to keep of each member.
+      written: bytes of the runs' earlier checkpoints, which new ones replace.
 
     Raises:
       ValueError: if they do not fit; the message gives the sizes.
     """
-    written = _size_of_checkpoints(folder)
     while not folder.exists():
         folder = folder.parent
     sizes = [need(env, config).state * num_members for config, num_members in runs]
     # While a checkpoint is being written there is one more.
     required = num_checkpoints * sum(sizes) + max(sizes, default=0)
     free = _free_disk(folder)
-    # New checkpoints take the place of those that a run to be continued has written.
     if free is not None and required > free + written:
         members = sum(num_members for _, num_members in runs)
         raise ValueError(
@@ -176,7 +177,7 @@ def check_disk(
         )
 
 
-def _size_of_checkpoints(folder: pathlib.Path) -> int:
+def size_of_checkpoints(folder: pathlib.Path) -> int:
     """Return the bytes of the checkpoints below a folder, which need not exist."""
     size = 0
     for path in folder.glob("**/checkpoints/**/*"):

@@ -91,6 +91,7 @@ def prepare(
             options.out or pathlib.Path("runs"),
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
+            written=resources.size_of_checkpoints(options.out) if options.out else 0,
         )
     run_options.tell_if_untuned(options)
     run_options.tell_without_effect(options, num_members)

@@ -62,7 +62,10 @@ def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatc
         folder = tmp_path / "checkpoints" / iteration / "state"
         folder.mkdir(parents=True)
         (folder / "array").write_bytes(bytes(state))
-    resources.check_disk(env, members, tmp_path, 3)
+    written = resources.size_of_checkpoints(tmp_path)
+    assert written == 3 * state
+    resources.check_disk(env, members, tmp_path, 3, written=written)
+    assert resources.size_of_checkpoints(tmp_path / "none") == 0
 
 
 def test_a_container_has_what_others_in_it_leave(tmp_path, monkeypatch):
