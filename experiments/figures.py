@@ -371,7 +371,12 @@ FIGURES: Mapping[str, Figure] = {
     "delayed_rewards": Figure(
         "Delayed rewards: PPO on decomposed rewards beside all others",
         "",
-        _matrix(cell for cell in CELLS if cell[1] > 1),
+        joined(
+            [
+                _matrix(cell for cell in CELLS if cell[1] > 1),
+                grid(TASKS, [_SCALED], (DELAY,), base="scaled"),
+            ]
+        ),
         favourite="ppo, decomposed",
     ),
     "single_setting": Figure(

@@ -15,10 +15,11 @@ from gasil_jax.figures.statistics import (
     interquartile_mean,
 )
 
-#: Okabe and Ito's colours, which colour-blind readers can distinguish.
+#: Okabe and Ito's colours, which colour-blind readers can distinguish, but for their
+#: yellow, which is too light for lines; grey and brown stand for it.
 COLORS = (
     *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
-    *("#E69F00", "#56B4E9", "#000000", "#999999"),
+    *("#E69F00", "#56B4E9", "#000000", "#999999", "#8C510A"),
 )
 
 
