@@ -179,10 +179,10 @@ class ReportOptions:
 
 
 def _write_all_pages() -> None:
-    stored = Store(RESULTS / "runs")
-    for name in FIGURES:
-        Page(name, stored).write(RESULTS)
-    Summary(stored).write()
+    summary = Summary(Store(RESULTS / "runs"))
+    for page in summary.pages.values():
+        page.write(RESULTS)
+    summary.write()
 
 
 def _report(options: ReportOptions) -> None:

@@ -307,7 +307,6 @@ _PARTS = [
     ),
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
-_DECOMPOSED = Arm("ppo, decomposed", "ppo")
 _SCALED = Arm("ppo, decomposed, scaled", "ppo")
 _ADAPTIVE_WITH_AND_WITHOUT = (
     Arm(ADAPTIVE, ADAPTIVE),

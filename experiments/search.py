@@ -112,6 +112,11 @@ def beyond(agent: str, point: Point) -> Iterator[Point]:
                 yield {**point, name: further}
 
 
+def _ranks(scores: np.ndarray) -> np.ndarray:
+    """Return the ranks of points, (points,), 0 the worst, from (points, seeds)."""
+    return scores.mean(axis=1).argsort().argsort()
+
+
 @dataclasses.dataclass(frozen=True)
 class Search:
     """The search of one agent on one task.
@@ -210,11 +215,11 @@ class Search:
         """
         if (chosen := self.chosen(store)) is not None:
             return chosen
-        for points in (self.points(store), draw(self.agent)):
-            scores = self.scores(points, store)
-            if scores is not None:
-                return points[int(scores.mean(axis=1).argmax())]
-        return None
+        if finalists := self.finalists(store):
+            return finalists[0]
+        drawn = draw(self.agent)
+        scores = self.scores(drawn, store)
+        return None if scores is None else drawn[int(scores.mean(axis=1).argmax())]
 
 
 #: Every task with its delay, delayed ones first.
@@ -249,7 +254,7 @@ class SingleSetting(Search):
             scores = dataclasses.replace(self, env=env).scores(drawn, store)
             if scores is None:
                 return None
-            ranks.append(scores.mean(axis=1).argsort().argsort())
+            ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
 
 
@@ -268,14 +273,10 @@ def importance(agent: str, store: Store) -> dict[str, float]:
             values = {name: [point[name] for point in points] for name in points[0]}
             explained = {n: statistics.importance(x, means) for n, x in values.items()}
             shares.append({name: share or 0.0 for name, share in explained.items()})
-    return (
-        {
-            name: max(0.0, float(np.mean([x[name] for x in shares])))
-            for name in points[0]
-        }
-        if shares
-        else {}
-    )
+    if not shares:
+        return {}
+    mean = lambda name: float(np.mean([x[name] for x in shares]))
+    return {name: max(0.0, mean(name)) for name in points[0]}
 
 
 def mean_ranks(
@@ -292,8 +293,8 @@ def mean_ranks(
         points = draw(search.agent)
         scores = search.scores(points, store)
         if scores is not None and name in points[0]:
-            order = scores.mean(axis=1).argsort().argsort() / (len(points) - 1)
-            for point, rank in zip(points, order, strict=True):
+            shares = _ranks(scores) / (len(points) - 1)
+            for point, rank in zip(points, shares, strict=True):
                 ranks.setdefault(point[name], []).append(float(rank))
     return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}
 

@@ -68,7 +68,7 @@ def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatc
     assert resources.size_of_checkpoints(tmp_path / "none") == 0
 
 
-def test_a_container_has_what_others_in_it_leave(tmp_path, monkeypatch):
+def test_a_container_has_what_others_in_it_leave(tmp_path):
     values = {"max": "1000", "current": "700", "stat": "anon 300\ninactive_file 50\n"}
     for name, text in values.items():
         (tmp_path / f"memory.{name}").write_text(text)
