@@ -1,10 +1,12 @@
 """Speed and fidelity of physics and training: ``python -m experiments benchmark``.
 
 - "physics": random actions with each way of building a task, and the relative error of
-  one step against C MuJoCo with the model's own integrator, which is Gymnasium's.
+  one step against C MuJoCo with the model's own integrator, which is Gymnasium's. On a
+  GPU also MuJoCo Warp through MJX, if it is installed (mujoco-mjx's extra "warp").
 - "training": PPO+GASIL on many seeds at once, beside physics alone in as many
   environments and, if it is installed (the extra "benchmark"), Stable-Baselines3's PPO
-  on Gymnasium's task: one process, and one on every core.
+  on Gymnasium's task: a run in one process, a run whose environments have processes of
+  their own, and a run on every core.
 - "scaling": training on 1, 2, 4 ... devices, with as many seeds on each device. A
   perfect ratio is the number of devices.
 
@@ -110,6 +112,13 @@ def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
     return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
 
 
+def _speed(call: Callable[[], Any], steps: int) -> float:
+    """Return the steps per second of a call that takes so many steps."""
+    began = time.perf_counter()
+    jax.block_until_ready(call())
+    return steps / (time.perf_counter() - began)
+
+
 def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     """Random actions in environments that are spread over the devices."""
     env = _make(env_name, variant)
@@ -129,12 +138,45 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     # Not from the start, because most bodies have fallen to the ground after a while.
     states, _ = jax.block_until_ready(advance((states, keys(0, count))))
 
-    def run() -> float:
-        began = time.perf_counter()
-        jax.block_until_ready(advance((states, keys(1, count))))
-        return num_envs * _NUM_STEPS / (time.perf_counter() - began)
-
+    rollouts = lambda: advance((states, keys(1, count)))
+    run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, variant, num_envs, run, compile_seconds)
+
+
+def warp_row(env_name: str, num_envs: int) -> Row:
+    """Random actions in MuJoCo Warp, without rewards, observations and resets."""
+    from mujoco import mjx
+
+    env = gasil_envs.make(env_name, **VARIANTS["mjx"]).unwrapped
+    frame_skip, (low, high) = env.task.frame_skip, env.action_range
+    model = mjx.put_model(env.model, impl="warp")
+    # Warp warns that four iterations of the solver, which all rows have, are few.
+    model = model.tree_replace({"opt._impl.warn_overflow": 0})
+    blank = mjx.make_data(env.model, impl="warp", naconmax=24 * num_envs, njmax=128)
+    step = jax.vmap(mjx.step, in_axes=(None, 0))
+
+    def random_step(data: Any, key: jax.Array) -> tuple[Any, None]:
+        shape = (num_envs, env.action_size)
+        action = jax.random.uniform(key, shape, minval=low, maxval=high)
+        data = data.replace(ctrl=action)
+        return jax.lax.fori_loop(0, frame_skip, lambda _, x: step(model, x), data), None
+
+    def start(key: jax.Array) -> Any:
+        physics = env.reset(key).pipeline_state.physics
+        return blank.replace(qpos=physics.qpos, qvel=physics.qvel)
+
+    keys = lambda number, count: jax.random.split(jax.random.key(number), count)
+    rollout = jax.jit(lambda data, keys: jax.lax.scan(random_step, data, keys)[0])
+    states = jax.vmap(start)(keys(0, num_envs))
+    began = time.perf_counter()
+    advance = rollout.lower(states, keys(0, _NUM_STEPS)).compile()
+    states = jax.block_until_ready(advance(states, keys(0, _NUM_STEPS)))
+    # Warp compiles its kernels at the first call.
+    compile_seconds = time.perf_counter() - began
+
+    rollouts = lambda: advance(states, keys(1, _NUM_STEPS))
+    run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
+    return Row(env_name, "warp", num_envs, run, compile_seconds)
 
 
 def one_step_error(env_name: str, variant: str) -> float:
@@ -160,7 +202,10 @@ def physics_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     errors = {name: one_step_error(env_name, name) for name in variants}
     for num_envs in options.num_envs:
         rows = [physics_row(env_name, name, num_envs) for name in errors]
-        yield [dataclasses.replace(row, error=errors[row.name]) for row in rows]
+        rows = [dataclasses.replace(row, error=errors[row.name]) for row in rows]
+        if importlib.util.find_spec("warp") and jax.default_backend() == "gpu":
+            rows.append(warp_row(env_name, num_envs))
+        yield rows
 
 
 def training_row(
@@ -189,16 +234,20 @@ def training_row(
     return Row(env_name, name, num_envs, run, compile_seconds)
 
 
-def _train_baseline(task: str, num_envs: int, threads: int, pipe: Any) -> None:
+def _train_baseline(
+    task: str, num_envs: int, spread: bool, threads: int, pipe: Any
+) -> None:
     """Train Stable-Baselines3's PPO in a process of its own, when it is told to."""
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
     # With more threads than cores, threads wait for each other.
     torch.set_num_threads(threads)
     # 2048 steps, 10 epochs and minibatches of 64 are its own values, and ours.
-    env = make_vec_env(task, num_envs)
+    kind = SubprocVecEnv if spread else DummyVecEnv
+    env = make_vec_env(task, num_envs, vec_env_cls=kind)
     model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, device="cpu")
     model.learn(2048)
     pipe.send("ready")
@@ -206,20 +255,33 @@ def _train_baseline(task: str, num_envs: int, threads: int, pipe: Any) -> None:
     began = time.perf_counter()
     model.learn(_BASELINE_STEPS)
     pipe.send(time.perf_counter() - began)
+    env.close()
 
 
-def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
-    """Stable-Baselines3's PPO, as many runs at once as there are processes."""
+def baseline_row(
+    env_name: str, runs: int, num_envs: int, *, spread: bool = False
+) -> Row:
+    """Stable-Baselines3's PPO.
+
+    Args:
+      env_name: name of the task.
+      runs: number of runs that train at once.
+      num_envs: number of environments of a run.
+      spread: give each environment a process of its own, not all of a run the same.
+    """
     task = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
     context = multiprocessing.get_context("spawn")
-    threads = max(1, available_cores() // processes)
+    threads = max(1, available_cores() // runs)
 
     def run() -> float:
         pipes = []
-        for _ in range(processes):
+        for _ in range(runs):
             mine, theirs = context.Pipe()
-            arguments = (task, num_envs, threads, theirs)
-            context.Process(target=_train_baseline, args=arguments, daemon=True).start()
+            arguments = (task, num_envs, spread, threads, theirs)
+            # A daemon may not have processes of its own.
+            context.Process(
+                target=_train_baseline, args=arguments, daemon=not spread
+            ).start()
             # Otherwise the end of a process that failed would go unnoticed.
             theirs.close()
             pipes.append(mine)
@@ -227,10 +289,11 @@ def baseline_row(env_name: str, processes: int, num_envs: int) -> Row:
             pipe.recv()
         for pipe in pipes:
             pipe.send("go")
-        return processes * _BASELINE_STEPS / max(pipe.recv() for pipe in pipes)
+        return runs * _BASELINE_STEPS / max(pipe.recv() for pipe in pipes)
 
+    processes = runs * num_envs if spread else runs
     name = f"stable-baselines3 ppo, {processes} process{'es'[: 2 * (processes > 1)]}"
-    return Row(env_name, name, processes * num_envs, run)
+    return Row(env_name, name, runs * num_envs, run)
 
 
 def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
@@ -239,8 +302,9 @@ def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     num_envs = options.seeds * (options.training_envs or config.num_envs)
     rows, devices = [], len(jax.devices())
     if importlib.util.find_spec("stable_baselines3"):
-        for processes in sorted({1, available_cores()}):
-            rows += [baseline_row(env_name, processes, n) for n in (1, 8)]
+        for runs in sorted({1, available_cores()}):
+            rows += [baseline_row(env_name, runs, n) for n in (1, 8)]
+        rows.append(baseline_row(env_name, 1, 8, spread=True))
     for variant in options.variants or ("ours", "mujoco"):
         row = physics_row(env_name, variant, num_envs)
         rows.append(dataclasses.replace(row, name=f"physics alone, {variant}"))

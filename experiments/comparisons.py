@@ -85,7 +85,8 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
 
     The p-value is the percentile bootstrap's: the share of draws on the other side of
     0, times two. That is too small where seeds are few, so that the difference of two
-    curves has the permutation test's if it is larger. In Holm's method the smallest is
+    curves has the permutation test's if it is larger. Differences of differences have
+    the bootstrap's alone. In Holm's method the smallest is
     multiplied by the number of comparisons, the next by one less, and none is smaller
     than the one before.
     """
@@ -115,7 +116,8 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) ->
 
     It is the probability that a seed of `ours` has more than one of `other`, in the
     mean over the panels, with the 95% percentile bootstrap interval over seeds, drawn
-    within each panel (Agarwal et al. 2021).
+    within each panel (Agarwal et al. 2021). A score that is not a number, of a seed
+    that ended no episode, is less than all others.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
 
@@ -129,7 +131,8 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) ->
     def resampled(values: np.ndarray) -> np.ndarray:
         return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
 
-    pairs = [(scores[panel, ours], scores[panel, other]) for panel in panels]
+    of = lambda panel, x: np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
+    pairs = [(of(panel, ours), of(panel, other)) for panel in panels]
     middle = np.mean([probability(*pair) for pair in pairs])
     drawn = [probability(*map(resampled, pair)) for pair in pairs]
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])

@@ -308,6 +308,7 @@ _PARTS = [
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
 _SCALED = Arm("ppo, decomposed, scaled", "ppo")
+_SCALED_ALONE = Arm("ppo, scaled", "ppo", {"decompose_rewards": False})
 _ADAPTIVE_WITH_AND_WITHOUT = (
     Arm(ADAPTIVE, ADAPTIVE),
     Arm(f"{ADAPTIVE} without imitation", ADAPTIVE, {"imitation_weight": 0.0}),
@@ -384,7 +385,7 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), panel="{env}", base=base)
             for arms, base in (
-                ([_SCALED], "scaled"),
+                ([_SCALED, _SCALED_ALONE], "scaled"),
                 (
                     [Arm("ppo, decomposed, best mean rank", "ppo")],
                     functools.partial(SingleSetting, decompose_rewards=True),
@@ -435,7 +436,6 @@ FIGURES: Mapping[str, Figure] = {
                 panel="{env}",
                 curve="{arm}-{delay}",
                 base=base,
-                seeds=5,
             )
             for arms, base in (
                 (PAIR, _usual_delay),

@@ -55,7 +55,7 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         for handles, names in shown
         for x, name in zip(handles, names, strict=True)
     }
-    if count > 1 and len(handle_of) > 4:
+    if count > 1 and len(handle_of) > 3:
         # So many names would hide the curves.
         below: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
         picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)

@@ -52,8 +52,10 @@ A final return is the interquartile mean over seeds of the mean return over the 
 tenth of training, of the episodes that the acting policy ended; in brackets its 95%
 interval, by the percentile bootstrap over seeds, which covers a little less with ten.
 Better and worse are verdicts on differences, by a permutation test and the bootstrap
-together, corrected by Holm's method for the {} comparisons of this page: with 95%
-probability none of them is wrong. "Not clear" does not mean that two are equal. The
+together (differences of differences: by the bootstrap alone), corrected by Holm's
+method for the {} comparisons of this page: where nothing differs, any verdict at all
+has a probability of 5%. They are about these settings; that another search might have
+chosen others is not in the intervals. "Not clear" does not mean that two are equal. The
 probability of improvement is that of a seed of one curve having more than one of the
 other, averaged over the tasks."""
 
@@ -113,8 +115,8 @@ class Results:
             jax = (by["versions"] or {}).get("jax")
             source = f"collected at {by.get('collected_at') or '?'}"
             if by["commit"]:
-                changed = ", changed" if by["clean"] is False else ""
-                source = f"commit {by['commit']}{changed}"
+                checked = {True: "", False: ", changed", None: ", not compared"}
+                source = f"commit {by['commit']}{checked[by['clean']]}"
             words = [by["physics"], jax and f"jax {jax}", by["device"], source]
             seeds_of.setdefault(", ".join(filter(None, words)), []).append(run.seed)
         if len(seeds_of) == 1:
@@ -231,9 +233,11 @@ class Page:
             if complete:
                 verdicts = [self.comparisons[p, ours, other].verdict for p in complete]
                 probability = improvement(self.scores, complete, ours, other)
+                lacking = len(with_other) - len(complete)
+                more = f", {lacking} not measured yet" if lacking else ""
                 lines.append(
-                    f"- {ours} against {other}: {counted(verdicts)} of "
-                    f"{len(complete)}; probability of improvement {probability}."
+                    f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
+                    f"{more}; probability of improvement {probability}."
                 )
         return "\n".join(lines)
 
@@ -388,7 +392,12 @@ class Page:
         total = sum(curve.seeds for _, _, curve in self.figure.curves())
         stored = [len(results.records) for results in self.results.values()]
         if missing := total - sum(stored):
-            parts.append(f"Not trained yet: {missing} of {total} runs.")
+            words = f"Not trained yet: {missing} of {total} runs"
+            searches = self.figure.searches.values()
+            runs = [run for x in searches for run in x.requested(self.searched)]
+            if searched := len(self.searched.missing(runs)):
+                words += f", and at least {searched} of the searches"
+            parts.append(f"{words}.")
         if self.results:
             parts += [_READING.format(len(self.comparisons)), "## Settings"]
             parts.append(self.settings())

@@ -21,6 +21,7 @@ from gasil_jax.host import output_file
 README = pathlib.Path(__file__).parent.parent / "README.md"
 #: A comparison of a page, and the verdict that the claim expects of it.
 _Expected = tuple[tuple[str, ...], str]
+_OPPOSITE = {"better": "worse", "worse": "better"}
 
 
 class Claim(NamedTuple):
@@ -62,7 +63,8 @@ _OTHERS, _CONTROL = ("ppo", "ppo+bc", "ppo+sil"), ("ppo+bonus",)
 _GROWS = [key for key in FIGURES["stochastic_walker2d"].compared() if len(key) == 4]
 CLAIMS = (
     Claim(
-        "Point mass: PPO+GASIL is slower at first and ends higher than PPO",
+        "Point mass, in a layout that was chosen for it: PPO+GASIL is slower at first "
+        "and ends higher than PPO",
         "point_mass",
         {
             "early": [(("point_mass", "ppo+gasil early", "ppo early"), "worse")],
@@ -131,6 +133,11 @@ class Summary:
         if not measured:
             return "not measured yet"
         agree = [case for case, agrees in measured.items() if agrees]
+        opposite = [
+            case
+            for case in measured
+            if any(compared[k].verdict == _OPPOSITE[x] for k, x in claim.cases[case])
+        ]
         lacking = len(claim.cases) - len(measured)
         if len(agree) >= claim.needed:
             word = "holds"
@@ -140,6 +147,8 @@ class Summary:
             word = "holds in part" if agree else "does not hold"
         words = f"{word}: in {len(agree)} of {len(measured)} cases"
         words += f" ({'; '.join(agree)})" if agree else ""
+        if opposite:
+            words += f"; the opposite in {len(opposite)} ({'; '.join(opposite)})"
         return words + (f"; {lacking} not measured yet" if lacking else "")
 
     def claims(self) -> str:

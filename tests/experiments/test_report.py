@@ -112,6 +112,10 @@ def test_the_probability_of_improvement_is_of_pairs_of_seeds():
     assert comparisons.improvement(data, "ab", "x", "y").startswith("0.81 [")
     assert comparisons.improvement(data, "ab", "y", "x").startswith("0.19 [")
     assert comparisons.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
+    # A seed that ended no episode has less than any other, on either side.
+    none = {**data, ("b", "y"): np.array([np.nan, np.nan])}
+    assert comparisons.improvement(none, "b", "x", "y") == "1.00 [1.00, 1.00]"
+    assert comparisons.improvement(none, "b", "y", "x") == "0.00 [0.00, 0.00]"
 
 
 def test_every_task_counts_alike_in_the_aggregate(tmp_path):
@@ -295,18 +299,24 @@ def test_a_block_is_made_anew():
     ("verdicts", "words"),
     [
         ([], "not measured yet"),
-        (["worse"], "open so far: in 0 of 1 cases; 2 not measured yet"),
+        (
+            ["worse"],
+            "open so far: in 0 of 1 cases; the opposite in 1 (0); 2 not measured yet",
+        ),
         (["better", "better"], "holds: in 2 of 2 cases (0; 1); 1 not measured yet"),
-        (["worse", "worse"], "does not hold: in 0 of 2 cases; 1 not measured yet"),
-        (["worse", "better", "worse"], "holds in part: in 1 of 3 cases (1)"),
+        (["not clear"] * 2, "does not hold: in 0 of 2 cases; 1 not measured yet"),
+        (
+            ["worse", "better", "worse"],
+            "holds in part: in 1 of 3 cases (1); the opposite in 2 (0; 2)",
+        ),
     ],
 )
 def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words):
     made = summary.Summary(STORE)
     keys = [("panel", "ppo+gasil", f"other {i}") for i in range(3)]
-    middle = {"better": 1.0, "worse": -1.0}
+    of = {"better": (1.0, 0.0), "worse": (-1.0, 0.0), "not clear": (1.0, 1.0)}
     made.pages["matrix"].comparisons = {
-        key: comparisons.Comparison(middle[verdict], 0.0, 0.0, 0.0)
+        key: comparisons.Comparison(of[verdict][0], 0.0, 0.0, of[verdict][1])
         for key, verdict in zip(keys, verdicts, strict=False)
     }
     cases = {f"{i}": [(key, "better")] for i, key in enumerate(keys)}
