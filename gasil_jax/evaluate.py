@@ -26,6 +26,7 @@ def evaluate_in_gymnasium(
     *,
     num_episodes: int,
     seed: int = 0,
+    num_steps: int | None = None,
 ) -> dict[str, np.ndarray]:
     """Run complete episodes of a policy in Gymnasium, with C MuJoCo.
 
@@ -34,13 +35,14 @@ def evaluate_in_gymnasium(
       act: observation -> action, as from `numpy_policy.load`.
       num_episodes: number of episodes, which run one after the other.
       seed: seed of the first episode; each next episode has the next seed.
+      num_steps: steps after which an episode is truncated; default the task's own.
 
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
     """
     import gymnasium
 
-    env = gymnasium.make(gymnasium_id)
+    env = gymnasium.make(gymnasium_id, max_episode_steps=num_steps)
     returns, lengths = [], []
     for episode in range(num_episodes):
         observation, _ = env.reset(seed=seed + episode)
@@ -112,6 +114,7 @@ def _score_in_gymnasium(options: Options, policies: Policies) -> dict[str, np.nd
             numpy_policy.make(weights),
             num_episodes=options.episodes,
             seed=options.key,
+            num_steps=policies.num_steps,
         )
         for weights in policies.weights
     ]
@@ -141,7 +144,9 @@ def _main(arguments: Sequence[str] | None) -> None:
         )
     if not options.gymnasium:
         with command_line.input_checked():
-            resources.check_episodes(env, options.episodes, len(seeds), jax.devices())
+            resources.check_episodes(
+                env, options.episodes, len(seeds), jax.devices()[:1]
+            )
     if options.out is not None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")

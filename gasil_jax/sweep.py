@@ -158,6 +158,9 @@ def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
         options.first_seed,
         options.config.agent,
     )
+    idle = [x for point in points for x in point if x.startswith("decomposition_")]
+    if idle and not options.config.decompose_rewards:
+        raise InputError(f"{idle[0]} can't vary: decompose_rewards is off")
     for point in points:
         config = options.config.replace(**point)
         run_options.check(dataclasses.replace(options, config=config))

@@ -68,13 +68,15 @@ def _check_states(name: str, env: Env) -> None:
     limited = wrappers.EpisodeLimit(env, 1)
     action = jnp.zeros(env.action_size)
     try:
+        bare = jax.eval_shape(env.reset, jax.random.key(0))
+        stepped = jax.eval_shape(env.step, bare, action)
         first = jax.eval_shape(limited.reset, jax.random.key(0))
         then = jax.eval_shape(limited.step, first, action)
     except Exception as error:
         raise ValueError(
             f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
         ) from None
-    for state, where in ((first, "reset"), (then, "step")):
+    for state, where in ((bare, "reset"), (stepped, "step")):
         expected = {"obs": (env.observation_size,), "reward": (), "done": ()}
         for field, shape in expected.items():
             value = getattr(state, field)
@@ -83,6 +85,11 @@ def _check_states(name: str, env: Env) -> None:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} has the shape {given}, "
                     f"must have {shape}"
+                )
+            if value.dtype != jnp.float32:
+                raise ValueError(
+                    f"env {name!r}: the {field} of its {where} is {value.dtype}, must "
+                    "be float32"
                 )
     flat = [
         {jax.tree_util.keystr(path): leaf for path, leaf in leaves}

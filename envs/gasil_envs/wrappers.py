@@ -67,19 +67,24 @@ class RewardDelay(Wrapper):
 
     Paper, section 5.4. Over an episode, the rewards given sum to the rewards earned.
     ``info["true_reward"]`` is the reward of each step without delay, which evaluations
-    use.
+    use; an environment that gives its own keeps it.
     """
 
     def __init__(self, env: Env, delay: int):
         super().__init__(env)
         self.delay = delay
+        first = jax.eval_shape(env.reset, jax.random.key(0))
+        self._gives_true_reward = "true_reward" in first.info
+
+    def _true_reward(self, state: State) -> jax.Array:
+        return state.info["true_reward"] if self._gives_true_reward else state.reward
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode with nothing held back."""
         state = self.env.reset(rng)
         info = {
             **state.info,
-            "true_reward": jnp.zeros_like(state.reward),
+            "true_reward": self._true_reward(state),
             "held_reward": jnp.zeros_like(state.reward),
             "delay_steps": jnp.int32(0),
         }
@@ -93,7 +98,7 @@ class RewardDelay(Wrapper):
         give = (steps % self.delay == 0) | (state.done > 0)
         info = {
             **state.info,
-            "true_reward": state.reward,
+            "true_reward": self._true_reward(state),
             "held_reward": jnp.where(give, 0.0, held),
             "delay_steps": steps,
         }

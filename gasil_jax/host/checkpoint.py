@@ -54,7 +54,9 @@ def save(folder: pathlib.Path, state: Any) -> None:
 
 
 def restore(folder: pathlib.Path, like: Any) -> Any:
-    """Read a state that `save` wrote.
+    """Read a state that `save` wrote, as NumPy arrays and random keys.
+
+    All members together may be too large for one device.
 
     Args:
       folder: the folder that `save` wrote to.
@@ -78,7 +80,7 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     values = [
         jax.random.wrap_key_data(arrays[jax.tree_util.keystr(path)])
         if _is_key(x)
-        else jnp.asarray(arrays[jax.tree_util.keystr(path)])
+        else np.asarray(arrays[jax.tree_util.keystr(path)])
         for path, x in leaves
     ]
     return jax.tree.unflatten(structure, values)

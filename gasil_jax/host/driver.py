@@ -224,6 +224,12 @@ def _restored(
     checkpoint.delete_partial(root)
     checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
     if newest is None:
+        if not damages and (root.parent / "metrics.csv").exists():
+            print(
+                f"warning: {root.parent} has no checkpoint: starting anew, the old "
+                "tables are kept under other names",
+                file=sys.stderr,
+            )
         return None, 0, None
     with progress.aside(f"restoring {newest.folder.name}"):
         like = jax.eval_shape(lambda: members.trim(members.init()))

@@ -191,8 +191,14 @@ class Members:
 
     def to_devices(self, states: Any) -> Any:
         """Return the members' arrays, (members, ...), padded and on their devices."""
-        pad = lambda x: jnp.concatenate([x, *[x[-1:]] * self._padding])
-        return jax.device_put(jax.tree.map(pad, states), self.sharding)
+
+        def place(x: Any) -> jax.Array:
+            # Not on one device first, whose memory may hold only its share.
+            join = np.concatenate if isinstance(x, np.ndarray) else jnp.concatenate
+            padded = join([x, *[x[-1:]] * self._padding]) if self._padding else x
+            return jax.device_put(padded, self.sharding)
+
+        return jax.tree.map(place, states)
 
     def trim(self, states: Any) -> Any:
         """Return the members' arrays without the padding: (members, ...)."""

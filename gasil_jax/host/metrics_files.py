@@ -1,9 +1,11 @@
 """Write and read the files of a run folder: JSON files and tables in CSV."""
 
+import array
 import csv
 import dataclasses
 import importlib.metadata
 import json
+import math
 import os
 import pathlib
 import platform
@@ -189,12 +191,18 @@ def read_metrics(
     first = len(labels)
     try:
         with path.open(newline="") as file:
-            header, *rows = csv.reader(file)
-        values = np.array(
-            [[float(cell) if cell else np.nan for cell in row[first:]] for row in rows]
-        ).reshape(-1, num_members, len(header) - first)
-        if not len(values):
+            header: list[str] = []
+            cells = array.array("d")
+            # A table may be large: only its numbers are kept.
+            for number, row in enumerate(csv.reader(file)):
+                header = header or row
+                if len(row) != len(header):
+                    raise ValueError(f"row {number} has {len(row)} cells")
+                if number:
+                    cells.extend(float(x) if x else math.nan for x in row[first:])
+        if not cells:
             raise ValueError("it has no rows")
+        values = np.array(cells).reshape(-1, num_members, len(header) - first)
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged: {error}") from None
     metrics = {name: values[:, :, i].T for i, name in enumerate(header[first:])}

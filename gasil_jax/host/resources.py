@@ -55,12 +55,16 @@ def need(env: Any, config: Config) -> Need:
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
-    """Return the free memory of these devices in bytes, or None if it is unknown."""
+    """Return the bytes that equal shares on these devices may have together.
+
+    The device with the least free memory decides; None if it is unknown.
+    """
     if devices[0].platform != "cpu":
-        stats = devices[0].memory_stats() or {}
-        if "bytes_limit" not in stats:
+        every = [device.memory_stats() or {} for device in devices]
+        if any("bytes_limit" not in stats for stats in every):
             return None
-        return len(devices) * (stats["bytes_limit"] - stats.get("bytes_in_use", 0))
+        free = [x["bytes_limit"] - x.get("bytes_in_use", 0) for x in every]
+        return len(devices) * min(free)
     free = []
     for read in (_free_on_the_machine, _free_in_the_container):
         # A file is missing, or there is no limit.
@@ -87,6 +91,11 @@ def _free_in_the_container(group: pathlib.Path = _CONTROL_GROUP) -> int:
     return limit - used + int(cached)
 
 
+def _padded(count: int, devices: Sequence[jax.Device]) -> int:
+    """Return the number of members with those that make all devices' shares equal."""
+    return math.ceil(count / len(devices)) * len(devices)
+
+
 def check_memory(
     env: Any, config: Config, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
@@ -96,13 +105,13 @@ def check_memory(
       env: one environment.
       config: the config of the runs.
       num_members: number of members that are trained at once.
-      devices: the devices that they are sharded over.
+      devices: the devices that they are sharded over, at most one for each member.
 
     Raises:
       ValueError: if it does not fit; the message gives the sizes.
     """
-    one = need(env, config)
-    required, free = num_members * one.memory, available(devices)
+    one, used = need(env, config), devices[:num_members]
+    required, free = _padded(num_members, used) * one.memory, available(used)
     if free is not None and required > free:
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
@@ -126,14 +135,16 @@ def check_episodes(
       env: one environment.
       num_episodes: number of episodes of each policy.
       num_policies: number of policies that are evaluated at once.
-      devices: the devices that they run on.
+      devices: the devices that they are sharded over, at most one for each policy.
       option: name of the option that sets the number of episodes.
 
     Raises:
       ValueError: if they do not fit; the message gives the sizes.
     """
     state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
-    required, free = _STATES * state * num_episodes * num_policies, available(devices)
+    used = devices[:num_policies]
+    each, free = _STATES * state * num_episodes, available(used)
+    required = _padded(num_policies, used) * each
     if free is not None and required > free:
         raise ValueError(
             f"{option} is {num_episodes}: of {num_policies} policies side by side they "

@@ -27,12 +27,14 @@ def check(out: pathlib.Path, resume: bool) -> None:
     """Check that a run can use the folder; leaves nothing but a lock file.
 
     Raises:
-      InputError: if it can't be written, if another process uses it, or if it is not
-        empty and `resume` is false.
+      InputError: if it can't be written, if another process uses it, if it is not
+        empty and `resume` is false, or if its training has ended and can't continue.
     """
     if out.is_dir():
         with lock(create(out, "")):
-            if not (resume and is_described(out)):
+            if resume and is_described(out):
+                _refuse_without_checkpoints(out)
+            else:
                 refuse_used(out)
         return
     existing = out
@@ -43,6 +45,19 @@ def check(out: pathlib.Path, resume: bool) -> None:
             pass
     except OSError as error:
         raise InputError(unwritable(out, error)) from None
+
+
+def _refuse_without_checkpoints(out: pathlib.Path) -> None:
+    """Refuse to replace the results of training whose checkpoints are gone."""
+    is_run = not (out / "results.csv").exists()
+    ended = [out] if is_run and (out / "summary.json").exists() else []
+    ended += [path.parent for path in out.glob("programs/*/training.json")]
+    for folder in ended:
+        if not any((folder / "checkpoints").glob("*")):
+            raise InputError(
+                f"out is {out}: training in {folder} has ended and its checkpoints are "
+                "gone, so that it can't continue: name another folder"
+            )
 
 
 def create(out: pathlib.Path | None, name: str, *, option: str = "out") -> pathlib.Path:

@@ -48,9 +48,9 @@ class Options:
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the hyperparameters to start from: tuned, by environment and agent;
-        decomposed, for PPO that decomposes delayed rewards; or paper, with the
-        paper's single environment per seed, which is slow where seeds are few. Flags
-        override them.
+        decomposed, for PPO that decomposes delayed rewards; scaled, the same with one
+        setting for all locomotion tasks; or paper, with the paper's single environment
+        per seed, which is slow where seeds are few. Flags override them.
       devices: number of host devices to spread the seeds over; default one for each
         core.
       settings: settings of the environment.
@@ -220,6 +220,12 @@ def tell_without_effect(options: Options, num_members: int) -> None:
         options.env, config.agent, options.preset, settings.reward_delay
     )
     now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
+    if not config.decompose_rewards:
+        for name in sorted(now):
+            if name.startswith("decomposition_") and now[name] != before[name]:
+                command_line.note(
+                    f"{name} is {now[name]}, to no effect: decompose_rewards is off"
+                )
     for name in sorted(unused(config.agent)):
         if now[name] != before[name]:
             command_line.note(

@@ -307,13 +307,14 @@ _bonus_alone = lambda reward, bonus: bonus
 FIELDS = (
     "bonus",
     "discriminator_learning_rate",
+    "discriminator_hidden_sizes",
     "discriminator_entropy_coefficient",
     "discriminator_updates",
     "discriminator_minibatch_size",
     "discriminator_gradient_penalty",
     "discriminator_normalizes_actions",
 )
-_FIELDS = ("alpha", *FIELDS)
+_FIELDS = ("alpha", "alpha_schedule", *FIELDS)
 _FIELDS_OF_BUFFER = (*_FIELDS, *good_trajectories.FIELDS)
 
 #: r - alpha log D (section 4.3).

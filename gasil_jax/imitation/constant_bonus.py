@@ -16,4 +16,6 @@ def _reward_and_constant(
     return state, context.rollout.reward + context.hyperparameters.alpha, {}
 
 
-PPO_BONUS = Imitation(no_state, _reward_and_constant, leave_policy, fields=("alpha",))
+PPO_BONUS = Imitation(
+    no_state, _reward_and_constant, leave_policy, fields=("alpha", "alpha_schedule")
+)

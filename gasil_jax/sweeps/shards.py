@@ -132,7 +132,13 @@ def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
 
 
 def refuse_sharded(out: pathlib.Path) -> None:
-    """Raise `InputError` if the folder holds a sweep with shards."""
+    """Raise `InputError` if the folder holds shards of a sweep, or their tables."""
+    merged = (out / "results.csv").exists() and not (out / "programs").is_dir()
+    if merged and not root(out).is_dir():
+        raise InputError(
+            f"out is {out}, which holds the tables of shards in other folders: "
+            "continue each of them with --resume, then run python -m gasil_jax.merge"
+        )
     if root(out).is_dir():
         raise InputError(
             f"out is {out}, which holds shards: continue each of them with --shard and "

@@ -30,6 +30,15 @@ def test_a_saved_state_is_loaded_bit_by_bit(trained_point_mass, tmp_path):
     )
 
 
+def test_gymnasiums_episodes_have_the_runs_limit():
+    rest = lambda observation: np.zeros(2)
+    for limit, length in ((7, 7), (None, 1000)):
+        scores = evaluate.evaluate_in_gymnasium(
+            "Swimmer-v5", rest, num_episodes=1, num_steps=limit
+        )
+        assert scores["episode_length"] == [length]
+
+
 def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
     _, _, states = trained_point_mass
     checkpoint.save(tmp_path / "state", states)

@@ -280,6 +280,15 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
         (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
         (_OWN.replace("obs=a", "obs={'x': a}"), r"step has the shape dict, .* \(2,\)"),
         (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
+        (_OWN.replace("zeros(2)", "zeros(2, int)"), "obs of its reset is int32, must"),
+        (
+            _OWN.replace("reward=reward", "reward=reward > 0"),
+            "the reward of its step is bool, must be float32",
+        ),
+        (
+            _OWN.replace("reward=reward", "reward=reward, done=reward > 0"),
+            "the done of its step is bool, must be float32",
+        ),
         (
             _OWN.replace("pipeline_state + 1", "pipeline_state + 0.5"),
             r"state.pipeline_state is int32\[\] in its reset and float32\[\] in",

@@ -56,6 +56,26 @@ def test_delayed_reward_loses_nothing(delay, terminates, limit):
     assert states.done[-1] == 1.0 and not states.done[:-1].any()
 
 
+class WithTrueReward(Scripted):
+    """Its reward is shaped; the true one is 1 in every third step."""
+
+    def reset(self, rng):
+        return super().reset(rng).replace(info={"true_reward": jnp.float32(0)})
+
+    def step(self, state, action):
+        state = super().step(state, action)
+        true = (state.pipeline_state % 3 == 0).astype(jnp.float32)
+        return state.replace(info={**state.info, "true_reward": true})
+
+
+def test_an_environments_own_true_reward_survives_a_delay():
+    env = wrappers.EpisodeLimit(WithTrueReward(100), 6)
+    start, states = roll(wrappers.RewardDelay(env, 2), 6)
+    assert start.info["true_reward"] == 0.0
+    np.testing.assert_array_equal(states.info["true_reward"], [0, 0, 1, 0, 0, 1])
+    np.testing.assert_array_equal(states.reward, [0, 3, 0, 7, 0, 11])
+
+
 def test_the_limit_truncates_and_an_end_does_not():
     _, cut = roll(wrappers.EpisodeLimit(Scripted(100), 4), 4)
     np.testing.assert_array_equal(cut.done, [0, 0, 0, 1])

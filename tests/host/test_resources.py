@@ -78,6 +78,36 @@ def test_a_container_has_what_others_in_it_leave(tmp_path):
         resources._free_in_the_container(tmp_path)
 
 
+class Device:
+    platform = "gpu"
+
+    def __init__(self, used):
+        self.used = used
+
+    def memory_stats(self):
+        return {"bytes_limit": 100_000, "bytes_in_use": self.used}
+
+
+def test_members_have_equal_shares_of_the_devices_that_are_used(monkeypatch):
+    """One that is larger than a device does not fit eight, nor nine half as large."""
+    devices = [Device(20_000), *[Device(10_000)] * 7]
+    assert resources.available(devices) == 8 * 80_000
+    assert resources.available(devices[1:2]) == 90_000
+    fits = lambda size, count: (
+        monkeypatch.setattr(resources, "need", lambda *_: resources.Need(0, size)),
+        resources.check_memory(None, gasil_jax.Config(), count, devices),
+    )
+    fits(80_000, 8)
+    fits(40_000, 16)
+    for size, count in ((81_000, 1), (81_000, 8), (41_000, 9)):
+        with pytest.raises(ValueError, match=f"seeds are {count} "):
+            fits(size, count)
+    env = gasil_jax.make_env("point_mass")
+    resources.check_episodes(env, 100, 8, devices)
+    with pytest.raises(ValueError, match="episodes is 100: of 80 policies"):
+        resources.check_episodes(env, 100, 80, devices)
+
+
 def test_available_memory_is_read():
     free = resources.available(jax.devices())
     assert free is None or 10**7 < free < 10**14

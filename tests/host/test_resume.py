@@ -233,6 +233,10 @@ def test_resume_needs_a_folder(capsys):
     [
         (lambda path: path.unlink(), "lacks rows that the checkpoint has seen"),
         (
+            lambda path: path.write_text(path.read_text().replace(",", "", 9)),
+            "metrics.csv",
+        ),
+        (
             lambda path: path.write_text(path.read_text().replace(",0.", ",z.")),
             "metrics.csv",
         ),
@@ -257,6 +261,24 @@ def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
         for name in theirs:
             np.testing.assert_array_equal(ours[name], theirs[name])
     assert checkpoints(out) == checkpoints(whole)
+
+
+def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    shutil.rmtree(out / "checkpoints")
+    before = {x: x.read_bytes() for x in out.iterdir() if x.suffix in (".csv", ".npz")}
+    more = str((ITERATIONS + 5) * 128)
+    arguments = ["--resume", "--out", str(out), "--total-steps", more]
+    assert run.main(arguments) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert "has ended and its checkpoints are gone" in error
+    assert all(path.read_bytes() == content for path, content in before.items())
+    # Where it has not ended, its table is kept under another name.
+    (out / "summary.json").unlink()
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert "has no checkpoint: starting anew" in capsys.readouterr().err
+    assert (out / "metrics.csv").read_bytes() == before[out / "metrics.csv"]
+    assert (out / "metrics-cut-1.csv").exists()
 
 
 def test_total_steps_may_grow(whole, tmp_path):

@@ -133,6 +133,9 @@ def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
     apart = [str(path) for path in sorted((parts / "shards").iterdir())]
     for _ in range(2):
         assert merge.main([*apart, "--out", str(tmp_path / "apart")]) == 0
+    # There is nothing to continue, and the tables must stay.
+    assert sweep.main(["--resume", "--out", str(tmp_path / "apart")]) == 2
+    assert "the tables of shards in other folders" in capsys.readouterr().err
     for out in (parts, tmp_path / "apart"):
         for name in TABLES:
             whole = (tmp_path / "whole" / name).read_bytes()

@@ -137,6 +137,10 @@ def test_points_from_a_file(tmp_path):
         ("--grid alhpa=1", "did you mean 'alpha'"),
         ("--agent ppo --grid alpha=1", "agent 'ppo' does not look at it (one of learn"),
         ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not look at it"),
+        (
+            "--grid decomposition_learning_rate=1e-3,1e-4",
+            "decomposition_learning_rate can't vary: decompose_rewards is off",
+        ),
         ("--agent ppo --random 5", "random is 5: it must be at most 4"),
         ("--grid alpha=1,big", "it must be numbers, like alpha=0.1,0.2"),
         ("--grid buffer_steps=1.5", "whole numbers, like buffer_steps=10,20"),
