@@ -212,6 +212,9 @@ class Config:
     decomposition_window_steps: int = _count(32)
     """Steps that represent a window in a gradient step of that network: all of a
     window that has no more, and as many drawn at random of a longer one."""
+    decomposition_history_episodes: int = _count(1)
+    """Length of the history that windows are drawn from, in episodes of the largest
+    length, beside a batch. Where rewards come once an episode, 1 holds few windows."""
     decomposition_hidden_sizes: tuple[int, ...] = _count((100, 100))
     """Widths of the tanh layers of that network."""
     stagger_episodes: bool = True

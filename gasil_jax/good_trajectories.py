@@ -102,14 +102,17 @@ def init_history(
     max_episode_steps: int,
     observation_size: int,
     action_size: int,
+    *,
     keep_next: bool = False,
+    num_episodes: int = 1,
 ) -> History:
     """Return an empty history, long enough for every episode that ends in a batch.
 
-    Its length H is a multiple of `num_steps`, so that a batch is written in one piece.
-    With `keep_next` it also keeps the observations after each action.
+    Its length H is a multiple of `num_steps`, so that a batch is written in one piece,
+    and that of at least `num_episodes` episodes and a batch. With `keep_next` it also
+    keeps the observations after each action.
     """
-    batches = -(-(max_episode_steps + num_steps) // num_steps)
+    batches = -(-(num_episodes * max_episode_steps + num_steps) // num_steps)
     length = batches * num_steps
     # Each field needs its own array: a shared one could not be donated.
     observations = lambda: jnp.zeros((num_envs, length, observation_size), jnp.float32)

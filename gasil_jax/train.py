@@ -98,6 +98,9 @@ def init(
         episode_steps,
         *sizes,
         keep_next=config.decompose_rewards,
+        num_episodes=(
+            config.decomposition_history_episodes if config.decompose_rewards else 1
+        ),
     )
     return TrainState(
         actor_critic=_init_actor_critic(
