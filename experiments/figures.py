@@ -309,6 +309,11 @@ _PARTS = [
 ]
 _SCALED = Arm("ppo, decomposed, scaled", "ppo")
 _SCALED_ALONE = Arm("ppo, scaled", "ppo", {"decompose_rewards": False})
+_SCALED_LONG = Arm(
+    f"{_SCALED.name}, long history", "ppo", {"decomposition_history_episodes": 4}
+)
+#: The last is the whole episode.
+_DELAYS = (1, 5, DELAY, 100, 1000)
 _ADAPTIVE_WITH_AND_WITHOUT = (
     Arm(ADAPTIVE, ADAPTIVE),
     Arm(f"{ADAPTIVE} without imitation", ADAPTIVE, {"imitation_weight": 0.0}),
@@ -429,18 +434,13 @@ FIGURES: Mapping[str, Figure] = {
         "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
         "",
         joined(
-            grid(
-                TASKS[:3],
-                arms,
-                (1, 5, DELAY, 100, 1000),
-                panel="{env}",
-                curve="{arm}-{delay}",
-                base=base,
-            )
-            for arms, base in (
-                (PAIR, _usual_delay),
-                ((ADAPTIVE,), "tuned"),
-                ([_SCALED], "scaled"),
+            grid(tasks, arms, delays, panel="{env}", curve="{arm}-{delay}", base=base)
+            for tasks, arms, delays, base in (
+                (TASKS[:3], PAIR, _DELAYS, _usual_delay),
+                (TASKS[:3], (ADAPTIVE,), _DELAYS, "tuned"),
+                (TASKS[:3], [_SCALED], _DELAYS, "scaled"),
+                # The others' episodes are shorter at first.
+                (("halfcheetah",), [_SCALED_LONG], _DELAYS[-1:], "scaled"),
             )
         ),
         favourite=_SCALED.name,

@@ -109,6 +109,40 @@ def decompose_all(batches, failed=()):
         yield decomposition, history, np.asarray(reward), metrics
 
 
+@pytest.mark.parametrize(("num_episodes", "complete"), [(1, 1), (4, 4)])
+def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, complete):
+    """A window as long as an episode is complete only where all of it is kept."""
+    history = good_trajectories.init_history(
+        1, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True, num_episodes=num_episodes
+    )
+    most = 0
+    for batch in range(30):
+        step = batch * NUM_STEPS + jnp.arange(NUM_STEPS)[:, None]
+        ended = (step + 1) % LIMIT == 0
+        zeros = jnp.zeros((NUM_STEPS, 1, OBS))
+        history = good_trajectories.record(
+            history, zeros, zeros[..., :ACT], ended * 1.0, ended, zeros
+        )
+        recorded = jnp.int32((batch + 1) * NUM_STEPS)
+        found = reward_decomposition.windows(history, recorded)
+        most = max(most, int(found.ends.sum()))
+        assert (found.length[found.ends] == LIMIT).all()
+    assert most == complete
+
+
+def test_the_length_of_the_history_follows_the_configuration():
+    env = gasil_jax.make_env("point_mass")
+    length = lambda **changes: jax.eval_shape(
+        lambda: gasil_jax.init(env, CONFIG.replace(**changes), jax.random.key(0))
+    ).history.reward.shape[1]
+    episode = env.episode_length
+    assert length() == -(-(episode + NUM_STEPS) // NUM_STEPS) * NUM_STEPS
+    longer = length(decomposition_history_episodes=3)
+    assert longer == -(-(3 * episode + NUM_STEPS) // NUM_STEPS) * NUM_STEPS
+    plain = {"decompose_rewards": False, "decomposition_history_episodes": 3}
+    assert length(**plain) == length()
+
+
 def test_windows_of_the_history_are_those_of_a_plain_loop():
     batches = list(random_batches(0, 9))
     steps = []
