@@ -434,13 +434,22 @@ FIGURES: Mapping[str, Figure] = {
         "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
         "",
         joined(
-            grid(tasks, arms, delays, panel="{env}", curve="{arm}-{delay}", base=base)
-            for tasks, arms, delays, base in (
-                (TASKS[:3], PAIR, _DELAYS, _usual_delay),
-                (TASKS[:3], (ADAPTIVE,), _DELAYS, "tuned"),
-                (TASKS[:3], [_SCALED], _DELAYS, "scaled"),
+            grid(
+                tasks,
+                [arm],
+                delays,
+                panel="{env}",
+                curve="{arm}-{delay}",
+                base=base,
+                seeds=5 if arm == ADAPTIVE else 10,
+            )
+            for tasks, arm, delays, base in (
+                (TASKS[:3], "ppo", _DELAYS, _usual_delay),
+                (TASKS[:3], "ppo+gasil", _DELAYS, _usual_delay),
+                (TASKS[:3], ADAPTIVE, _DELAYS, "tuned"),
+                (TASKS[:3], _SCALED, _DELAYS, "scaled"),
                 # The others' episodes are shorter at first.
-                (("halfcheetah",), [_SCALED_LONG], _DELAYS[-1:], "scaled"),
+                (("halfcheetah",), _SCALED_LONG, _DELAYS[-1:], "scaled"),
             )
         ),
         favourite=_SCALED.name,
