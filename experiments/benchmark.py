@@ -274,14 +274,16 @@ def baseline_row(
     threads = max(1, available_cores() // runs)
 
     def run() -> float:
-        pipes = []
+        pipes, processes = [], []
         for _ in range(runs):
             mine, theirs = context.Pipe()
             arguments = (task, num_envs, spread, threads, theirs)
             # A daemon may not have processes of its own.
-            context.Process(
+            process = context.Process(
                 target=_train_baseline, args=arguments, daemon=not spread
-            ).start()
+            )
+            process.start()
+            processes.append(process)
             # Otherwise the end of a process that failed would go unnoticed.
             theirs.close()
             pipes.append(mine)
@@ -289,10 +291,14 @@ def baseline_row(
             pipe.recv()
         for pipe in pipes:
             pipe.send("go")
-        return runs * _BASELINE_STEPS / max(pipe.recv() for pipe in pipes)
+        seconds = max(pipe.recv() for pipe in pipes)
+        # The next row must not run beside their end.
+        for process in processes:
+            process.join()
+        return runs * _BASELINE_STEPS / seconds
 
-    processes = runs * num_envs if spread else runs
-    name = f"stable-baselines3 ppo, {processes} process{'es'[: 2 * (processes > 1)]}"
+    count = runs * num_envs if spread else runs
+    name = f"stable-baselines3 ppo, {count} process{'es'[: 2 * (count > 1)]}"
     return Row(env_name, name, runs * num_envs, run)
 
 
