@@ -112,6 +112,10 @@ def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
     return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
 
 
+def _keys(number: int, count: int) -> jax.Array:
+    return jax.random.split(jax.random.key(number), count)
+
+
 def _speed(call: Callable[[], Any], steps: int) -> float:
     """Return the steps per second of a call that takes so many steps."""
     began = time.perf_counter()
@@ -129,16 +133,15 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
             function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
         )
     )
-    keys = lambda number, count: jax.random.split(jax.random.key(number), count)
-    states = shard(jax.vmap(env.reset))(keys(0, num_envs))
+    states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
     rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
     began = time.perf_counter()
-    advance = rollout.lower((states, keys(0, count))).compile()
+    advance = rollout.lower((states, _keys(0, count))).compile()
     compile_seconds = time.perf_counter() - began
     # Not from the start, because most bodies have fallen to the ground after a while.
-    states, _ = jax.block_until_ready(advance((states, keys(0, count))))
+    states, _ = jax.block_until_ready(advance((states, _keys(0, count))))
 
-    rollouts = lambda: advance((states, keys(1, count)))
+    rollouts = lambda: advance((states, _keys(1, count)))
     run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, variant, num_envs, run, compile_seconds)
 
@@ -165,16 +168,15 @@ def warp_row(env_name: str, num_envs: int) -> Row:
         physics = env.reset(key).pipeline_state.physics
         return blank.replace(qpos=physics.qpos, qvel=physics.qvel)
 
-    keys = lambda number, count: jax.random.split(jax.random.key(number), count)
     rollout = jax.jit(lambda data, keys: jax.lax.scan(random_step, data, keys)[0])
-    states = jax.vmap(start)(keys(0, num_envs))
+    states = jax.vmap(start)(_keys(0, num_envs))
     began = time.perf_counter()
-    advance = rollout.lower(states, keys(0, _NUM_STEPS)).compile()
-    states = jax.block_until_ready(advance(states, keys(0, _NUM_STEPS)))
+    advance = rollout.lower(states, _keys(0, _NUM_STEPS)).compile()
+    states = jax.block_until_ready(advance(states, _keys(0, _NUM_STEPS)))
     # Warp compiles its kernels at the first call.
     compile_seconds = time.perf_counter() - began
 
-    rollouts = lambda: advance(states, keys(1, _NUM_STEPS))
+    rollouts = lambda: advance(states, _keys(1, _NUM_STEPS))
     run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, "warp", num_envs, run, compile_seconds)
 

@@ -436,20 +436,19 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(
                 tasks,
-                [arm],
+                arms,
                 delays,
                 panel="{env}",
                 curve="{arm}-{delay}",
                 base=base,
-                seeds=5 if arm == ADAPTIVE else 10,
+                seeds=seeds,
             )
-            for tasks, arm, delays, base in (
-                (TASKS[:3], "ppo", _DELAYS, _usual_delay),
-                (TASKS[:3], "ppo+gasil", _DELAYS, _usual_delay),
-                (TASKS[:3], ADAPTIVE, _DELAYS, "tuned"),
-                (TASKS[:3], _SCALED, _DELAYS, "scaled"),
+            for tasks, arms, delays, base, seeds in (
+                (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
+                (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
+                (TASKS[:3], [_SCALED], _DELAYS, "scaled", 10),
                 # The others' episodes are shorter at first.
-                (("halfcheetah",), _SCALED_LONG, _DELAYS[-1:], "scaled"),
+                (("halfcheetah",), [_SCALED_LONG], _DELAYS[-1:], "scaled", 10),
             )
         ),
         favourite=_SCALED.name,

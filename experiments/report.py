@@ -247,8 +247,8 @@ class Page:
         A seed's return is divided by the interquartile mean of the curve `unit` in the
         panel of the same task with dense rewards. Then every task counts alike in the
         interquartile mean over all seeds of all tasks; its 95% interval is the
-        percentile bootstrap's over seeds, drawn within each task; the unit is taken as
-        known. The curves must have scores on all of these tasks, dense or delayed.
+        percentile bootstrap's over seeds, drawn within each task; the unit is not
+        drawn anew. The curves must have scores on all of these tasks, dense or delayed.
         """
         dense: dict[str, list[str]] = {}
         for panel, curves in self.figure.panels.items():

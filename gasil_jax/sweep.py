@@ -158,10 +158,10 @@ def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
         options.first_seed,
         options.config.agent,
     )
-    idle = [x for point in points for x in point if x.startswith("decomposition_")]
-    if idle and not options.config.decompose_rewards:
-        raise InputError(f"{idle[0]} can't vary: decompose_rewards is off")
+    unused = run_options.unused_fields(options.config)
     for point in points:
+        if name := next((name for name in point if name in unused), None):
+            raise InputError(f"{name} can't vary: {unused[name]}")
         config = options.config.replace(**point)
         run_options.check(dataclasses.replace(options, config=config))
     programs = shards.programs(

@@ -191,14 +191,10 @@ class Members:
 
     def to_devices(self, states: Any) -> Any:
         """Return the members' arrays, (members, ...), padded and on their devices."""
-
-        def place(x: Any) -> jax.Array:
-            # Not on one device first, whose memory may hold only its share.
-            join = np.concatenate if isinstance(x, np.ndarray) else jnp.concatenate
-            padded = join([x, *[x[-1:]] * self._padding]) if self._padding else x
-            return jax.device_put(padded, self.sharding)
-
-        return jax.tree.map(place, states)
+        padded = np.arange(self.num_members + self._padding)
+        index = np.minimum(padded, self.num_members - 1)
+        # Not on one device first, whose memory may hold only its share.
+        return jax.tree.map(lambda x: jax.device_put(x[index], self.sharding), states)
 
     def trim(self, states: Any) -> Any:
         """Return the members' arrays without the padding: (members, ...)."""

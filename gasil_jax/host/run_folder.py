@@ -49,11 +49,10 @@ def check(out: pathlib.Path, resume: bool) -> None:
 
 def _refuse_without_checkpoints(out: pathlib.Path) -> None:
     """Refuse to replace the results of training whose checkpoints are gone."""
-    is_run = not (out / "results.csv").exists()
-    ended = [out] if is_run and (out / "summary.json").exists() else []
-    ended += [path.parent for path in out.glob("programs/*/training.json")]
-    for folder in ended:
-        if not any((folder / "checkpoints").glob("*")):
+    # Of a run, or of each program of a sweep.
+    for folder in (path.parent for path in out.rglob("metrics.csv")):
+        ended = any((folder / x).exists() for x in ("summary.json", "training.json"))
+        if ended and not any((folder / "checkpoints").glob("*")):
             raise InputError(
                 f"out is {out}: training in {folder} has ended and its checkpoints are "
                 "gone, so that it can't continue: name another folder"

@@ -205,6 +205,17 @@ def check(options: Options) -> None:
     run_folder.check_seeds(options.seeds, options.first_seed)
 
 
+def unused_fields(config: Config) -> dict[str, str]:
+    """Return the names of the fields that have no effect, each with the reason."""
+    reason = f"agent {config.agent!r} does not use it"
+    fields = dict.fromkeys(unused(config.agent), reason)
+    if not config.decompose_rewards:
+        for name in run_folder.flat(vars(config)):
+            if name.startswith("decomposition_"):
+                fields[name] = "decompose_rewards is off"
+    return fields
+
+
 def tell_without_effect(options: Options, num_members: int) -> None:
     """Print a note for each option that differs from its default to no effect.
 
@@ -220,18 +231,9 @@ def tell_without_effect(options: Options, num_members: int) -> None:
         options.env, config.agent, options.preset, settings.reward_delay
     )
     now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
-    if not config.decompose_rewards:
-        for name in sorted(now):
-            if name.startswith("decomposition_") and now[name] != before[name]:
-                command_line.note(
-                    f"{name} is {now[name]}, to no effect: decompose_rewards is off"
-                )
-    for name in sorted(unused(config.agent)):
+    for name, reason in sorted(unused_fields(config).items()):
         if now[name] != before[name]:
-            command_line.note(
-                f"{name} is {now[name]}, to no effect: agent {config.agent!r} does not "
-                "use it"
-            )
+            command_line.note(f"{name} is {now[name]}, to no effect: {reason}")
     if options.devices is not None and options.devices > num_members:
         command_line.note(
             f"devices is {options.devices}, of which {num_members} are used, one for "

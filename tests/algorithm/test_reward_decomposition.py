@@ -124,9 +124,9 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
             history, zeros, zeros[..., :ACT], ended * 1.0, ended, zeros
         )
         recorded = jnp.int32((batch + 1) * NUM_STEPS)
-        found = reward_decomposition.windows(history, recorded)
-        most = max(most, int(found.ends.sum()))
-        assert (found.length[found.ends] == LIMIT).all()
+        windows = reward_decomposition.windows(history, recorded)
+        most = max(most, int(windows.ends.sum()))
+        assert (windows.length[windows.ends] == LIMIT).all()
     assert most == complete
 
 
