@@ -20,7 +20,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.imitation import agents, unused
+from gasil_jax.imitation import agents, find_agent, unused
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,10 +209,13 @@ def unused_fields(config: Config) -> dict[str, str]:
     """Return the names of the fields that have no effect, each with the reason."""
     reason = f"agent {config.agent!r} does not use it"
     fields = dict.fromkeys(unused(config.agent), reason)
-    if not config.decompose_rewards:
-        for name in run_folder.flat(vars(config)):
-            if name.startswith("decomposition_"):
-                fields[name] = "decompose_rewards is off"
+    names = [x for x in run_folder.flat(vars(config)) if x.startswith("decomposition_")]
+    if not find_agent(config.agent).uses_reward:
+        names += ["normalize_rewards", "decompose_rewards"]
+        reason = f"agent {config.agent!r} does not use the environment's reward"
+        fields |= dict.fromkeys(names, reason)
+    elif not config.decompose_rewards:
+        fields |= dict.fromkeys(names, "decompose_rewards is off")
     return fields
 
 

@@ -330,6 +330,7 @@ GASIL = Imitation(
     _update_and_reward(GOOD_TRAJECTORIES, _bonus_alone),
     leave_policy,
     fields=_FIELDS_OF_BUFFER,
+    uses_reward=False,
 )
 #: -alpha log D alone, D against expert trajectories (section 3.2).
 GAIL = Imitation(
@@ -338,4 +339,5 @@ GAIL = Imitation(
     leave_policy,
     _check_expert,
     _FIELDS,
+    uses_reward=False,
 )

@@ -82,6 +82,8 @@ class Imitation(NamedTuple):
       fields: names of the fields of `Config` and `Hyperparameters` that the method
         uses, besides those that PPO uses. A sweep over a field that the agent does
         not use is refused. None if the method does not say.
+      uses_reward: whether PPO maximizes the environment's reward, alone or with others.
+        Where it does not, settings that change the reward are told to have no effect.
       hyperparameters: the class of the agent's hyperparameters: `Hyperparameters`, or
         one that is derived from it and declares numbers of the agent's own.
       num_streams: number of reward streams.
@@ -99,6 +101,7 @@ class Imitation(NamedTuple):
     ]
     check: Callable[[Config, int, int], None] = check_without_expert
     fields: tuple[str, ...] | None = None
+    uses_reward: bool = True
     hyperparameters: type[Hyperparameters] = Hyperparameters
     num_streams: int = 1
     mix: Callable[[Any, jax.Array, Context], tuple[jax.Array, Metrics]] = one_advantage
