@@ -18,7 +18,7 @@ from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 LEVEL = 0.05
 _DRAWS = 10_000
 #: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
-_FEWEST_SEEDS = 5
+FEWEST_SEEDS = 5
 _VERDICTS = ("better", "not clear", "worse")
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
@@ -99,7 +99,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
         beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
-        enough = all(len(x) >= _FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
+        enough = all(len(x) >= FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
         p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
@@ -158,7 +158,7 @@ def in_words(middle: float, low: float, high: float) -> str:
 def interval(scores: np.ndarray) -> str:
     """Return interquartile mean and 95% interval of (seeds,); of few seeds the mean."""
     middle = float(interquartile_mean(scores))
-    if len(scores) < _FEWEST_SEEDS:
+    if len(scores) < FEWEST_SEEDS:
         return number(middle)
     return in_words(middle, *map(float, bootstrap_interval(scores)))
 

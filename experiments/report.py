@@ -17,6 +17,9 @@ import numpy as np
 
 from experiments import plots
 from experiments.comparisons import (
+    FEWEST_SEEDS,
+    Comparison,
+    Scores,
     compare,
     counted,
     improvement,
@@ -51,7 +54,9 @@ _READING = """## How to read this
 A final return is the interquartile mean over seeds of the mean return over the last
 tenth of training, of the episodes that the acting policy ended; in brackets its 95%
 interval, by the percentile bootstrap over seeds, which covers a little less with ten.
-Better and worse are verdicts on differences, by a permutation test and the bootstrap
+"Evaluated" is the same mean of the last policy's returns with its mean actions, without
+noise, over the seeds that were evaluated: in brackets how many, if not all. Better and
+worse are verdicts on differences, by a permutation test and the bootstrap
 together (differences of differences: by the bootstrap alone), corrected by Holm's
 method for the {} comparisons of this page: where nothing differs, any verdict at all
 has a probability of 5%. They are about these settings; that another search might have
@@ -107,6 +112,21 @@ class Results:
         """The final returns, (seeds,)."""
         return np.array([record.final for record in self.records.values()])
 
+    @property
+    def evaluated(self) -> np.ndarray:
+        """The mean returns of the last policies' mean actions, (evaluated seeds,)."""
+        evaluations = [record.evaluation_return for record in self.records.values()]
+        return np.array([returns[-1] for returns in evaluations if len(returns)])
+
+    @property
+    def evaluated_in_words(self) -> str:
+        """Their interquartile mean and, if not all seeds have one, their number."""
+        if not len(self.evaluated):
+            return ""
+        count = len(self.evaluated)
+        of = "" if count == len(self.records) else f" ({count})"
+        return f"{number(float(interquartile_mean(self.evaluated)))}{of}"
+
     def provenance(self) -> str:
         """Return physics, versions, devices and commits of the seeds, in words."""
         seeds_of: dict[str, list[int]] = {}
@@ -144,7 +164,7 @@ class Page:
     """
 
     SLOTS = (
-        *("table", "returns", "differences", "tally", "aggregate"),
+        *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "searches", "importance", "ranks", "published"),
     )
 
@@ -160,6 +180,7 @@ class Page:
         self.note = "{{table}}" if figure else (NOTES / f"{name}.md").read_text()
         self.results: dict[tuple[str, str], Results] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
+        self.evaluated_scores: dict[tuple[str, str], np.ndarray] = {}
         for panel, label, curve in self.figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
@@ -169,6 +190,8 @@ class Page:
             self.results[panel, label] = results
             if results.complete:
                 self.scores[panel, label] = results.final
+                if len(results.evaluated) >= FEWEST_SEEDS:
+                    self.evaluated_scores[panel, label] = results.evaluated
                 if self.figure.early is not None:
                     share = self.figure.early / curve.total_steps
                     early = [x.part(0.0, share) for x in results.records.values()]
@@ -178,11 +201,12 @@ class Page:
     def table(self) -> str:
         """Return the final returns: a row for each panel and curve."""
         favourite = self.figure.favourite
-        head = ["task", "agent", "seeds", "final return"]
+        head = ["task", "agent", "seeds", "final return", "evaluated"]
         head += [f"{favourite} ahead by", f"{favourite} is"] if favourite else []
         rows = []
         for (panel, label), results in self.results.items():
             cells = [panel, label, results.seeds, interval(results.final)]
+            cells.append(results.evaluated_in_words)
             if favourite:
                 rival = str(self.figure.rival(panel, label))
                 against = self.comparisons.get((panel, rival, label))
@@ -225,14 +249,30 @@ class Page:
         """
         if not set(panels) <= set(self.figure.panels):
             raise self._no_slot("tally", *panels)
+        return self._tally(self.scores, self.comparisons, panels)
+
+    def evaluated(self) -> str:
+        """Return the tally of the last policies' mean actions, a family of its own.
+
+        Their returns are over the seeds that were evaluated, if these are enough.
+        """
+        comparisons = compare(self.evaluated_scores, self.figure.compared())
+        return self._tally(self.evaluated_scores, comparisons)
+
+    def _tally(
+        self,
+        scores: Scores,
+        comparisons: Mapping[tuple[str, ...], Comparison],
+        panels: Sequence[str] = (),
+    ) -> str:
         lines, panels = [], panels or tuple(self.figure.panels)
         for other in self.figure.names(panels):
             with_other = [p for p in panels if other in self.figure.panels[p]]
             ours = str(self.figure.rival(with_other[0], other))
-            complete = [p for p in with_other if (p, ours, other) in self.comparisons]
+            complete = [p for p in with_other if (p, ours, other) in comparisons]
             if complete:
-                verdicts = [self.comparisons[p, ours, other].verdict for p in complete]
-                probability = improvement(self.scores, complete, ours, other)
+                verdicts = [comparisons[p, ours, other].verdict for p in complete]
+                probability = improvement(scores, complete, ours, other)
                 lacking = len(with_other) - len(complete)
                 more = f", {lacking} not measured yet" if lacking else ""
                 lines.append(

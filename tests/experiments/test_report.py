@@ -189,7 +189,8 @@ def page(tmp_path):
 
 
 def test_a_table_and_a_tally(page):
-    assert "| one | other | 6 | 102 [101, 104] | 100 [" in page.table()
+    assert "| one | other | 6 | 102 [101, 104] |  | 100 [" in page.table()
+    assert page.value("evaluated") == "Nothing is complete yet."
     assert page.table().count(" better |") == 1 == page.table().count(" not clear |")
     (line,) = page.tally().splitlines()
     words = "- ours against other: better on 1, not clear on 1 of 2; probability of"
@@ -199,6 +200,27 @@ def test_a_table_and_a_tally(page):
     words = f"so {page.tally('two')}"
     assert report.fill("so {{tally two}}", page.value) == words
     assert "commit c, changed" in page.settings()
+
+
+def test_the_last_policies_evaluations_are_compared_on_their_own(tmp_path):
+    store, nan = Store(tmp_path / "runs"), np.full(10, np.nan)
+    # While they learn, ours has more; evaluated, other has. One seed of it was not.
+    for name, trained, evaluated in (("ours", 200.0, 5.0), ("other", 100.0, 50.0)):
+        for i, run in enumerate(FIGURE.panels["one"][name].runs(store)):
+            values = np.full(10, trained + i)
+            returns = np.array([1000.0, evaluated + i])
+            if (name, i) == ("other", 5):
+                returns = np.empty(0)
+            steps = np.arange(len(returns)) + 1
+            by = {"physics": "mjx"}
+            record = Record(np.arange(1, 11), values, nan, by, steps, returns)
+            store.add({run: record})
+    page = Page("matrix", store, figure=FIGURE)
+    assert page.value("tally").startswith("- ours against other: better on 1 of 1, ")
+    words = "- ours against other: worse on 1 of 1, 1 not measured yet; "
+    assert page.value("evaluated").startswith(words)
+    assert "| one | ours | 6 | 202 [201, 204] | 7.5 |" in page.table()
+    assert "| one | other | 6 | 102 [101, 104] | 52.0 (5) | 100 [" in page.table()
 
 
 def test_returns_of_curves_beside_each_other(page):
@@ -242,7 +264,7 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
             records[run] = Record(np.arange(1, 11), values, nan, by | {"clean": True})
     store.add(records)
     page = Page("delays", store, figure=DELAYS)
-    assert "| hopper | ppo-1000 | 10 | 104 [102, 107] | 1000 [" in page.table()
+    assert "| hopper | ppo-1000 | 10 | 104 [102, 107] |  | 1000 [" in page.table()
     tally = page.tally().splitlines()
     assert len(tally) == 4
     assert tally[0].startswith("- ppo+gasil-1 against ppo-1: not clear on 2 of 2;")
