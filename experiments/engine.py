@@ -19,7 +19,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.store import Record, Run, Store
+from experiments.store import Record, Run, Store, run_of
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
@@ -34,6 +34,8 @@ _WRITTEN = (
     *("experiments/results", "README.md", "gasil_jax/tuned_presets.json"),
     *("gasil_jax/zoo", "docs/zoo.md"),
 )
+#: The file of a scratch folder that lists the runs in training there.
+_RUNS = "runs.json"
 #: The columns of metrics.csv that identify the members of a program.
 _LABELS = ("member", "seed")
 
@@ -180,6 +182,8 @@ def train(program: Program) -> dict[Run, Record]:
     env = assembly.prepare(options, [members], [members])
     read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))
     with run_folder.lock(run_folder.create(folder, "")):
+        runs = [{"experiment": x.experiment, "seed": x.seed} for x in program.runs]
+        metrics_files.write_json(folder / _RUNS, {"runs": runs})
         provenance = _provenance(program)
         try:
             assembly.train(
@@ -255,6 +259,27 @@ def record(
     )
 
 
+def begun(missing: Iterable[Run], setup: Setup) -> list[Program]:
+    """Return the programs of the scratch folder that train any of the missing runs.
+
+    They may have other runs too, which were stored meanwhile.
+
+    Raises:
+      InputError: if a folder's list of runs can't be read.
+    """
+    missing, found = set(missing), []
+    for path in sorted(setup.runs.glob(f"*/{_RUNS}")):
+        try:
+            listed = json.loads(path.read_text())["runs"]
+            program = Program(tuple(run_of(**fields) for fields in listed), setup)
+        except (ValueError, KeyError, TypeError) as error:
+            raise InputError(f"{path} is not a list of runs: {error}") from None
+        # With another setup it is other training.
+        if program.folder == path.parent and not missing.isdisjoint(program.runs):
+            found.append(program)
+    return found
+
+
 def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
     """Train runs and add them to the store, each program as soon as it has ended.
 
@@ -263,17 +288,16 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
         continued.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
-    requested = programs(missing, setup)
-    begun = [
-        program.folder for program in requested if any(program.folder.glob("[!.]*"))
-    ]
-    if begun and not setup.resume:
+    unfinished = begun(missing, setup)
+    if unfinished and not setup.resume:
         raise InputError(
             f"runs is {setup.runs}, which holds training of these runs in "
-            f"{', '.join(folder.name for folder in begun)}: continue it with --resume, "
-            "or name another folder"
+            f"{', '.join(program.folder.name for program in unfinished)}: continue it "
+            "with --resume, or name another folder"
         )
-    for program in requested:
+    continued = {run for program in unfinished for run in program.runs}
+    others = [run for run in missing if run not in continued]
+    for program in [*unfinished, *programs(others, setup)]:
         # Another process may have added them meanwhile.
         if Store(store.folder).missing(program.runs):
             store.add(train(program))

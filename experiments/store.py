@@ -83,6 +83,11 @@ def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
     return {**fields, "config": Config(**values)}
 
 
+def run_of(experiment: str, seed: int) -> Run:
+    """Return the run whose `Run.experiment` and seed these are."""
+    return Run(seed=seed, **_experiment(json.loads(experiment)))
+
+
 @dataclasses.dataclass(frozen=True)
 class Record:
     """The stored results of a run: means over equal parts of training, (rows,) each.

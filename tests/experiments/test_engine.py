@@ -137,6 +137,34 @@ def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
         assert again.provenance["clean"] is None
 
 
+def test_training_is_continued_when_other_runs_are_missing(
+    trained, monkeypatch, tmp_path
+):
+    program, _ = trained
+    resumed = dataclasses.replace(program.setup, resume=True)
+    requested = []
+    monkeypatch.setattr(engine, "train", lambda x: requested.append(x) or {})
+    # Of the two that it trains one was stored, and a third is requested.
+    another = dataclasses.replace(RUNS[0], seed=99)
+    missing = [another, RUNS[1]]
+    with pytest.raises(InputError, match=f"in {program.folder.name}: continue it"):
+        engine.train_missing(missing, Store(tmp_path), program.setup)
+    engine.train_missing(missing, Store(tmp_path), resumed)
+    assert [set(x.runs) for x in requested] == [set(RUNS), {another}]
+    assert requested[0].folder == program.folder
+    # With other physics it is other training.
+    other = dataclasses.replace(program.setup, physics="mujoco")
+    assert engine.begun(missing, other) == [] == engine.begun([another], resumed)
+
+
+def test_a_damaged_list_of_runs_is_named(tmp_path):
+    for text in ("{", '{"runs": [{}]}', "{}"):
+        (tmp_path / "x").mkdir(exist_ok=True)
+        (tmp_path / "x" / "runs.json").write_text(text)
+        with pytest.raises(InputError, match=r"runs\.json is not a list of runs"):
+            engine.begun(RUNS, Setup(tmp_path))
+
+
 def test_rows_are_means_over_equal_parts_of_training():
     returns = np.arange(120.0)
     returns[[0, 1, 2]], returns[5] = np.nan, np.nan
