@@ -49,7 +49,8 @@ class Setup:
       resume: continue interrupted training in the scratch folder, which is otherwise
         refused. Runs that the results hold are never trained again, with or without it.
       physics: physics engine of locomotion: mjx or mujoco.
-      devices: number of host devices to shard members over; default one per core.
+      devices: number of CPU devices to shard members over; default one per core. All
+        visible GPUs are used in any case.
       evaluate_episodes: episodes of each of the ten evaluations during training; 0
         for no evaluations.
       share_counts: train runs that differ in buffer_steps or discriminator_updates in

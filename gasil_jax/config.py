@@ -81,7 +81,9 @@ def _field(default: Any, allowed: Range) -> Any:
 
 
 class Hyperparameters(struct.PyTreeNode):
-    """Every number that can be swept; a pytree, so a sweep is a `vmap` over its leaves.
+    """The numbers that may differ within one compiled program.
+
+    They are a pytree, so a sweep is a `vmap` over its leaves.
 
     Two of them are counts, `discriminator_updates` and `buffer_steps`. The values in
     the configuration decide shapes and are upper limits: a member of a sweep may have
@@ -139,7 +141,8 @@ class Config:
     """The settings that change array shapes, loop counts or the program; hashable."""
 
     agent: str = "ppo+gasil"
-    """Name of the agent: one of `gasil_jax.agents()`, or MODULE:NAME of your own."""
+    """Name of the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
+    ppo+bonus, gail, or MODULE:NAME of your own."""
     total_steps: int = _count(1_000_000)
     """Environment steps per seed, rounded up to whole batches."""
     num_envs: int = _count(16)
@@ -154,7 +157,8 @@ class Config:
     hidden_sizes: tuple[int, ...] = _count((64, 64))
     """Widths of the tanh layers, in the policy and in the value."""
     bonus: str = "softplus"
-    """Form of the discriminator's reward: "softplus", -log D, is the paper's."""
+    """Form of the discriminator's reward: softplus (-log D, the paper's), logit, dail
+    or centered."""
     imitation_rule: str = "both"
     """What the share of imitation in the policy's advantage follows, in the agent
     ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for neither."""
@@ -230,8 +234,8 @@ class Config:
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
     )
-    """The numbers that can be swept; `make_train` accepts traced replacements. They are
-    of the agent's class, and those that it does not have are dropped."""
+    """Numbers that `make_train` also takes as traced arguments. They do not change the
+    compiled program, except for buffer_steps and discriminator_updates."""
 
     def __post_init__(self) -> None:
         """Give the hyperparameters the class that the agent declares."""
@@ -363,9 +367,9 @@ def validate(config: Config, agents: Sequence[str]) -> None:
         if isinstance(field.default, bool) and not isinstance(value, bool):
             raise _refusal(field.name, value, "True or False")
         if isinstance(field.default, str) and not isinstance(value, str):
-            raise _refusal(field.name, value, "a text")
+            raise _refusal(field.name, value, "a string")
     if not isinstance(config.expert, str | None):
-        raise _refusal("expert", config.expert, "a text or None")
+        raise _refusal("expert", config.expert, "a string or None")
     if config.agent not in agents and ":" not in config.agent:
         raise ValueError(unknown("agent", config.agent, agents, ["MODULE:NAME"]))
     hyperparameters_of(config.agent)

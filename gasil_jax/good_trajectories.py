@@ -49,7 +49,9 @@ class History(struct.PyTreeNode):
     Attributes:
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
-      reward: float32 (N, H), the environment's own reward.
+      reward: float32 (N, H), the reward, never normalized; in an agent's context it is
+        decomposed if the config says so. NaN on faulty steps, and on the last step of
+        an episode that was cut short.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
       next_observation: float32 (N, H, obs), after the action; None if it is not kept.

@@ -39,7 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.merge")
     if not options.folders:
-        raise InputError("folders is empty: it must be a sweep's or its shards'")
+        raise InputError(
+            "folders is empty: name the sweep's folder, or those of all its shards"
+        )
     out = options.out
     if out is None:
         if len(options.folders) > 1:

@@ -175,7 +175,10 @@ def _main(arguments: Sequence[str] | None) -> None:
     if not options.runs:
         raise InputError("runs is empty: name one folder or more")
     if len(labels) != len(options.runs):
-        raise InputError(f"labels are {len(labels)}: runs are {len(options.runs)}")
+        raise InputError(
+            f"labels has {len(labels)} names: it must have one for each of the "
+            f"{len(options.runs)} runs"
+        )
     output_file.check(options.out, (".png", ".pdf", ".svg"))
     runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
     output_file.make_parent(options.out)

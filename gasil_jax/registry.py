@@ -21,7 +21,7 @@ def find(name: Any) -> Any:
       ValueError: if the name is unknown, or if it names no `Imitation`.
     """
     if not isinstance(name, str):
-        raise ValueError(f"agent is {name!r}: it must be a text")
+        raise ValueError(f"agent is {name!r}: it must be a string")
     if ":" not in name:
         importlib.import_module("gasil_jax.imitation")  # It fills the table.
         if name not in AGENTS:

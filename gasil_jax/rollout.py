@@ -21,7 +21,8 @@ class Rollout(struct.PyTreeNode):
         ended, it is its final observation and not the start of the next episode.
       action: float32 (time, env, action), as drawn from the policy, not clipped.
       log_prob: float32 (time, env), log density of the action when it was drawn.
-      reward: float32 (time, env), the environment's reward, delayed if it delays it.
+      reward: float32 (time, env), the environment's reward, delayed if it delays it;
+        in an agent's context decomposed and normalized if the config says so.
       terminated: bool (time, env), whether the episode ended and has no future value.
       truncated: bool (time, env), whether the episode was cut off; its value is then
         bootstrapped.

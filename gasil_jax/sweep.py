@@ -193,7 +193,9 @@ def _plan_here(
     points, programs = plan(options)
     check_points(points, began)
     if options.shards is not None:
-        raise InputError(f"shards is {options.shards}: it is of --launcher")
+        raise InputError(
+            f"shards is {options.shards}: it needs --launcher (one part is --shard)"
+        )
     return points, programs
 
 

@@ -29,7 +29,8 @@ class Settings:
         section 5.3); 0 means no noise.
       physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
         host's cores.
-      solver: contact solver of mjx: small (ours, faster) or mjx.
+      solver: implementation of the JAX physics: small, our own dynamics and solver, or
+        mjx, MJX's own step, which is slower.
       integrator: integrator of locomotion: model, the same as Gymnasium's, or euler,
         which is faster but changes the task.
     """

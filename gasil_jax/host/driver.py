@@ -215,8 +215,8 @@ def _restored(
     for name in [f"{table}_size" for table in tables]:
         if newest is not None and name not in newest.record:
             raise InputError(
-                f"{newest.folder} is whole, but its record has no {name}: it is of a "
-                "training with other options"
+                f"{newest.folder} has no {name}: it was written with other options, "
+                "for example without evaluate_every"
             )
     for damage in damages:
         instead = "starting anew" if newest is None else f"using {newest.folder.name}"

@@ -12,7 +12,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from gasil_jax.errors import InputError, NotImportable
 
 _WORDS = {
-    str: "a text",
+    str: "a string",
     int: "a whole number, 0 or more",
     float: "a finite number",
     bool: "true or false",

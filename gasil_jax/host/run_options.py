@@ -36,8 +36,8 @@ class Options:
         its number.
       out: run folder, created if it is missing; default runs/ENV-AGENT-TIME.
       resume: continue the run in the folder `out` from its last checkpoint, with its
-        settings; only total_steps may differ, and only grow. If the folder holds no
-        run yet, a new one begins.
+        settings. total_steps may grow; checkpoint_every, keep_checkpoints, devices and
+        log may differ. If the folder holds no run yet, a new one begins.
       checkpoint_every: environment steps per seed between two checkpoints; by
         default a checkpoint is written every ten minutes.
       keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
@@ -50,9 +50,10 @@ class Options:
       preset: the hyperparameters to start from: tuned, by environment and agent;
         decomposed, for PPO that decomposes delayed rewards; scaled, the same with one
         setting for all locomotion tasks; or paper, with the paper's single environment
-        per seed, which is slow where seeds are few. Flags override them.
-      devices: number of host devices to spread the seeds over; default one for each
-        core.
+        per seed, which is slow where seeds are few. Flags override them. The defaults
+        that this help shows are those without a preset.
+      devices: number of CPU devices that share the seeds; default one for each core.
+        All visible GPUs are used in any case.
       settings: settings of the environment.
       config: settings of the algorithm.
     """
@@ -220,7 +221,7 @@ def unused_fields(config: Config) -> dict[str, str]:
 
 
 def tell_without_effect(options: Options, num_members: int) -> None:
-    """Print a note for each option that differs from its default to no effect.
+    """Print a note for each option that differs from its default without effect.
 
     Args:
       options: options that `check` accepts.
@@ -229,14 +230,16 @@ def tell_without_effect(options: Options, num_members: int) -> None:
     config, settings = options.config, options.settings
     for name in environments.without_effect(options.env, settings):
         value = getattr(settings, name)
-        command_line.note(f"{name} is {value}, to no effect: {options.env} has none")
+        command_line.note(
+            f"{name} is {value}, which has no effect: {options.env} has none"
+        )
     default = presets.preset(
         options.env, config.agent, options.preset, settings.reward_delay
     )
     now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
     for name, reason in sorted(unused_fields(config).items()):
         if now[name] != before[name]:
-            command_line.note(f"{name} is {now[name]}, to no effect: {reason}")
+            command_line.note(f"{name} is {now[name]}, which has no effect: {reason}")
     if options.devices is not None and options.devices > num_members:
         command_line.note(
             f"devices is {options.devices}, of which {num_members} are used, one for "

@@ -19,8 +19,8 @@ class Context(struct.PyTreeNode):
     """The data of an iteration that an imitation method may use.
 
     Attributes:
-      rollout: the batch, (time, env, ...); its rewards are normalized if the config
-        says so.
+      rollout: the batch, (time, env, ...); its rewards are decomposed and normalized if
+        the config says so.
       history: the last steps of each environment, including the batch's.
       good_trajectories: the buffer, including the batch's ended episodes.
       normalizer: the normalizer of observations that the policy used in the batch.
@@ -83,7 +83,8 @@ class Imitation(NamedTuple):
         uses, besides those that PPO uses. A sweep over a field that the agent does
         not use is refused. None if the method does not say.
       uses_reward: whether PPO maximizes the environment's reward, alone or with others.
-        Where it does not, settings that change the reward are told to have no effect.
+        Where it does not, a note says that settings which change the reward have no
+        effect.
       hyperparameters: the class of the agent's hyperparameters: `Hyperparameters`, or
         one that is derived from it and declares numbers of the agent's own.
       num_streams: number of reward streams.

@@ -108,7 +108,10 @@ def test_runs_are_drawn(tmp_path, capsys):
         ([*folders, "--out", str(out)], "which exists"),
         ([str(tmp_path)], "must be the folder of a run"),
         ([folders[0], "--out", "x.txt"], "must end in .png"),
-        ([*folders, "--labels", "a"], "labels are 1: runs are 2"),
+        (
+            [*folders, "--labels", "a"],
+            "labels has 1 names: it must have one for each of the 2 runs",
+        ),
     ):
         assert plot.main(arguments) == 2
         error = capsys.readouterr().err

@@ -208,14 +208,20 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
 @pytest.mark.parametrize(
     ("arguments", "messages"),
     [
-        ("--physics mujoco", ["physics is mujoco, to no effect: point_mass has none"]),
-        ("--solver mjx", ["solver is mjx, to no effect"]),
-        ("--integrator euler", ["integrator is euler, to no effect"]),
-        ("--agent ppo --alpha 0.7", ["alpha is 0.7, to no effect: agent 'ppo' does"]),
+        (
+            "--physics mujoco",
+            ["physics is mujoco, which has no effect: point_mass has none"],
+        ),
+        ("--solver mjx", ["solver is mjx, which has no effect"]),
+        ("--integrator euler", ["integrator is euler, which has no effect"]),
+        (
+            "--agent ppo --alpha 0.7",
+            ["alpha is 0.7, which has no effect: agent 'ppo' does"],
+        ),
         ("--seeds 2 --devices 8", ["devices is 8, of which 2 are used"]),
         ("--seeds 2 --devices 2 --alpha 0.7", []),
         ("--agent ppo --gamma 0.9", []),
-        ("--decomposition-updates 9", ["is 9, to no effect: decompose_rewards is off"]),
+        ("--decomposition-updates 9", ["is 9, which has no effect: decompose_"]),
         ("--decomposition-updates 9 --decompose-rewards", []),
         ("--agent gasil --decompose-rewards", ["'gasil' does not use the env"]),
         ("--agent ppo --alpha-schedule 1e5 0 2e5 1", ["alpha_schedule is ((1000"]),

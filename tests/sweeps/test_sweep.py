@@ -154,7 +154,7 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
         ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
         ("--grid alpha=1 --shard 1/1", "shard needs --out"),
-        ("--grid alpha=1 --shards 3", "shards is 3: it is of --launcher"),
+        ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
         ("--grid alpha=1 --launcher loacl", "did you mean 'local'"),
         ("--grid alpha=1 --launcher local --out x", "None: --launcher needs --shards"),
         ("--grid alpha=1 --launcher local --shards 1", "launcher needs --out"),

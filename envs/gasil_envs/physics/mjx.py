@@ -1,4 +1,4 @@
-"""MuJoCo physics in pure JAX, on MJX."""
+"""MuJoCo physics in pure JAX: our own implementation, or MJX's."""
 
 import logging
 from collections.abc import Callable, Sequence
