@@ -153,7 +153,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     with announced("evaluate", f"scoring {len(seeds)} policies"):
         score = _score_in_gymnasium if options.gymnasium else _score
         scores = score(options, policies)
-    print("seed  episodes      return     spread  length")
+    print("seed  episodes      return        std  length")
     for i, seed in enumerate(seeds):
         returns, length = scores["episode_return"][i], scores["episode_length"][i]
         print(

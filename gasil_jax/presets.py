@@ -12,7 +12,7 @@ locomotion tasks. An agent without a row for a task starts from the defaults.
 the best point so far where the search is not complete.
 
 "scaled" holds one setting for PPO on all locomotion tasks, whose step size and
-exploration follow the number of actions; it decomposes delayed rewards.
+exploration follow the dimension of an action; it decomposes delayed rewards.
 
 "paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
 gives for a task. The rest are the defaults, which are the appendix's where it gives
@@ -41,8 +41,8 @@ Rows = Mapping[tuple[str, str], Overrides]
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
-#: The locomotion tasks, each with its number of actions.
-_ACTIONS = {
+#: The locomotion tasks, each with the dimension of its actions.
+_ACTION_SIZES = {
     **{"hopper": 3, "walker2d": 6, "halfcheetah": 6},
     **{"swimmer": 2, "ant": 8, "humanoid": 17},
 }
@@ -72,14 +72,14 @@ def _searched(rewards: str) -> Rows:
 
 def _tuned(rewards: str, adaptive: Overrides) -> Rows:
     """Return the rows that searches chose, and those of adaptive imitation."""
-    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _ACTIONS}
+    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _ACTION_SIZES}
     return {**_searched(rewards), **rows}
 
 
 def _scaled(decompose_rewards: bool) -> Rows:
-    """Return rows for PPO whose step size and exploration follow the number of actions.
+    """Return rows for PPO whose step size and exploration follow an action's dimension.
 
-    The more actions a task has, the smaller both must be, as the searches suggest
+    The more dimensions an action has, the smaller both must be, as the searches suggest
     (experiments/results/matrix.md). So the noise on an untrained policy's action has a
     length of about 1 in every task.
     """
@@ -89,10 +89,10 @@ def _scaled(decompose_rewards: bool) -> Rows:
             "decompose_rewards": decompose_rewards,
             "num_envs": 32,
             "gamma": 0.995,
-            "learning_rate": 1.5e-3 / actions,
-            "initial_deviation": 1 / math.sqrt(actions),
+            "learning_rate": 1.5e-3 / size,
+            "initial_deviation": 1 / math.sqrt(size),
         }
-        for env, actions in _ACTIONS.items()
+        for env, size in _ACTION_SIZES.items()
     }
 
 
