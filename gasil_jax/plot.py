@@ -12,7 +12,6 @@ import tyro
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting, statistics
 from gasil_jax.figures.plotting import COLORS
-from gasil_jax.figures.statistics import final_returns
 from gasil_jax.host import command_line, metrics_files, output_file, run_folder
 
 _STYLES = ("-", "--", "-.", ":")
@@ -88,7 +87,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
         label=label or default,
         env_steps=env_steps,
         returns=means,
-        final=final_returns(returns),
+        final=metrics_files.final_returns(returns),
         evaluations=evaluations,
     )
 

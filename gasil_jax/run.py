@@ -8,7 +8,6 @@ from typing import Any, NotRequired, TypedDict
 import numpy as np
 
 from gasil_jax.figures import plotting
-from gasil_jax.figures.statistics import final_returns
 from gasil_jax.host import (
     command_line,
     driver,
@@ -83,7 +82,7 @@ def _write_results(
         f"{options.env}, {config.agent}",
         evaluations=evaluations,
     )
-    final = final_returns(returns)
+    final = metrics_files.final_returns(returns)
     policy_file.save(folder / "policy.npz", outcome.states, env, seeds, final)
     faulty = np.nansum(metrics["faulty_steps"], axis=1)
     skipped = np.nansum(metrics["skipped_updates"], axis=1)
@@ -100,7 +99,7 @@ def _write_results(
         "device_count": len(members.devices),
         "versions": metrics_files.versions(),
     }
-    lengths = final_returns(metrics["episode_length"])
+    lengths = metrics_files.final_returns(metrics["episode_length"])
     finals = {"final_return": final, "final_length": lengths}
     if evaluations is not None:
         finals["final_evaluation"] = evaluations["mean"][:, -1]

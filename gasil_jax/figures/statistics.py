@@ -66,23 +66,6 @@ def performance_profile(scores: np.ndarray, levels: np.ndarray) -> np.ndarray:
     return np.mean(scores[:, None] > levels[None, :], axis=0)
 
 
-def final_returns(returns: np.ndarray) -> np.ndarray:
-    """Return each seed's mean return over the last tenth of iterations, (seeds,).
-
-    It also works for other metrics of episodes, such as their length. If no episode of
-    a seed ended in that time (in some tasks all episodes end at once), the result is
-    the value of the last iteration in which one ended; NaN if none ever did.
-    """
-    last = returns[:, -max(1, returns.shape[1] // 10) :]
-    count = np.isfinite(last).sum(axis=1)
-    mean = np.nansum(last, axis=1) / np.maximum(count, 1)
-    ended = np.isfinite(returns)
-    last_ended = returns.shape[1] - 1 - ended[:, ::-1].argmax(axis=1)
-    newest = np.take_along_axis(returns, last_ended[:, None], axis=1)[:, 0]
-    newest = np.where(ended.any(axis=1), newest, np.nan)
-    return np.where(count > 0, mean, newest)
-
-
 def are_numbers(values: Sequence[Any]) -> bool:
     """Return whether all values are numbers, which a bool is not."""
     return all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in values)

@@ -10,7 +10,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gasil_jax.config import Config, Range
-from gasil_jax.host import driver, json_reader, metrics_files, run_folder
+from gasil_jax.host import (
+    driver,
+    json_reader,
+    metrics_files,
+    policy_file,
+    run_folder,
+)
 from gasil_jax.host.driver import Callback, FitProgress
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import make_members
@@ -60,8 +66,9 @@ def fit(
       env: one environment.
       config: the config that the seeds share.
       seeds: number of seeds, from 0 on; or their numbers.
-      folder: folder of metrics.csv, evaluations.csv and checkpoints/, created if it is
-        missing; None keeps nothing.
+      folder: folder of metrics.csv, evaluations.csv, checkpoints/ and, at the end,
+        policy.npz for `gasil_jax.load_policy`. It is created if it is missing; None
+        keeps nothing.
       resume: continue the training in the folder from its newest checkpoint. Of the
         seeds, the config and the evaluations only `total_steps` may differ, and only
         grow. The environment, and schedules that are functions, are not compared. If
@@ -120,9 +127,14 @@ def fit(
             evaluation_schedule=evaluation_schedule,
             callback=callback,
         )
+        metrics = _table(where / "metrics.csv", members.num_members)
+        if folder is not None:
+            final = metrics_files.final_returns(metrics["episode_return"])
+            path = where / "policy.npz"
+            policy_file.save(path, outcome.states, env, members.seeds, final)
         return FitResult(
             outcome.states,
-            _table(where / "metrics.csv", members.num_members),
+            metrics,
             _table(where / "evaluations.csv", members.num_members),
         )
 

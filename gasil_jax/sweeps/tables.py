@@ -17,7 +17,7 @@ import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.figures.statistics import final_returns, importance
+from gasil_jax.figures.statistics import importance
 from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point, check_saved
@@ -191,12 +191,10 @@ def write(
         evaluations |= part.evaluations()
     curves = _curves(points, seeds, members)
     of_point = lambda name, i: np.stack([members[i, seed][name] for seed in seeds])
-    final = np.array(
-        [final_returns(of_point("episode_return", i)) for i in range(len(points))]
+    finals_of = lambda name: np.array(
+        [metrics_files.final_returns(of_point(name, i)) for i in range(len(points))]
     )
-    length = np.array(
-        [final_returns(of_point("episode_length", i)) for i in range(len(points))]
-    )
+    final, length = finals_of("episode_return"), finals_of("episode_length")
     # (points, seeds) each, for columns and fields of the same names.
     finals = {"final_return": final, "final_length": length}
     if evaluations:

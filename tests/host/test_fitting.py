@@ -106,6 +106,10 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         )
     assert "resume=True" in interrupted.value.__notes__[0]
     same(gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED), commanded)
+    policies = [np.load(folder / "policy.npz") for folder in (out, commanded)]
+    for name in policies[1]:
+        np.testing.assert_array_equal(*(arrays[name] for arrays in policies))
+    assert gasil_jax.load_policy(out)(np.zeros(env.observation_size)).shape == (2,)
 
 
 def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
