@@ -12,6 +12,7 @@ it has the environment's full length. The data set's description says the same.
 """
 
 import dataclasses
+import importlib
 import itertools
 import pathlib
 import shutil
@@ -32,11 +33,11 @@ from gasil_jax.host.members import member
 from gasil_jax.sweeps import saved_states
 
 _DESCRIPTION = (
-    "The good trajectories of {run}: whole episodes of {agent} on {env}, the best "
-    "discounted returns first. Observations and actions are exact, actions as the "
+    "The good trajectories of {run}: whole episodes of {agent} on {env}, seed by seed, "
+    "the best returns first. Observations and actions are exact, actions as the "
     "policy drew them, before the environment limits them. Filled in: the reward of "
-    "an episode's last step is its discounted return (gamma {gamma:g}) and the others "
-    "are 0; the observation after the last action is the one before it; every episode "
+    "an episode's last step is its return, {discounted}, and the others are 0; "
+    "the observation after the last action is the one before it; every episode "
     "is called truncated."
 )
 
@@ -105,6 +106,7 @@ def check_name(name: str) -> None:
       InputError: if the name is malformed or taken, or if Minari is not installed.
     """
     try:
+        importlib.import_module("h5py")  # Minari needs it to write a data set.
         from minari.dataset.minari_dataset import parse_dataset_id
         from minari.storage import get_dataset_path
     except ImportError:
@@ -191,12 +193,15 @@ def _main(arguments: Sequence[str] | None) -> None:
         raise InputError(f"run is {options.run}: no whole episode is in its buffer")
     described = run_folder.read(options.run)
     settings = dataclasses.asdict(described["settings"])
+    discounted = "not discounted"
+    if config.buffer_discounts:
+        # The points of a sweep may have different gammas.
+        discounted = f"discounted by {float(states.hyperparameters.gamma[0]):g} a step"
     description = _DESCRIPTION.format(
         run=options.run.resolve().name,
         agent=config.agent,
         env=f"{described['env']} {settings}",
-        # The points of a sweep may have different gammas.
-        gamma=float(states.hyperparameters.gamma[0]),
+        discounted=discounted,
     )
     write(options.name, complete, algorithm_name=config.agent, description=description)
     steps = sum(len(episode.action) for episode in complete)

@@ -13,19 +13,21 @@ import sys
 import types
 import warnings
 from collections.abc import Sequence
+from ctypes.util import find_library
 from importlib.util import find_spec
 from typing import Annotated, Any, Literal
 
 # MuJoCo reads this variable on import. Without a display, EGL can draw on a CPU too.
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    os.environ.setdefault("MUJOCO_GL", "egl")
+    _HAS_EGL = find_library("EGL") is not None
+    os.environ.setdefault("MUJOCO_GL", "egl" if _HAS_EGL else "disable")
 
 import jax
 import numpy as np
 import tyro
 
 from gasil_envs import pictures, wrappers
-from gasil_jax import policy
+from gasil_jax import normalization, policy
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, output_file
 from gasil_jax.host.progress import announced
@@ -75,6 +77,8 @@ def episode(
 ) -> tuple[list[Any], float]:
     """Return the physics states of an episode, from its start on, and its true return.
 
+    A step in which the physics fails ends the episode, and counts in neither.
+
     Args:
       env: one environment.
       act: (observation, key) -> action.
@@ -87,6 +91,8 @@ def episode(
     states, total = [jax.device_get(state.pipeline_state)], 0.0
     for step_key in jax.random.split(key, num_steps):
         state = step(state, step_key)
+        if not normalization.is_sound(state.obs).all():
+            break
         states.append(jax.device_get(state.pipeline_state))
         total += float(state.info.get("true_reward", state.reward))
         if state.done > 0 or wrappers.truncated(state):

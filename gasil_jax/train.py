@@ -530,6 +530,7 @@ def check(env: Any, config: Config) -> None:
         raise ValueError(
             f"env is {env!r}: it must be an environment, as gasil_jax.make_env gives"
         )
+    _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
     validate(config, agents())
@@ -543,6 +544,22 @@ def check(env: Any, config: Config) -> None:
             f"limit is {limit}"
         )
     find_agent(config.agent).check(config, env.observation_size, env.action_size)
+
+
+def _refuse_automatic_resets(env: Any) -> None:
+    """Raise `ValueError` if a wrapper starts the next episode by itself.
+
+    The value of a truncated episode would be that of the next one's start.
+    """
+    wrapper = env
+    while wrapper is not None:
+        if "AutoReset" in (name := type(wrapper).__name__):
+            raise ValueError(
+                f"env is wrapped in {name}: it must not reset itself (of Brax take "
+                "brax.envs.get_environment)"
+            )
+        # Not by getattr, which wrappers hand on.
+        wrapper = getattr(wrapper, "__dict__", {}).get("env")
 
 
 class Train(Protocol):

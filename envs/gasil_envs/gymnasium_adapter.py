@@ -65,7 +65,7 @@ class GymnasiumEnv(gymnasium.Env):
         height: int = 360,
         **settings: Any,
     ):
-        self._env = env = registry.make(name, **settings)
+        self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.observation_space, self.action_space = _spaces(env)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode is {render_mode!r}: it must be 'rgb_array'")
@@ -77,7 +77,8 @@ class GymnasiumEnv(gymnasium.Env):
             self.metadata = {**self.metadata, "render_fps": fps}
         self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
         self._state: Any = None
-        self._steps, self._limit = 0, np.inf
+        # Typed as Any because an elapsed number of steps is None before the reset.
+        self._limits: list[Any] = []
         # The physics states since the episode's start, which a picture may show.
         self._episode: list[Any] = []
 
@@ -87,10 +88,10 @@ class GymnasiumEnv(gymnasium.Env):
         """Start an episode and return its first observation, (obs,) float32."""
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
-        self._steps, self._limit = 0, self._limit_of_wrappers()
+        self._limits = self._time_limits()
         self._episode = []
         self._remember()
-        return np.asarray(self._state.obs), {}
+        return np.array(self._state.obs), {}
 
     def step(
         self, action: np.ndarray
@@ -100,17 +101,20 @@ class GymnasiumEnv(gymnasium.Env):
         ``info["true_reward"]`` is the reward without delay.
         """
         self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
-        self._steps += 1
         self._remember()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
         reward = float(state.reward)
         info = {"true_reward": float(state.info.get("true_reward", reward))}
-        if self._steps >= self._limit and not terminated:
-            # This is the last step, so that nothing may be held back; in an episode
-            # that the environment has ended, nothing is.
-            truncated, reward = True, reward + float(state.info.get("held_reward", 0.0))
-        return np.asarray(state.obs), reward, terminated, truncated, info
+        held = state.info.get("held_reward")
+        last = any(x._elapsed_steps + 1 >= x._max_episode_steps for x in self._limits)
+        if last and not terminated and held is not None:
+            # The limit ends the episode after this step, so nothing may be held back.
+            # A wrapper that repeats actions may take several steps in it.
+            reward += float(held)
+            paid = {**state.info, "held_reward": jnp.zeros_like(held)}
+            self._state = state.replace(info=paid)
+        return np.array(state.obs), reward, terminated, truncated, info
 
     def render(self) -> np.ndarray | None:
         """Return a picture, uint8 (height, width, 3); None without a render mode."""
@@ -125,19 +129,19 @@ class GymnasiumEnv(gymnasium.Env):
         if self._painter is not None:
             self._episode.append(self._state.pipeline_state)
 
-    def _limit_of_wrappers(self) -> float:
-        """Return the lowest limit of the `TimeLimit` wrappers that call `reset`.
+    def _time_limits(self) -> list[Any]:
+        """Return the `TimeLimit` wrappers around it, which call `reset`.
 
         `gymnasium.make` keeps its argument max_episode_steps from the environment and
         wraps it; an environment does not know its wrappers, but these have called it.
         """
-        limits, frame = [np.inf], inspect.currentframe()
+        limits, frame = [], inspect.currentframe()
         while frame is not None:
             caller = frame.f_locals.get("self")
             if isinstance(caller, TimeLimit) and caller.unwrapped is self:
-                limits.append(caller._max_episode_steps)
+                limits.append(caller)
             frame = frame.f_back
-        return min(limits)
+        return limits
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -146,6 +150,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     Args:
       name: one of `gasil_envs.names()`.
       num_envs: number of environments.
+      render_mode: None; a batch can't be drawn.
       **settings: arguments of `gasil_envs.make`.
     """
 
@@ -154,8 +159,19 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
-    def __init__(self, name: str, num_envs: int = 1, **settings: Any):
-        self._env = env = registry.make(name, **settings)
+    def __init__(
+        self,
+        name: str,
+        num_envs: int = 1,
+        render_mode: str | None = None,
+        **settings: Any,
+    ):
+        if render_mode is not None:
+            raise ValueError(
+                f"render_mode is {render_mode!r}: it must be None, as only a single "
+                "environment can be drawn"
+            )
+        self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(env)
         batch = gymnasium.vector.utils.batch_space

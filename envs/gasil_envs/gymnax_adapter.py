@@ -35,7 +35,7 @@ class GymnaxEnv:
 
     def __init__(self, name: str, **settings: Any):
         self.name = name
-        self._env = registry.make(name, **settings)
+        self._env = wrappers.FaultyStepEnds(registry.make(name, **settings))
 
     def reset(
         self, key: jax.Array, params: Params | None = None

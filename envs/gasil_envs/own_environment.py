@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs import Env
 
 from gasil_envs import own_code, wrappers
@@ -51,6 +52,7 @@ def build(name: str) -> Env:
         _check_count(name, attribute, getattr(env, attribute))
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
+    _check_action_range(name, env)
     _check_states(name, env)
     return env
 
@@ -59,6 +61,20 @@ def _check_count(name: str, what: str, count: Any) -> None:
     if not isinstance(count, numbers.Integral) or count < 1:
         raise ValueError(
             f"env {name!r} has {what} {count!r}: it must be a whole number, 1 or more"
+        )
+
+
+def _check_action_range(name: str, env: Env) -> None:
+    given = wrappers.action_range(env)
+    try:
+        low, high = (np.asarray(x, np.float32) for x in given)
+        below = bool(np.broadcast_to(low < high, (env.action_size,)).all())
+    except (TypeError, ValueError):
+        below = False
+    if not below:
+        raise ValueError(
+            f"env {name!r} has action_range {given!r}: it must be the lowest and the "
+            "highest action, each a number or one for each dimension"
         )
 
 
@@ -78,8 +94,13 @@ def _check_states(name: str, env: Env) -> None:
         ) from None
     for state, where in ((bare, "reset"), (stepped, "step")):
         expected = {"obs": (env.observation_size,), "reward": (), "done": ()}
+        values = {field: getattr(state, field) for field in expected}
+        for field in ("truncation", "true_reward"):
+            if field in state.info:
+                expected[f"info[{field!r}]"] = ()
+                values[f"info[{field!r}]"] = state.info[field]
         for field, shape in expected.items():
-            value = getattr(state, field)
+            value = values[field]
             given = getattr(value, "shape", type(value).__name__)
             if given != shape:
                 raise ValueError(

@@ -25,6 +25,13 @@ def action_range(env: Any) -> tuple[Any, Any]:
     return getattr(env, "action_range", (-1.0, 1.0))
 
 
+def _refuse_taken(state: State, *names: str) -> None:
+    """Raise `ValueError` if an environment's info has one of a wrapper's names."""
+    for name in names:
+        if name in state.info:
+            raise ValueError(f"info[{name!r}] is a wrapper's own: name yours otherwise")
+
+
 class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
@@ -44,6 +51,7 @@ class EpisodeLimit(Wrapper):
     def reset(self, rng: jax.Array) -> State:
         """Start an episode."""
         state = self.env.reset(rng)
+        _refuse_taken(state, "steps")
         info = {**state.info, "steps": jnp.int32(0), "truncation": jnp.float32(0)}
         return state.replace(info=info)
 
@@ -74,6 +82,7 @@ class RewardDelay(Wrapper):
         super().__init__(env)
         self.delay = delay
         first = jax.eval_shape(env.reset, jax.random.key(0))
+        _refuse_taken(first, "held_reward", "delay_steps")
         self._gives_true_reward = "true_reward" in first.info
 
     def _true_reward(self, state: State) -> jax.Array:
@@ -134,6 +143,32 @@ class ObservationNoise(Wrapper):
         # An environment may build on its last observation: it gets its own back.
         state = state.replace(obs=state.info["true_observation"])
         return self._noisy(self.env.step(state, action), noise_key)
+
+
+class FaultyStepEnds(Wrapper):
+    """End an episode in which the physics fails, for the users of other libraries.
+
+    The step has reward 0 and the observation of the step before: no number that is not
+    finite, or beyond 1e10, leaves it. `gasil_jax` does the same in its own rollout.
+    """
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and terminate the episode if the physics fails."""
+        stepped = self.env.step(state, action)
+        is_sound = lambda x: jnp.all(jnp.abs(x) <= 1e10)  # False of what is no number.
+        of_step = ("true_reward", "held_reward", "truncation")
+        checked = [stepped.info[x] for x in of_step if x in stepped.info]
+        sound = jnp.all(
+            jnp.array([*map(is_sound, (stepped.obs, stepped.reward, *checked))])
+        )
+        zero = lambda x: jnp.where(sound, x, jnp.zeros_like(x))
+        info = {k: zero(x) if k in of_step else x for k, x in stepped.info.items()}
+        return stepped.replace(
+            obs=jnp.where(sound, stepped.obs, state.obs),
+            reward=zero(stepped.reward),
+            done=jnp.where(sound, stepped.done, jnp.ones_like(stepped.done)),
+            info=info,
+        )
 
 
 class AutoReset(Wrapper):

@@ -7,7 +7,7 @@ import io
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, TypeVar, get_type_hints
+from typing import Any, TypeVar, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -105,13 +105,7 @@ def parse(
     Raises:
       InputError: if tyro rejects the command line; the message is one line.
     """
-    # tyro's own message about a switch with a value does not name the switch.
-    switches = _switches(options)
-    for argument in sys.argv[1:] if arguments is None else arguments:
-        flag, equals, value = argument.partition("=")
-        name = flag.removeprefix("--").replace("-", "_")
-        if equals and flag.startswith("--") and name in switches:
-            raise InputError(f"{name} is {value!r}: it takes no value")
+    _check_flags(options, sys.argv[1:] if arguments is None else arguments)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), _REGISTRY:
@@ -128,15 +122,29 @@ def parse(
         raise InputError(_in_one_line(printed.getvalue())) from None
 
 
-def _switches(kind: Any) -> set[str]:
-    """Return the names of a dataclass' boolean flags, including nested dataclasses'."""
-    names = set()
+def _check_flags(options: Any, arguments: Sequence[str]) -> None:
+    """Refuse what tyro would take silently, or would refuse without naming the flag."""
+    kinds, given = dict(_flags(options)), set()
+    for argument in arguments:
+        flag, equals, value = argument.partition("=")
+        if not flag.startswith("--"):
+            continue
+        name = flag.removeprefix("--").replace("-", "_")
+        if equals and kinds.get(name.removeprefix("no_")) is bool:
+            raise InputError(f"{name} is {value!r}: it takes no value")
+        # The last one would stand for all.
+        if get_origin(kinds.get(name)) is tuple and name in given:
+            raise InputError(f"{name} is given twice: put all values after one {flag}")
+        given.add(name)
+
+
+def _flags(kind: Any) -> Iterator[tuple[str, Any]]:
+    """Yield names and types of a dataclass' fields, nested dataclasses' included."""
     for name, hint in get_type_hints(kind).items():
-        if hint is bool:
-            names |= {name, f"no_{name}"}
-        elif dataclasses.is_dataclass(hint):
-            names |= _switches(hint)
-    return names
+        if dataclasses.is_dataclass(hint):
+            yield from _flags(hint)
+        else:
+            yield name, hint
 
 
 def _in_one_line(refusal: str) -> str:

@@ -2,6 +2,7 @@
 
 import contextlib
 import functools
+import importlib
 import pathlib
 from typing import Any
 
@@ -24,12 +25,22 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       ValueError: if it can't be read or holds other arrays.
     """
-    version = None
-    if not source.startswith(_MINARI):
-        with contextlib.suppress(OSError):
-            file = pathlib.Path(source).stat()
-            version = (file.st_mtime_ns, file.st_size)
-    return _load(source, version)
+    return _load(source, _version(source))
+
+
+def _version(source: str) -> Any:
+    """Return what changes when an expert's files do; None if they can't be seen."""
+    paths = [pathlib.Path(source)]
+    if source.startswith(_MINARI):
+        try:
+            from minari.storage import get_dataset_path
+        except ImportError:
+            return None
+        folder = pathlib.Path(get_dataset_path(source.removeprefix(_MINARI)))
+        paths = sorted(folder.rglob("*"))
+    with contextlib.suppress(OSError):
+        return tuple((x.name, x.stat().st_mtime_ns, x.stat().st_size) for x in paths)
+    return None
 
 
 @functools.lru_cache(maxsize=4)
@@ -76,6 +87,7 @@ def _first_line(error: Exception) -> str:
 
 def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
     try:
+        importlib.import_module("h5py")  # Minari needs it to read a data set.
         import minari
     except ImportError:
         raise ValueError(

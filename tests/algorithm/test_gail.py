@@ -1,5 +1,7 @@
 """GAIL imitates a scripted expert, and refuses files without expert data."""
 
+import sys
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -102,6 +104,21 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
         np.testing.assert_array_equal(got, np.concatenate(expected))
     with pytest.raises(ValueError, match=r"and 2 actions .* has 4 and 3"):
         expert_module.check("minari:test/expert-v0", 4, 3)
+    # Another data set under the same name is read, not the one before.
+    minari.delete_dataset("test/expert-v0")
+    minari.create_dataset_from_buffers(
+        "test/expert-v0",
+        episodes[:1],
+        observation_space=space(4),
+        action_space=space(2),
+    )
+    observation, _ = expert_module.load("minari:test/expert-v0")
+    np.testing.assert_array_equal(observation, episodes[0].observations[:5])
+    # Minari itself does not need h5py, its data sets do.
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    expert_module._load.cache_clear()
+    with pytest.raises(ValueError, match="needs the package minari"):
+        expert_module.load("minari:test/expert-v0")
 
 
 def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):

@@ -64,7 +64,7 @@ def test_whole_episodes_come_back(filled, capsys):
         np.testing.assert_array_equal(*episode.observations[-2:])
     metadata = dataset.storage.metadata
     assert metadata["algorithm_name"] == "ppo+gasil"
-    assert "discounted return (gamma 0.99)" in metadata["description"]
+    assert "its return, discounted by 0.99 a step, and" in metadata["description"]
 
 
 def test_the_discount_is_that_of_the_states(filled, monkeypatch):
@@ -83,7 +83,15 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
         export_minari, "write", lambda *_, **settings: metadata.update(settings)
     )
     assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
-    assert "(gamma 0.9)" in metadata["description"]
+    assert "discounted by 0.9 a step" in metadata["description"]
+
+    def without_discount(*arguments):
+        env, config, seeds, states = load(*arguments)
+        return env, config.replace(buffer_discounts=False), seeds, states
+
+    monkeypatch.setattr(saved_states, "load", without_discount)
+    assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
+    assert "its return, not discounted, and" in metadata["description"]
 
 
 def test_the_last_episode_of_a_buffer_is_kept_if_it_is_whole():

@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import os
 import pathlib
 import re
 import subprocess
@@ -182,6 +183,42 @@ def test_a_film_is_whole_or_not_there(point_mass, tmp_path, monkeypatch, capsys)
     assert render.main([str(point_mass), "--out", str(path), "--steps", "2"]) == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_an_episode_ends_before_the_physics_fails(point_mass):
+    policies = saved_states.load_policies(point_mass)
+    act = policy.make(policies.weights[0])
+    env = policies.env
+
+    class Failing(type(env)):
+        def __getattr__(self, name):
+            return getattr(env, name)
+
+        def __init__(self):
+            pass
+
+        reset = staticmethod(env.reset)
+
+        @staticmethod
+        def step(state, action):
+            stepped = env.step(state, action)
+            fails = stepped.info["steps"] == 4
+            blow_up = lambda x: jax.numpy.where(fails, jax.numpy.nan, x)
+            return stepped.replace(obs=blow_up(stepped.obs), reward=blow_up(1.0))
+
+    states, total = render.episode(Failing(), act, jax.random.key(0), 20)
+    assert len(states) == 4 and total == 3.0
+
+
+def test_without_a_display_and_egl_nothing_is_drawn_by_opengl():
+    code = (
+        "import ctypes.util; ctypes.util.find_library = lambda name: None\n"
+        "import gasil_jax.render, os; print(os.environ['MUJOCO_GL'])"
+    )
+    unset = {k: x for k, x in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env=unset, capture_output=True, text=True)
+    assert done.stdout.split() == ["disable"], done.stderr
 
 
 def test_a_missing_package_is_named(point_mass, tmp_path, monkeypatch, capsys):

@@ -154,6 +154,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished):
         ("--env hopper --out /proc/nowhere/run", "can't be written"),
         ("--env hopper --total-step 5", "--total-steps"),
         ("--env hopper --resume=3", "resume is '3': it takes no value"),
+        ("--env hopper --log wandb --log tensorboard", "log is given twice: put all"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
         ("--env brax:zoo", "env 'brax:zoo' is unknown: it must be one of brax:"),
         ("--env brax:ant --physics mujoco", "brax:ant has its own"),

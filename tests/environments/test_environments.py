@@ -295,6 +295,13 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
         ),
         (_OWN.replace("info={}", "info={'x': a}"), r"info\['x'\] is missing in its r"),
         (_OWN + "    episode_length = 0\n", "has episode_length 0: it must be a whole"),
+        (_OWN + "    action_range = 0.5\n", "has action_range 0.5: it must be the low"),
+        (_OWN + "    action_range = (1, -1)\n", r"has action_range \(1, -1\): it must"),
+        (_OWN + "    action_range = (0, [1, 1])\n", "it must be the lowest and the hi"),
+        (
+            _OWN.replace("info={}", "info={'true_reward': a}"),
+            r"info\['true_reward'\] of its step has the shape \(2,\), must have \(\)",
+        ),
     ],
 )
 def test_a_fault_of_the_users_environment_is_one_line(

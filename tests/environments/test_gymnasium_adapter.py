@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import TimeLimit
+from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
 
 import gasil_envs
 from gasil_envs import gymnasium_adapter
@@ -95,6 +95,39 @@ def test_no_reward_is_lost_where_a_limit_cuts_the_episode(make):
     given, earned = episode(make(reward_delay=20), 30)
     np.testing.assert_allclose(given, earned, rtol=1e-5)
     assert np.all(earned != 0.0)
+
+
+def test_a_limit_counts_the_steps_of_the_wrapper_that_it_is_around():
+    env = gymnasium_adapter.GymnasiumEnv("point_mass", reward_delay=20)
+    env = TimeLimit(MaxAndSkipObservation(env, skip=3), 5)
+    inner, given, earned = env.unwrapped.step, 0.0, []
+
+    def step(action):
+        *others, info = inner(action)
+        earned.append(info["true_reward"])
+        return *others, info
+
+    env.unwrapped.step = step
+    env.reset(seed=0)
+    for count in range(1, 6):
+        _, reward, terminated, truncated, _ = env.step(np.ones(2, np.float32))
+        given += reward
+        assert not terminated and truncated == (count == 5)
+    assert len(earned) == 15
+    assert given == pytest.approx(sum(earned), rel=1e-4) and given != 0.0
+
+
+def test_a_batch_is_not_drawn():
+    with pytest.raises(ValueError, match="render_mode is 'rgb_array': it must be None"):
+        gymnasium.make_vec("gasil_envs/point_mass", 2, render_mode="rgb_array")
+
+
+def test_observations_may_be_changed():
+    env = gymnasium.make("gasil_envs/point_mass")
+    observation, _ = env.reset(seed=0)
+    observation -= 1.0
+    observation, *_ = env.step(np.ones(2, np.float32))
+    observation -= 1.0
 
 
 def test_a_limit_above_the_environments_own_is_refused():

@@ -116,6 +116,57 @@ def test_a_truncation_alone_ends_the_episode_and_pays_the_held_reward():
     np.testing.assert_array_equal(cut.reward, [0, 0, 1 + 2 + 3, 4])
 
 
+class Counted(Scripted):
+    """It counts its steps under a name of one of the wrappers."""
+
+    def __init__(self, name):
+        super().__init__(9)
+        self.name = name
+
+    def reset(self, rng):
+        return super().reset(rng).replace(info={self.name: jnp.int32(0)})
+
+
+def test_a_wrappers_name_in_an_environments_info_is_refused():
+    key = jax.random.key(0)
+    with pytest.raises(ValueError, match=r"info\['steps'\] is a wrapper's own"):
+        wrappers.EpisodeLimit(Counted("steps"), 9).reset(key)
+    for name in ("held_reward", "delay_steps"):
+        with pytest.raises(ValueError, match=f"{name}.* is a wrapper's own"):
+            wrappers.RewardDelay(Counted(name), 3)
+    wrappers.RewardDelay(wrappers.EpisodeLimit(Counted("count"), 9), 3).reset(key)
+
+
+class Failing(Scripted):
+    """Its third step gives numbers that are too large, or none at all."""
+
+    def __init__(self, value, field):
+        super().__init__(9)
+        self.value, self.field = value, field
+
+    def step(self, state, action):
+        stepped = super().step(state, action)
+        failed = {self.field: jnp.full_like(getattr(stepped, self.field), self.value)}
+        select = lambda a, b: jnp.where(stepped.pipeline_state == 3, a, b)
+        return jax.tree.map(select, stepped.replace(**failed), stepped)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -2e10])
+@pytest.mark.parametrize("field", ["obs", "reward"])
+def test_a_step_whose_physics_fails_ends_the_episode(value, field):
+    env = wrappers.FaultyStepEnds(wrappers.RewardDelay(Failing(value, field), 2))
+    _, states = roll(env, 3)
+    np.testing.assert_array_equal(states.done, [0, 0, 1])
+    np.testing.assert_array_equal(states.reward, [0, 3, 0])
+    np.testing.assert_array_equal(states.info["true_reward"], [1, 2, 0])
+    np.testing.assert_array_equal(states.obs[:, 0], [1, 2, 2])
+    assert not wrappers.truncated(states).any()
+    # Others are as they were.
+    _, plain = roll(wrappers.RewardDelay(Scripted(9), 2), 2)
+    for same, other in zip(*map(jax.tree.leaves, (states, plain)), strict=True):
+        np.testing.assert_array_equal(same[:2], other)
+
+
 def test_noise_is_fresh_gaussian_and_only_on_the_observation():
     _, plain = roll(Scripted(10_000), 4000)
     _, noisy = roll(wrappers.ObservationNoise(Scripted(10_000), 0.5), 4000)

@@ -11,10 +11,13 @@ import re
 import jax
 import numpy as np
 import pytest
+from brax.envs import Wrapper as BraxWrapper
+from brax.envs.wrappers import training
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import gasil_jax
+from gasil_envs import wrappers
 from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import validate
 from gasil_jax.errors import InputError
@@ -210,6 +213,15 @@ def test_settings_are_refused_or_made(delay, noise):
         return
     env = gasil_jax.make_env("point_mass", reward_delay=delay, obs_noise=noise)
     assert env.observation_size > 0
+
+
+def test_an_environment_that_resets_itself_is_refused():
+    env = gasil_jax.make_env("point_mass")
+    brax = BraxWrapper(training.AutoResetWrapper(env))
+    for wrapped, name in ((wrappers.AutoReset(env), "AutoReset"), (brax, "AutoReset")):
+        with pytest.raises(ValueError, match=f"env is wrapped in {name}"):
+            gasil_jax.make_train(wrapped, gasil_jax.Config())
+    gasil_jax.make_train(BraxWrapper(env), gasil_jax.Config())
 
 
 class Bomb:
