@@ -24,6 +24,7 @@ from experiments.search import (
     DELAY,
     PAIR,
     TASKS,
+    InverselyScaled,
     Point,
     Search,
     SingleSetting,
@@ -308,6 +309,7 @@ _PARTS = [
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
 _SCALED = Arm("ppo, decomposed, scaled", "ppo")
+_INVERSELY_SCALED = Arm("ppo, decomposed, scaled inversely", "ppo")
 _SCALED_ALONE = Arm("ppo, scaled", "ppo", {"decompose_rewards": False})
 _SCALED_LONG = Arm(
     f"{_SCALED.name}, long history", "ppo", {"decomposition_history_episodes": 4}
@@ -390,6 +392,10 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), panel="{env}", base=base)
             for arms, base in (
+                (
+                    [_INVERSELY_SCALED],
+                    functools.partial(InverselyScaled, decompose_rewards=True),
+                ),
                 ([_SCALED, _SCALED_ALONE], "scaled"),
                 (
                     [Arm("ppo, decomposed, best mean rank", "ppo")],

@@ -42,7 +42,7 @@ TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
 #: The locomotion tasks, each with the dimension of its actions.
-_ACTION_SIZES = {
+ACTION_SIZES = {
     **{"hopper": 3, "walker2d": 6, "halfcheetah": 6},
     **{"swimmer": 2, "ant": 8, "humanoid": 17},
 }
@@ -72,7 +72,7 @@ def _searched(rewards: str) -> Rows:
 
 def _tuned(rewards: str, adaptive: Overrides) -> Rows:
     """Return the rows that searches chose, and those of adaptive imitation."""
-    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in _ACTION_SIZES}
+    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in ACTION_SIZES}
     return {**_searched(rewards), **rows}
 
 
@@ -92,7 +92,7 @@ def _scaled(decompose_rewards: bool) -> Rows:
             "learning_rate": 1.5e-3 / size,
             "initial_deviation": 1 / math.sqrt(size),
         }
-        for env, size in _ACTION_SIZES.items()
+        for env, size in ACTION_SIZES.items()
     }
 
 
