@@ -392,10 +392,6 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), panel="{env}", base=base)
             for arms, base in (
-                (
-                    [_INVERSELY_SCALED],
-                    functools.partial(InverselyScaled, decompose_rewards=True),
-                ),
                 ([_SCALED, _SCALED_ALONE], "scaled"),
                 (
                     [Arm("ppo, decomposed, best mean rank", "ppo")],
@@ -406,6 +402,22 @@ FIGURES: Mapping[str, Figure] = {
             )
         ),
         favourite=_SCALED.name,
+    ),
+    "exploration": Figure(
+        "Delayed rewards: exploration by the dimension of an action",
+        "",
+        joined(
+            grid(TASKS, [arm], (DELAY,), panel="{env}", base=base)
+            for arm, base in (
+                (
+                    _INVERSELY_SCALED,
+                    functools.partial(InverselyScaled, decompose_rewards=True),
+                ),
+                (_SCALED, "scaled"),
+                (Arm("ppo", "ppo"), Search),
+            )
+        ),
+        favourite=_INVERSELY_SCALED.name,
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",
