@@ -268,17 +268,23 @@ def begun(missing: Iterable[Run], setup: Setup) -> list[Program]:
     Raises:
       InputError: if a folder's list of runs can't be read.
     """
-    missing, found = set(missing), []
-    for path in sorted(setup.runs.glob(f"*/{_RUNS}")):
-        try:
-            listed = json.loads(path.read_text())["runs"]
-            program = Program(tuple(run_of(**fields) for fields in listed), setup)
-        except (ValueError, KeyError, TypeError) as error:
-            raise InputError(f"{path} is not a list of runs: {error}") from None
+    requested = frozenset(missing)
+    return [
+        program
+        for path in sorted(setup.runs.glob(f"*/{_RUNS}"))
         # With another setup it is other training.
-        if program.folder == path.parent and not missing.isdisjoint(program.runs):
-            found.append(program)
-    return found
+        if (program := _listed(path, setup)).folder == path.parent
+        and not requested.isdisjoint(program.runs)
+    ]
+
+
+def _listed(path: pathlib.Path, setup: Setup) -> Program:
+    """Return the program of the runs that a file lists."""
+    try:
+        listed = json.loads(path.read_text())["runs"]
+        return Program(tuple(run_of(**fields) for fields in listed), setup)
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is not a list of runs: {error}") from None
 
 
 def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
@@ -290,15 +296,16 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     unfinished = begun(missing, setup)
-    if unfinished and not setup.resume:
-        raise InputError(
-            f"runs is {setup.runs}, which holds training of these runs in "
-            f"{', '.join(program.folder.name for program in unfinished)}: continue it "
-            "with --resume, or name another folder"
-        )
     continued = {run for program in unfinished for run in program.runs}
     others = [run for run in missing if run not in continued]
-    for program in [*unfinished, *programs(others, setup)]:
+    requested = [*unfinished, *programs(others, setup)]
+    used = [x.folder.name for x in requested if any(x.folder.glob("[!.]*"))]
+    if used and not setup.resume:
+        raise InputError(
+            f"runs is {setup.runs}, which holds training of these runs in "
+            f"{', '.join(used)}: continue it with --resume, or name another folder"
+        )
+    for program in requested:
         # Another process may have added them meanwhile.
         if Store(store.folder).missing(program.runs):
             store.add(train(program))

@@ -24,7 +24,6 @@ from experiments.search import (
     DELAY,
     PAIR,
     TASKS,
-    InverselyScaled,
     Point,
     Search,
     SingleSetting,
@@ -309,7 +308,11 @@ _PARTS = [
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
 _SCALED = Arm("ppo, decomposed, scaled", "ppo")
-_INVERSELY_SCALED = Arm("ppo, decomposed, scaled inversely", "ppo")
+_INVERSELY_SCALED = "ppo, decomposed, scaled inversely"
+_OF_EACH_TASK = {
+    env: Arm(_INVERSELY_SCALED, "ppo", {"initial_deviation": 2 / size})
+    for env, size in presets.ACTION_SIZES.items()
+}
 _SCALED_ALONE = Arm("ppo, scaled", "ppo", {"decompose_rewards": False})
 _SCALED_LONG = Arm(
     f"{_SCALED.name}, long history", "ppo", {"decomposition_history_episodes": 4}
@@ -407,17 +410,14 @@ FIGURES: Mapping[str, Figure] = {
         "Delayed rewards: exploration by the dimension of an action",
         "",
         joined(
-            grid(TASKS, [arm], (DELAY,), panel="{env}", base=base)
-            for arm, base in (
-                (
-                    _INVERSELY_SCALED,
-                    functools.partial(InverselyScaled, decompose_rewards=True),
-                ),
-                (_SCALED, "scaled"),
-                (Arm("ppo", "ppo"), Search),
+            grid(tasks, [arm], (DELAY,), panel="{env}", base=base)
+            for tasks, arm, base in (
+                *(((env,), arm, "scaled") for env, arm in _OF_EACH_TASK.items()),
+                (TASKS, _SCALED, "scaled"),
+                (TASKS, Arm("ppo", "ppo"), Search),
             )
         ),
-        favourite=_INVERSELY_SCALED.name,
+        favourite=_INVERSELY_SCALED,
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",

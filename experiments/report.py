@@ -180,7 +180,6 @@ class Page:
         self.note = "{{table}}" if figure else (NOTES / f"{name}.md").read_text()
         self.results: dict[tuple[str, str], Results] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
-        self.evaluated_scores: dict[tuple[str, str], np.ndarray] = {}
         for panel, label, curve in self.figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
@@ -190,8 +189,6 @@ class Page:
             self.results[panel, label] = results
             if results.complete:
                 self.scores[panel, label] = results.final
-                if len(results.evaluated) >= FEWEST_SEEDS:
-                    self.evaluated_scores[panel, label] = results.evaluated
                 if self.figure.early is not None:
                     share = self.figure.early / curve.total_steps
                     early = [x.part(0.0, share) for x in results.records.values()]
@@ -256,8 +253,12 @@ class Page:
 
         Their returns are over the seeds that were evaluated, if these are enough.
         """
-        comparisons = compare(self.evaluated_scores, self.figure.compared())
-        return self._tally(self.evaluated_scores, comparisons)
+        scores = {
+            key: results.evaluated
+            for key, results in self.results.items()
+            if results.complete and len(results.evaluated) >= FEWEST_SEEDS
+        }
+        return self._tally(scores, compare(scores, self.figure.compared()))
 
     def _tally(
         self,

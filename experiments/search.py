@@ -18,7 +18,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.store import Run, Store
-from gasil_jax import presets
 from gasil_jax.config import Config
 from gasil_jax.figures import statistics
 
@@ -257,24 +256,6 @@ class SingleSetting(Search):
                 return None
             ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
-
-
-@dataclasses.dataclass(frozen=True)
-class InverselyScaled(Search):
-    """A setting for all tasks that follows the dimension of an action.
-
-    It is the preset "scaled" but for the standard deviation of an untrained policy's
-    actions, which is two divided by the dimension and not one by its root.
-    """
-
-    def chosen(self, store: Store) -> Point:
-        """Return the task's point."""
-        size = presets.ACTION_SIZES[self.env]
-        return {
-            "learning_rate": 1.5e-3 / size,
-            "gamma": 0.995,
-            "initial_deviation": 2 / size,
-        }
 
 
 def importance(agent: str, store: Store) -> dict[str, float]:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import normalization, policy, train
+from gasil_jax import policy, train
 from gasil_jax.config import Config
 
 
@@ -75,8 +75,8 @@ def run_episodes(
         action = act(states.obs, None if deterministic else key)
         states = jax.vmap(env.step)(states, action)
         reward = states.info.get("true_reward", states.reward)
-        sound = normalization.is_sound(states.obs).all(axis=-1)
-        sound &= normalization.is_sound(reward)
+        sound = wrappers.is_sound(states.obs).all(axis=-1)
+        sound &= wrappers.is_sound(reward)
         # As in training, a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running

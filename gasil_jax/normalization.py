@@ -5,16 +5,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_envs import wrappers
+
 # From there, because a saved policy runs without JAX.
 from gasil_jax.numpy_policy import CLIP
-
-# From C MuJoCo (mjMAXVAL), for which a larger number means a failed simulation.
-_LARGEST = 1e10
-
-
-def is_sound(x: jax.Array) -> jax.Array:
-    """Return where numbers are finite and no larger than physics gives: x's shape."""
-    return jnp.abs(x) < _LARGEST  # False for NaN.
 
 
 class Normalizer(struct.PyTreeNode):
@@ -41,12 +35,12 @@ def init(observation_size: int) -> Normalizer:
 def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
     """Return the normalizer updated by a batch (..., obs).
 
-    Rows with a number for which `is_sound` is false are left out. Mean and sum of
-    squares are updated as in Chan, Golub, LeVeque 1979.
+    Rows with a number for which `wrappers.is_sound` is false are left out. Mean and sum
+    of squares are updated as in Chan, Golub, LeVeque 1979.
     """
     chex.assert_equal(observation.shape[-1:], normalizer.mean.shape)
     rows = observation.reshape(-1, observation.shape[-1])
-    valid = jnp.all(is_sound(rows), axis=-1, keepdims=True)
+    valid = jnp.all(wrappers.is_sound(rows), axis=-1, keepdims=True)
     rows = jnp.where(valid, rows, 0.0)
     count = jnp.sum(valid, dtype=jnp.float32)
     mean = jnp.sum(rows, axis=0) / jnp.maximum(count, 1.0)

@@ -19,15 +19,14 @@ from typing import Annotated, Any, Literal
 
 # MuJoCo reads this variable on import. Without a display, EGL can draw on a CPU too.
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
-    _HAS_EGL = find_library("EGL") is not None
-    os.environ.setdefault("MUJOCO_GL", "egl" if _HAS_EGL else "disable")
+    os.environ.setdefault("MUJOCO_GL", "egl" if find_library("EGL") else "disable")
 
 import jax
 import numpy as np
 import tyro
 
 from gasil_envs import pictures, wrappers
-from gasil_jax import normalization, policy
+from gasil_jax import policy
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, output_file
 from gasil_jax.host.progress import announced
@@ -91,7 +90,7 @@ def episode(
     states, total = [jax.device_get(state.pipeline_state)], 0.0
     for step_key in jax.random.split(key, num_steps):
         state = step(state, step_key)
-        if not normalization.is_sound(state.obs).all():
+        if not wrappers.is_sound(state.obs).all():
             break
         states.append(jax.device_get(state.pipeline_state))
         total += float(state.info.get("true_reward", state.reward))

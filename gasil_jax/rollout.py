@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import wrappers
-from gasil_jax import normalization
 from gasil_jax.networks import gaussian_log_prob
 
 
@@ -149,7 +148,7 @@ def collect(
       gamma: discount of the episodes' return.
 
     If the physics diverges, the episode terminates with reward 0 and the step is marked
-    in ``faulty``. It has diverged if `normalization.is_sound` is false for a number in
+    in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in
     the observation or for a reward, given or held back. An episode that is truncated
     here is given the reward that the environment still holds back,
     ``info["held_reward"]``.
@@ -178,9 +177,9 @@ def collect(
 
         true_reward = stepped.info.get("true_reward", stepped.reward)
         held = stepped.info.get("held_reward", jnp.zeros_like(stepped.reward))
-        sound = normalization.is_sound(stepped.obs).all(axis=-1)
+        sound = wrappers.is_sound(stepped.obs).all(axis=-1)
         for number in (stepped.reward, true_reward, held):
-            sound &= normalization.is_sound(number)
+            sound &= wrappers.is_sound(number)
         length = carry.episode_length + 1
         true_reward = jnp.where(sound, true_reward, 0.0)
         cut_off = wrappers.truncated(stepped)

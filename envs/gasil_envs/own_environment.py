@@ -93,21 +93,22 @@ def _check_states(name: str, env: Env) -> None:
             f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
         ) from None
     for state, where in ((bare, "reset"), (stepped, "step")):
-        expected = {"obs": (env.observation_size,), "reward": (), "done": ()}
-        values = {field: getattr(state, field) for field in expected}
-        for field in ("truncation", "true_reward"):
-            if field in state.info:
-                expected[f"info[{field!r}]"] = ()
-                values[f"info[{field!r}]"] = state.info[field]
-        for field, shape in expected.items():
-            value = values[field]
+        fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
+        of_info = {
+            f"info[{x!r}]": state.info[x]
+            for x in ("truncation", "true_reward")
+            if x in state.info
+        }
+        for field, value in (fields | of_info).items():
+            shape = (env.observation_size,) if field == "obs" else ()
             given = getattr(value, "shape", type(value).__name__)
             if given != shape:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} has the shape {given}, "
                     f"must have {shape}"
                 )
-            if value.dtype != jnp.float32:
+            # The wrappers take a truncation that is a bool, too.
+            if field in fields and value.dtype != jnp.float32:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} is {value.dtype}, must "
                     "be float32"

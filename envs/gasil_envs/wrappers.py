@@ -11,6 +11,9 @@ import jax
 import jax.numpy as jnp
 from brax.envs import Env, State, Wrapper
 
+#: From C MuJoCo (mjMAXVAL), for which a larger number means a failed simulation.
+_LARGEST = 1e10
+
 
 def truncated(state: State) -> jax.Array:
     """Return whether the episode was cut off in this step, bool, the shape of ``done``.
@@ -18,6 +21,11 @@ def truncated(state: State) -> jax.Array:
     It is false if the environment has no ``info["truncation"]``.
     """
     return state.info.get("truncation", jnp.zeros_like(state.done)) > 0
+
+
+def is_sound(x: jax.Array) -> jax.Array:
+    """Return where numbers are finite and no larger than physics gives: x's shape."""
+    return jnp.abs(x) < _LARGEST  # False for NaN.
 
 
 def action_range(env: Any) -> tuple[Any, Any]:
@@ -155,12 +163,10 @@ class FaultyStepEnds(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and terminate the episode if the physics fails."""
         stepped = self.env.step(state, action)
-        is_sound = lambda x: jnp.all(jnp.abs(x) <= 1e10)  # False of what is no number.
-        of_step = ("true_reward", "held_reward", "truncation")
-        checked = [stepped.info[x] for x in of_step if x in stepped.info]
-        sound = jnp.all(
-            jnp.array([*map(is_sound, (stepped.obs, stepped.reward, *checked))])
-        )
+        of_step = ("held_reward", *_LAST_STEP_INFO)
+        sound = is_sound(stepped.obs).all() & is_sound(stepped.reward)
+        for name in of_step:
+            sound &= is_sound(stepped.info.get(name, jnp.float32(0)))
         zero = lambda x: jnp.where(sound, x, jnp.zeros_like(x))
         info = {k: zero(x) if k in of_step else x for k, x in stepped.info.items()}
         return stepped.replace(

@@ -194,7 +194,8 @@ class Members:
         padded = np.arange(self.num_members + self._padding)
         index = np.minimum(padded, self.num_members - 1)
         # Not on one device first, whose memory may hold only its share.
-        return jax.tree.map(lambda x: jax.device_put(x[index], self.sharding), states)
+        padded_rows = lambda x: x[index] if self._padding else x
+        return jax.device_put(jax.tree.map(padded_rows, states), self.sharding)
 
     def trim(self, states: Any) -> Any:
         """Return the members' arrays without the padding: (members, ...)."""

@@ -222,7 +222,10 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
         ("--seeds 2 --devices 8", ["devices is 8, of which 2 are used"]),
         ("--seeds 2 --devices 2 --alpha 0.7", []),
         ("--agent ppo --gamma 0.9", []),
-        ("--decomposition-updates 9", ["is 9, which has no effect: decompose_"]),
+        (
+            "--decomposition-updates 9",
+            ["is 9, which has no effect: decompose_rewards is off"],
+        ),
         ("--decomposition-updates 9 --decompose-rewards", []),
         ("--agent gasil --decompose-rewards", ["'gasil' does not use the env"]),
         ("--agent ppo --alpha-schedule 1e5 0 2e5 1", ["alpha_schedule is ((1000"]),

@@ -259,6 +259,9 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
     env = gasil_envs.make("own_that_is_whole:Env", reward_delay=3)
     assert env.step(env.reset(jax.random.key(0)), jnp.zeros(1)).pipeline_state == 1
+    told = _OWN.replace("info={}", "info={**state.info, 'truncation': then > 2}")
+    (tmp_path / "own_with_truncation.py").write_text(told)
+    gasil_envs.make("own_with_truncation:Env", reward_delay=3)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from experiments import search
 from experiments.figures import FIGURES, Arm, Curve, Figure, grid
 from experiments.search import DELAY, PAIR, Search
 from experiments.store import RESULTS, Record, Store
+from gasil_jax import presets
 from gasil_jax.config import Config, validate
 
 STORE = Store(RESULTS / "runs")
@@ -115,3 +116,13 @@ def test_a_figure_over_delays_is_a_row():
     # Agents are compared where the delay is the same.
     others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
     assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]
+
+
+def test_the_inversely_scaled_setting_is_the_preset_with_other_exploration(tmp_path):
+    panels = FIGURES["exploration"].panels
+    for env, size in (("swimmer", 2), ("humanoid", 17)):
+        curve = panels[env]["ppo, decomposed, scaled inversely"]
+        config = curve.runs(Store(tmp_path))[0].config
+        scaled = presets.preset(env, "ppo", "scaled", 20)
+        assert config == scaled.replace(initial_deviation=2 / size)
+        assert config.decompose_rewards and config != scaled

@@ -13,12 +13,10 @@ from experiments.search import (
     CELLS,
     SPACES,
     TASKS,
-    InverselyScaled,
     Search,
     SingleSetting,
 )
 from experiments.store import Record, Store
-from gasil_jax import presets
 
 
 def fill(store, one, points, scores, seeds=(1000, 1001)):
@@ -103,15 +101,6 @@ def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
         scores[0] = 1e6 if number == 0 else -1.0
         fill(store, one, points, scores)
     assert single.chosen(store) == points[1]
-
-
-def test_the_inversely_scaled_setting_is_the_preset_with_other_exploration(tmp_path):
-    for env, size in (("swimmer", 2), ("humanoid", 17)):
-        one = InverselyScaled(env, "ppo", 20, decompose_rewards=True)
-        config = one.config(one.chosen(Store(tmp_path)))
-        scaled = presets.preset(env, "ppo", "scaled", 20)
-        assert config == scaled.replace(initial_deviation=2 / size)
-        assert config.decompose_rewards and config != scaled
 
 
 def test_which_values_suit_a_task_is_told(tmp_path):
