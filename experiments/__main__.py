@@ -40,6 +40,9 @@ _Results = Annotated[
 class Options:
     """Train the runs that a figure lacks, then write its page.
 
+    In the default folder all else that is made from stored runs is written too: the
+    other pages, the README's tables and the tuned presets.
+
     Attributes:
       quick: train a small version below the folder `runs`: three seeds of the first
         panel, or of those that `only` names, for 100,000 steps each.
@@ -81,17 +84,28 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
 def _small(figure: Figure, names: Sequence[str]) -> Figure:
     """Return the small version of a figure, of the named panels or the first one.
 
-    It has the presets "tuned" instead of what a search may not have chosen yet.
+    It has the presets "tuned" and "decomposed" instead of what a search may not have
+    chosen yet.
+
+    Raises:
+      InputError: if there is no panel of a name, or if only searches are named.
     """
-    figure = _selected(figure, names or [*figure.panels][:1])
+    small_figure = _selected(figure, names or [*figure.panels][:1])
+    if not small_figure.panels:
+        raise InputError(
+            f"only is {' '.join(names)}: --quick trains panels, which are "
+            f"{', '.join(figure.panels)}"
+        )
 
     def small(curve: Curve) -> Curve:
-        base = "tuned" if callable(curve.base) else curve.base
+        base = curve.base
+        if search := curve.search:
+            base = "decomposed" if search.decompose_rewards else "tuned"
         return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
 
     panels = {
         panel: {name: small(curve) for name, curve in curves.items()}
-        for panel, curves in figure.panels.items()
+        for panel, curves in small_figure.panels.items()
     }
     return dataclasses.replace(figure, panels=panels, searches={})
 
@@ -102,11 +116,13 @@ def _train(name: str, options: Options) -> None:
     part = shards.parse(options.part, "part")
     command_line.check_least(setup, devices=1, evaluate_episodes=0)
     if options.quick and results != RESULTS:
-        raise InputError(f"results is {results}: --quick writes below --runs")
+        raise InputError(
+            f"results is {results}: --quick writes below --runs instead, leave it out"
+        )
     if options.quick:
         setup = dataclasses.replace(setup, runs=setup.runs / "quick")
         results, figure = setup.runs / "results", _small(figure, options.only)
-    chosen = _selected(figure, options.only)
+    chosen = figure if options.quick else _selected(figure, options.only)
 
     def stores() -> tuple[Store, Store]:
         """Return the stores of the figure's runs and of the searches' runs."""

@@ -219,7 +219,8 @@ def training_row(
     config = config.replace(num_envs=options.training_envs or config.num_envs)
     # As many iterations in a call as the command line does at most.
     config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
-    batch = make_members(env, config, range(seeds), devices=jax.devices()[:devices])
+    with command_line.input_checked():
+        batch = make_members(env, config, range(seeds), devices=jax.devices()[:devices])
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began

@@ -83,12 +83,12 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
 def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
     """Return the differences of interquartile means whose curves all have scores.
 
-    The p-value is the percentile bootstrap's: the share of draws on the other side of
-    0, times two. That is too small where seeds are few, so that the difference of two
-    curves has the permutation test's if it is larger. Differences of differences have
-    the bootstrap's alone. In Holm's method the smallest is
-    multiplied by the number of comparisons, the next by one less, and none is smaller
-    than the one before.
+    The p-value is the percentile bootstrap's: twice the share of draws on the other
+    side of 0. With few seeds that is too small, so the difference of two curves has the
+    larger of it and the permutation test's; differences of differences have the
+    bootstrap's alone. Holm's method multiplies the smallest p-value by the number of
+    comparisons, the next by one less, and so on, and makes none smaller than the one
+    before.
     """
     raw = {}
     for key, terms in family.items():
@@ -114,9 +114,10 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
 def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
     """Return the probability of improvement over the panels, in words.
 
-    It is the probability that a seed of `ours` has more than one of `other`, in the
-    mean over the panels, with the 95% percentile bootstrap interval over seeds, drawn
-    within each panel (Agarwal et al. 2021). A score that is not a number, of a seed
+    It is the probability that a random seed of `ours` has a higher score than a random
+    seed of `other`, where equal scores count half, averaged over the panels, with the
+    95% percentile bootstrap interval over seeds, drawn within each panel (Agarwal et
+    al. 2021). A score that is not a number, of a seed
     that ended no episode, is less than all others.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
@@ -156,7 +157,7 @@ def in_words(middle: float, low: float, high: float) -> str:
 
 
 def interval(scores: np.ndarray) -> str:
-    """Return interquartile mean and 95% interval of (seeds,); of few seeds the mean."""
+    """Return the interquartile mean of (seeds,); and its interval, if not too few."""
     middle = float(interquartile_mean(scores))
     if len(scores) < FEWEST_SEEDS:
         return number(middle)

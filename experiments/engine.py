@@ -182,7 +182,7 @@ def train(program: Program) -> dict[Run, Record]:
     labels = dict(zip(_LABELS, (range(len(seeds)), seeds), strict=True))
     env = assembly.prepare(options, [members], [members])
     read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))
-    with run_folder.lock(run_folder.create(folder, "")):
+    with run_folder.lock(run_folder.create(folder)):
         runs = [{"experiment": x.experiment, "seed": x.seed} for x in program.runs]
         metrics_files.write_json(folder / _RUNS, {"runs": runs})
         provenance = _provenance(program)

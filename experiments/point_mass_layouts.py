@@ -38,7 +38,11 @@ class Options:
 
 
 def draw(number: int) -> Layout:
-    """Layout `number`: greens and distractors above, blues anywhere, half mirrored."""
+    """Draw layout `number`.
+
+    Green objects and distractors are in the upper half, blue ones anywhere but at the
+    top, and half of the layouts are mirror-symmetric.
+    """
     rng = np.random.default_rng(number)
     mirrored = rng.random() < 0.5
     objects: list[tuple[float, float]] = []

@@ -51,18 +51,20 @@ PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 
 _READING = """## How to read this
 
-A final return is the interquartile mean over seeds of the mean return over the last
-tenth of training, of the episodes that the acting policy ended; in brackets its 95%
-interval, by the percentile bootstrap over seeds, which covers a little less with ten.
-"Evaluated" is the same mean of the last policy's returns with its mean actions, without
-noise, over the seeds that were evaluated: in brackets how many, if not all. Better and
-worse are verdicts on differences, by a permutation test and the bootstrap
-together (differences of differences: by the bootstrap alone), corrected by Holm's
-method for the {} comparisons of this page: where nothing differs, any verdict at all
-has a probability of 5%. They are about these settings; that another search might have
-chosen others is not in the intervals. "Not clear" does not mean that two are equal. The
-probability of improvement is that of a seed of one curve having more than one of the
-other, averaged over the tasks."""
+A final return is the mean return of the episodes that end in the last tenth of
+training, with the acting policy. Shown is the interquartile mean over seeds and, in
+brackets, its 95% interval, by the percentile bootstrap over seeds, which covers a
+little less than 95% with ten seeds. "Evaluated" is the interquartile mean of the last
+policy's returns with its mean actions, without noise, over the seeds that were
+evaluated: in brackets how many, if not all. Better and worse are verdicts on
+differences, by a permutation test and the bootstrap together (differences of
+differences: by the bootstrap alone), corrected by Holm's method for the {} comparisons
+of final returns on this page: where nothing differs, the probability of any verdict at
+all is 5% at most. Verdicts on evaluated returns are a family of their own. All verdicts
+are about these settings: the intervals leave out that another search might have chosen
+others. "Not clear" does not mean that two are equal. The probability of improvement is
+the probability that a random seed of the first curve has a higher return than a random
+seed of the second, where equal ones count half, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -102,7 +104,7 @@ class Results:
         return len(self.records) == self.curve.seeds
 
     @property
-    def seeds(self) -> str:
+    def seeds_in_words(self) -> str:
         """How many seeds there are, in words."""
         of = "" if self.complete else f" of {self.curve.seeds}"
         return f"{len(self.records)}{of}"
@@ -120,7 +122,7 @@ class Results:
 
     @property
     def evaluated_in_words(self) -> str:
-        """Their interquartile mean and, if not all seeds have one, their number."""
+        """The interquartile mean of `evaluated`, and how many if not all seeds were."""
         if not len(self.evaluated):
             return ""
         count = len(self.evaluated)
@@ -202,7 +204,7 @@ class Page:
         head += [f"{favourite} ahead by", f"{favourite} is"] if favourite else []
         rows = []
         for (panel, label), results in self.results.items():
-            cells = [panel, label, results.seeds, interval(results.final)]
+            cells = [panel, label, results.seeds_in_words, interval(results.final)]
             cells.append(results.evaluated_in_words)
             if favourite:
                 rival = str(self.figure.rival(panel, label))
@@ -291,14 +293,14 @@ class Page:
         percentile bootstrap's over seeds, drawn within each task; the unit is not
         drawn anew. The curves must have scores on all of these tasks, dense or delayed.
         """
-        dense: dict[str, list[str]] = {}
+        panels_of: dict[str, list[str]] = {}
         for panel, curves in self.figure.panels.items():
             curve = next(iter(curves.values()))
             if (name_of(curve.env), unit) in self.scores:
-                delayed = "delayed" if curve.reward_delay > 1 else "dense"
-                dense.setdefault(delayed, []).append(panel)
+                kind = "delayed" if curve.reward_delay > 1 else "dense"
+                panels_of.setdefault(kind, []).append(panel)
         rows = []
-        for kind, panels in dense.items():
+        for kind, panels in panels_of.items():
             for name in self.figure.names(panels):
                 having = [panel for panel in panels if (panel, name) in self.scores]
                 if having == panels:

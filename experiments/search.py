@@ -4,9 +4,9 @@ Episodes are staggered and rewards are normalized. Every agent is searched with 
 number of points on every task, dense and delayed, with two seeds of the search's own.
 Where the best point has a value at an end of its grid, the next value beyond is tried
 too. The best points of all these are trained with more seeds before one is chosen,
-because two seeds decide little on tasks whose outcomes are bimodal. So one table gives
-the best point of each task, which is the paper's protocol, and the best single point of
-all delayed tasks. Figures train the chosen points with seeds of their own.
+because two seeds decide little on tasks whose outcomes are bimodal. So the same runs
+give the best point of each task, which is the paper's protocol, and the best single
+point for all delayed tasks. Figures train the chosen points with seeds of their own.
 """
 
 import dataclasses
@@ -70,8 +70,8 @@ SPACES: Mapping[str, Space] = {
     },
 }
 AGENTS = tuple(SPACES)
-#: The values below and above a grid, where an agent may have them. How the size of the
-#: buffer matters has a figure of its own.
+#: The next value below and above each grid, or None if none is tried. The buffer's size
+#: has a figure of its own.
 _BEYOND: Mapping[str, tuple[Any, Any]] = {
     "learning_rate": (3e-5, 1.2e-3),
     "gae_lambda": (0.9, None),
@@ -105,7 +105,7 @@ def draw(agent: str) -> tuple[Point, ...]:
 
 
 def beyond(agent: str, point: Point) -> Iterator[Point]:
-    """Give a point with each of its values at an end of a grid one step further."""
+    """Yield, for each value at an end of its grid, the point with the value beyond."""
     for name, values in SPACES[agent].items():
         for end, further in zip((values[0], values[-1]), _BEYOND[name], strict=True):
             if point[name] == end and further is not None:

@@ -48,14 +48,14 @@ def _ahead(delay: int, others: Sequence[str]) -> dict[str, list[_Expected]]:
     return {p: [((p, "ppo+gasil", x), "better") for x in others] for p in panels}
 
 
-def _comparisons(name: str, start: str = "") -> dict[str, list[_Expected]]:
+def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
     """Expect the first of two curves to be better, in each comparison of a figure.
 
     Args:
       name: name of the figure.
-      start: how the names of the panels begin that count.
+      prefix: only panels whose names begin with it count.
     """
-    keys = [key for key in FIGURES[name].compared() if key[0].startswith(start)]
+    keys = [key for key in FIGURES[name].compared() if key[0].startswith(prefix)]
     return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
 
 
@@ -134,9 +134,10 @@ class Summary:
             return "not measured yet"
         agree = [case for case, agrees in measured.items() if agrees]
         opposite = [
-            case
+            case if len(claim.cases[case]) == 1 else f"{case} against {key[2]}"
             for case in measured
-            if any(compared[k].verdict == _OPPOSITE[x] for k, x in claim.cases[case])
+            for key, verdict in claim.cases[case]
+            if compared[key].verdict == _OPPOSITE[verdict]
         ]
         lacking = len(claim.cases) - len(measured)
         if len(agree) >= claim.needed:
@@ -148,7 +149,7 @@ class Summary:
         words = f"{word}: in {len(agree)} of {len(measured)} cases"
         words += f" ({'; '.join(agree)})" if agree else ""
         if opposite:
-            words += f"; the opposite in {len(opposite)} ({'; '.join(opposite)})"
+            words += f"; the opposite: {', '.join(opposite)}"
         return words + (f"; {lacking} not measured yet" if lacking else "")
 
     def claims(self) -> str:

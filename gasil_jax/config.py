@@ -9,7 +9,7 @@ import dataclasses
 import inspect
 import math
 import numbers
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -210,17 +210,19 @@ class Config:
     """Whether PPO sees, instead of a reward that arrives late, a reward for each step
     that a network learns from the sums that are paid (see reward_decomposition)."""
     decomposition_updates: int = _count(20)
-    """Gradient steps of the network that decomposes rewards in an iteration."""
+    """Gradient steps in an iteration of the network that decomposes rewards."""
     decomposition_minibatch_size: int = _count(64)
-    """Windows between two payouts in one gradient step of that network."""
+    """Windows between two payouts in one gradient step of the network that decomposes
+    rewards."""
     decomposition_window_steps: int = _count(32)
-    """Steps that represent a window in a gradient step of that network: all of a
-    window that has no more, and as many drawn at random of a longer one."""
+    """Steps of each window in one gradient step of the network that decomposes rewards:
+    all steps of a window that has no more, otherwise this many, drawn at random."""
     decomposition_history_episodes: int = _count(1)
     """Length of the history that windows are drawn from, in episodes of the largest
-    length, beside a batch. Where rewards come once an episode, 1 holds few windows."""
+    length; a batch comes on top. If rewards come only at the end of an episode, 1
+    leaves few windows."""
     decomposition_hidden_sizes: tuple[int, ...] = _count((100, 100))
-    """Widths of the tanh layers of that network."""
+    """Widths of the tanh layers of the network that decomposes rewards."""
     stagger_episodes: bool = True
     """Whether each environment's first episode begins at a random age, so that a batch
     holds steps from all parts of an episode. Otherwise all begin at age 0, and where
@@ -351,13 +353,12 @@ _LARGEST_COUNT = 2**31 - 1
 _LARGEST_FLOAT = 3.4e38
 
 
-def validate(config: Config, agents: Sequence[str]) -> None:
+def validate(config: Config) -> None:
     """Check that every value of a config is allowed.
 
     Args:
       config: the config to check. Hyperparameters that are arrays are skipped, because
         they may be traced.
-      agents: names of the registered agents; MODULE:NAME is allowed besides.
 
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
@@ -370,8 +371,6 @@ def validate(config: Config, agents: Sequence[str]) -> None:
             raise _refusal(field.name, value, "a string")
     if not isinstance(config.expert, str | None):
         raise _refusal("expert", config.expert, "a string or None")
-    if config.agent not in agents and ":" not in config.agent:
-        raise ValueError(unknown("agent", config.agent, agents, ["MODULE:NAME"]))
     hyperparameters_of(config.agent)
     _validate_sizes(config)
     for name in ("num_envs", "minibatch_size"):
@@ -423,7 +422,7 @@ def _validate_sizes(config: Config) -> None:
                 _validate_number(name, size, allowed)
         elif name != "total_steps":
             _validate_number(name, value, allowed)
-    # The iterations are counted.
+    # The number of iterations is an int32.
     most = _LARGEST_COUNT * config.batch_steps
     allowed = ranges(Config)["total_steps"]
     _validate_number("total_steps", config.total_steps, allowed, most)

@@ -29,10 +29,10 @@ def unknown(
       allowed: the names that exist.
       forms: what other names look like, such as MODULE:NAME.
     """
-    return f"{kind} {name!r} is unknown: {instead(name, allowed, forms)}"
+    return f"{kind} {name!r} is unknown: {did_you_mean(name, allowed, forms)}"
 
 
-def instead(name: str, allowed: Sequence[str], forms: Sequence[str] = ()) -> str:
+def did_you_mean(name: str, allowed: Sequence[str], forms: Sequence[str] = ()) -> str:
     """Return what is allowed in place of a name: the nearest, if one is near, and all.
 
     Names with spaces are quoted, as on a command line.

@@ -137,7 +137,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     )
     env, seeds = policies.env, policies.seeds
     locomotion = environments.is_locomotion(env)
-    if options.gymnasium and not (locomotion and not options.stochastic):
+    if options.gymnasium and (options.stochastic or not locomotion):
         raise InputError(
             "gymnasium is on: the run must be of a locomotion task, and stochastic "
             "must be off"

@@ -3,9 +3,10 @@
 Paper, section 4.1. The capacity is in steps. All steps ever offered are ordered by
 (return descending, episode, time) and the first `capacity` are kept, so the last
 admitted episode may be cut. On a tie the older episode stays. An episode is offered as
-a whole once it has ended. It is ranked by the discounted return R = sum_t gamma^t r_t
-of the environment's own reward. All functions are pure and work under jit, vmap and
-shard_map; an empty buffer is a normal state.
+a whole once it has ended. It is ranked by the return of the environment's own reward:
+R = sum_t gamma^t r_t, or the undiscounted sum if `Config.buffer_discounts` is false.
+All functions are pure and work under jit, vmap and shard_map; an empty buffer is a
+normal state.
 """
 
 import chex
@@ -73,7 +74,7 @@ class Episodes(struct.PyTreeNode):
     """Ended episodes offered to the buffer; entries with ``length == 0`` are empty.
 
     Attributes:
-      return_: float32 (E,), discounted return.
+      return_: float32 (E,), the return that episodes are ranked by.
       length: int32 (E,), number of steps.
       env: int32 (E,), index of the environment that the episode ran in.
       last: int32 (E,), index of its last step in that environment's ring.
@@ -219,17 +220,13 @@ def insert(
     slot = jnp.arange(capacity, dtype=jnp.int32)
     filled = slot < good_trajectories.size
     # The buffer's own content as episodes: one at each first step, and elsewhere
-    # entries of length 0.
+    # entries of length 0. An episode ends where the next one starts.
     starts = filled & (good_trajectories.time == 0)
-    next_start = jnp.minimum(
-        jnp.flip(jax.lax.cummin(jnp.flip(jnp.where(starts, slot, capacity)))),
-        good_trajectories.size,
+    next_start = jax.lax.cummin(
+        jnp.where(starts, slot, good_trajectories.size), reverse=True
     )
-    # next_start[i] is the first start at or after i, where the episode before it ends.
     following = jnp.append(next_start[1:], good_trajectories.size)
-    kept_length = jnp.where(
-        starts, jnp.minimum(following, good_trajectories.size) - slot, 0
-    )
+    kept_length = jnp.where(starts, following - slot, 0)
     offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
     length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
     return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])

@@ -7,7 +7,7 @@ from flax import struct
 
 from gasil_envs import wrappers
 
-# From there, because a saved policy runs without JAX.
+# Defined there, because a saved policy runs without JAX.
 from gasil_jax.numpy_policy import CLIP
 
 

@@ -50,8 +50,8 @@ def zoo() -> tuple[str, ...]:
 
 def _file(path: str | pathlib.Path) -> pathlib.Path:
     """Return the file of a saved policy."""
-    prefix, name = str(path)[: len(ZOO_PREFIX)], str(path)[len(ZOO_PREFIX) :]
-    if prefix == ZOO_PREFIX:
+    if str(path).startswith(ZOO_PREFIX):
+        name = str(path).removeprefix(ZOO_PREFIX)
         if name not in zoo():
             raise ValueError(unknown("policy of the zoo", name, zoo()))
         return ZOO / f"{name}.npz"

@@ -1,4 +1,4 @@
-"""Random permutations: the numbers of `jax.random.permutation`, sooner on a CPU.
+"""Random permutations equal to those of `jax.random.permutation`, faster on a CPU.
 
 JAX orders the numbers by random keys of 32 bits. XLA's CPU sorts a single array several
 times as fast as keys with values, and PPO draws a permutation in each of its epochs.
@@ -44,8 +44,8 @@ def argsort(keys: jax.Array) -> jax.Array:
     few neighbours with the same high bits are then put in order by exchanges.
 
     Args:
-      keys: uint32 (size,), at most 2**16 of them. Any keys are sorted, but random ones
-        soon.
+      keys: uint32 (size,), at most 2**16 of them. The result is right for any keys;
+        the function is fast for random ones.
     """
     size = keys.shape[0]
     low_bits = jnp.uint32(2 ** (size - 1).bit_length() - 1)

@@ -78,7 +78,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
         raise InputError(f"{path} has no curves to draw yet")
     metrics = read_table("metrics.csv", "episode_return")
     steps, returns = metrics["env_steps"][0], metrics["episode_return"]
-    env_steps, means = plotting.in_parts(steps, returns)
+    env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
     default = f"{described['env']}, {described['config'].agent}"

@@ -43,8 +43,12 @@ TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
 #: The locomotion tasks, each with the dimension of its actions.
 ACTION_SIZES = {
-    **{"hopper": 3, "walker2d": 6, "halfcheetah": 6},
-    **{"swimmer": 2, "ant": 8, "humanoid": 17},
+    "hopper": 3,
+    "walker2d": 6,
+    "halfcheetah": 6,
+    "swimmer": 2,
+    "ant": 8,
+    "humanoid": 17,
 }
 # One setting for every locomotion task, chosen on two seeds a task with rewards delayed
 # by 20 steps (experiments/notes/adaptive_ablation.md).
@@ -151,7 +155,7 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
         raise ValueError(unknown("preset", name, names()))
     find_agent(agent)
     chosen = PRESETS[name]
-    row = _row(chosen, env, agent, reward_delay) or {}
+    row = _row(chosen, env, agent, reward_delay)
     return Config(agent=agent).replace(**{**chosen.every, **row})
 
 
@@ -161,6 +165,6 @@ def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> boo
     return bool(chosen.every or _row(chosen, env, agent, reward_delay))
 
 
-def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides | None:
+def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides:
     rows = chosen.delayed if reward_delay > 1 else chosen.dense
-    return rows.get((env, agent))
+    return rows.get((env, agent), {})

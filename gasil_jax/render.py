@@ -34,7 +34,8 @@ from gasil_jax.sweeps.saved_states import load_policies
 
 _PICTURES = (".mp4", ".gif", ".png")
 _PAGE = ".html"
-# Of a frame, in pixels: all frames are in memory at once.
+# Limit of a frame's width and height in pixels, because all frames are in memory at
+# once.
 _LARGEST_SIZE = 4096
 
 
@@ -165,11 +166,11 @@ def save(
     if path.suffix == ".png":
         return write_strip(env, states, size, path)
     frames, fps = frames_of(env, states, size)
-    write(frames, fps, path)
+    write_film(frames, fps, path)
     return len(frames)
 
 
-def write(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
+def write_film(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
     """Write frames as a film, .mp4 or .gif.
 
     Raises:
@@ -205,7 +206,8 @@ def write_strip(
 ) -> int:
     """Write up to eight moments of an episode in two rows, each above its time.
 
-    The letters are as large as a column of a paper needs, four pictures wide.
+    The times are large enough to read when the strip, four pictures wide, fills a
+    column of a paper.
 
     Returns:
       The number of moments.
@@ -277,17 +279,17 @@ def _main(arguments: Sequence[str] | None) -> None:
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     steps = min(options.steps, num_steps)
     with announced("render", "compiling and running the episode"):
-        path, total = episode(env, act, jax.random.key(options.key), steps)
+        states, total = episode(env, act, jax.random.key(options.key), steps)
     try:
         with (
             announced("render", f"drawing {options.out}"),
             output_file.whole(options.out) as partial,
         ):
-            num_frames = save(env, path, size, partial)
+            num_frames = save(env, states, size, partial)
     except pictures.NoOpenGL as error:
         raise OSError(str(error)) from error
     print(
-        f"seed {seeds[0]}: return {total:.1f} in {len(path) - 1} steps, "
+        f"seed {seeds[0]}: return {total:.1f} in {len(states) - 1} steps, "
         f"{num_frames} frames in {options.out}"
     )
 

@@ -2,22 +2,22 @@
 
 A window is the steps between two payouts: it ends where the reward is not zero or the
 episode ends. Windows are known from rewards alone, so this works in any environment. A
-network g of (observation, action, next observation) gives each step a reward such that
-the mean over a window is the mean of what the window paid, by gradient steps on
+network g of (observation, action, next observation) learns the reward of a step in
+standard units. With m and s the running mean and standard deviation of payout / length,
+it takes gradient steps on
 
-    (mean_window g - (payout / length - m) / s)^2
+    (mean_window g - (payout / length - m) / s)^2.
 
-with m and s the running mean and standard deviation of payout / length. A window that
-is longer than `Config.decomposition_window_steps` is represented by as many of its
-steps, drawn at random, as in randomized return decomposition (Ren et al. 2022,
-arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
+A window that is longer than `Config.decomposition_window_steps` is represented by as
+many of its steps, drawn at random, as in randomized return decomposition (Ren et al.
+2022, arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
 
-PPO then sees m + s g instead of the environment's reward. What a window paid beyond
-the sum of that is shared evenly by its steps: so a window's sum is what it paid, before
-the network has learned anything the payout is spread evenly, and where every step pays
-the reward is the environment's own. Of a window that began in an earlier batch only the
-steps of this batch get their share, because PPO has learned from the others already;
-its sum then lacks theirs.
+PPO then sees m + s g instead of the environment's reward. The difference between what a
+window paid and the sum of m + s g over it is shared evenly by its steps. So a window's
+rewards sum to what it paid; before the network has learned anything the payout is
+spread evenly; and where every step pays, the reward is the environment's own. If a
+window began in an earlier batch, only its steps in this batch get their share, because
+PPO has already learned from the others; the sum then lacks the others' shares.
 """
 
 from collections.abc import Callable
@@ -95,7 +95,7 @@ def init(
       key: key for the network's parameters.
       config: sizes of the network.
       history: the empty history beside which it records.
-      action_size: number of actions.
+      action_size: dimension of an action.
     """
     num_envs, steps, observation_size = history.observation.shape
     observation = jnp.zeros(observation_size)
@@ -183,12 +183,13 @@ def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
         share = jnp.where(ends, rest, share)
         return share, share
 
-    return jax.lax.scan(backward, jnp.zeros_like(rest[0]), (rest, ends), reverse=True)[
-        1
-    ]
+    start = jnp.zeros_like(rest[0])
+    return jax.lax.scan(backward, start, (rest, ends), reverse=True)[1]
 
 
-def fit(predicted: jax.Array, actual: jax.Array, valid: jax.Array) -> Metrics:
+def goodness_of_fit(
+    predicted: jax.Array, actual: jax.Array, valid: jax.Array
+) -> Metrics:
     """Return how well windows are explained; NaN where there are fewer than two.
 
     Args:
@@ -269,7 +270,7 @@ def decompose(
     before = step_rewards(decomposition.network.params, decomposition.rates)
     total, length, _ = window_sums(before, ends, *running)
     rate = batch.reward / length
-    metrics = fit(total / length, rate, scored & (length > 1))
+    metrics = goodness_of_fit(total / length, rate, scored & (length > 1))
     rates = normalization.update(
         decomposition.rates, jnp.where(scored, rate, jnp.nan)[..., None]
     )
@@ -347,7 +348,7 @@ def _train(
         index = jnp.searchsorted(counts, jnp.floor(rank).astype(jnp.int32), "right")
         env, end = jnp.divmod(jnp.minimum(index, counts.size - 1), steps)
         length = complete.length[env, end]
-        offset, weight = represent(step_key, length, num_rows)
+        offset, weight = sample_window_steps(step_key, length, num_rows)
         position = (history.cursor + end[:, None] - offset) % steps
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
         drawn = (env, position, weight, target)
@@ -394,7 +395,7 @@ def mean_gradient(
     return jax.tree.map(lambda x: x / parts, total)
 
 
-def represent(
+def sample_window_steps(
     key: jax.Array, length: jax.Array, num_steps: int
 ) -> tuple[jax.Array, jax.Array]:
     """Return the steps that stand for each window, and their weights in its mean.

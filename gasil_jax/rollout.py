@@ -26,8 +26,9 @@ class Rollout(struct.PyTreeNode):
       truncated: bool (time, env), whether the episode was cut off; its value is then
         bootstrapped.
       episode_return: float32 (time, env), sum of the true rewards up to this step.
-      discounted_return: float32 (time, env), sum of gamma^t reward up to this step;
-        NaN from the first faulty step on, and where the episode was cut short.
+      discounted_return: float32 (time, env), sum of gamma^t reward up to this step,
+        with gamma 1 if `Config.buffer_discounts` is false; NaN from the first faulty
+        step on, and where the episode was cut short.
       episode_length: int32 (time, env), number of steps up to this one.
       faulty: bool (time, env), whether the physics failed in this step.
       cut_short: bool (time, env), whether the episode was truncated before it reached
@@ -67,7 +68,8 @@ class EnvironmentStates(struct.PyTreeNode):
     Attributes:
       state: the environments' states, a Brax ``State``.
       episode_return: float32 (env,), sum of the true rewards so far.
-      discounted_return: float32 (env,), sum of gamma^t reward so far.
+      discounted_return: float32 (env,), sum of gamma^t reward so far, with the same
+        gamma.
       discount: float32 (env,), gamma^t.
       episode_length: int32 (env,), number of steps so far.
       starting_age: int32 (env,), the age at which the running episode began. The

@@ -19,11 +19,11 @@ from gasil_jax.host.members import Members
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_options import (
     Options,
-    begun_run,
     check,
     check_out,
     open_folder,
     parse,
+    resumed_folder,
     seeds_of,
     write_config,
 )
@@ -165,7 +165,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = parse(Options, arguments, "gasil_jax.run", begun_run(arguments))
+    options = parse(Options, arguments, "gasil_jax.run", resumed_folder(arguments))
     check(options)
     check_out(options)
     # A run is a sweep of one point, in one program.

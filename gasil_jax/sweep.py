@@ -120,15 +120,16 @@ def _main(arguments: Sequence[str] | None) -> None:
         options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
         return
-    began = run_options.begun_run(arguments)
+    resumed = run_options.resumed_folder(arguments)
     if given.shard is not None:
         shard = shards.parse(given.shard)
         folder = _shard_folder(shard, given.out)
         _train_shard(arguments, shard, folder, bool(given.resume))
-    elif began is not None and (text := run_folder.read(began).get("shard")):
-        _train_shard(arguments, shards.parse(text), began, resume=True)
+    elif resumed is not None and (text := run_folder.read(resumed).get("shard")):
+        _train_shard(arguments, shards.parse(text), resumed, resume=True)
     else:
-        _train_whole(run_options.parse(Options, arguments, _PROGRAM, began), began)
+        options = run_options.parse(Options, arguments, _PROGRAM, resumed)
+        _train_whole(options, resumed)
 
 
 def _placement(
@@ -178,20 +179,20 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     return [program for program in programs if program.number in left]
 
 
-def check_points(points: Sequence[Point], began: pathlib.Path | None) -> None:
+def check_points(points: Sequence[Point], resumed: pathlib.Path | None) -> None:
     """Raise `InputError` if the sweep that has begun in a folder has other points."""
-    if began is not None and list(run_folder.read(began)["points"]) != list(points):
+    if resumed is not None and list(run_folder.read(resumed)["points"]) != list(points):
         raise InputError(
-            f"out is {began}, where a sweep of other points has begun: name the same "
-            "points or another folder"
+            f"out is {resumed}, where a sweep of other points has begun: name the "
+            "same points or another folder"
         )
 
 
-def _plan_here(
-    options: Options, began: pathlib.Path | None
+def _plan_without_launcher(
+    options: Options, resumed: pathlib.Path | None
 ) -> tuple[list[dict[str, Any]], list[Program]]:
     points, programs = plan(options)
-    check_points(points, began)
+    check_points(points, resumed)
     if options.shards is not None:
         raise InputError(
             f"shards is {options.shards}: it needs --launcher (one part is --shard)"
@@ -199,8 +200,8 @@ def _plan_here(
     return points, programs
 
 
-def _train_whole(options: Options, began: pathlib.Path | None) -> None:
-    points, programs = _plan_here(options, began)
+def _train_whole(options: Options, resumed: pathlib.Path | None) -> None:
+    points, programs = _plan_without_launcher(options, resumed)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
     run_options.check_out(options)
@@ -228,13 +229,14 @@ def _train_shard(
     resume: bool,
 ) -> None:
     """Train a shard in its own folder or, if `resume` is true, continue it."""
-    began = shard_folder if resume and run_folder.is_described(shard_folder) else None
-    options = run_options.parse(Options, arguments, _PROGRAM, began)
+    begun = run_folder.is_described(shard_folder)
+    resumed = shard_folder if resume and begun else None
+    options = run_options.parse(Options, arguments, _PROGRAM, resumed)
     options = dataclasses.replace(options, out=shard_folder)
-    points, programs = _plan_here(options, began)
+    points, programs = _plan_without_launcher(options, resumed)
     programs = shards.share(programs, shard)
     trained = tables.Trained(shard_folder, programs)
-    if began is not None and not trained.unfinished():
+    if resumed is not None and not trained.unfinished():
         print(f"shard {shard} is done, in {shard_folder}")
         return
     run_options.check_out(options)
@@ -259,13 +261,12 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
     points, programs = plan(options)
-    every = [
-        shards.Shard(number, options.shards) for number in range(1, options.shards + 1)
-    ]
-    shards.share(programs, every[-1])
+    last = shards.Shard(options.shards, options.shards)
+    shards.share(programs, last)  # Refuses more shards than members.
     shards.refuse_whole(options.out)
-    shards.refuse_recut(options.out, every[-1])
+    shards.refuse_recut(options.out, last)
     shards.refuse_used(options.out, options.resume)
+    every = [shards.Shard(number, last.count) for number in range(1, last.count + 1)]
     # A job that is run again after its process died continues.
     where = ["--resume", "--out", str(options.out.absolute())]
     jobs = {

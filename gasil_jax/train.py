@@ -26,7 +26,7 @@ from gasil_jax import (
 )
 from gasil_jax.config import Config, Hyperparameters, validate
 from gasil_jax.errors import unknown
-from gasil_jax.imitation import agents, find_agent
+from gasil_jax.imitation import find_agent
 from gasil_jax.imitation.adaptive import RULES
 from gasil_jax.imitation.adversarial import BONUSES
 from gasil_jax.imitation.interface import Context, Imitation
@@ -79,7 +79,14 @@ def init(
     key: jax.Array,
     hyperparameters: Hyperparameters | None = None,
 ) -> TrainState:
-    """The state before the first iteration. The key is consumed."""
+    """Return the training state before the first iteration.
+
+    Args:
+      env: one environment with Brax's interface, not wrapped to reset itself.
+      config: decides the agent and all shapes; only `make_train` checks it.
+      key: random key; consumed.
+      hyperparameters: scalars, which may be traced; default the config's.
+    """
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
     # Of the agent's class, with its own numbers.
@@ -139,7 +146,7 @@ def init(
 
 
 def _networks(env: Any, config: Config) -> tuple[Any, Any]:
-    # Flax says of `apply` that it may give changed variables too: Any is narrower.
+    # Typed as Any because Flax declares that `apply` may also return variables.
     return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
 
 
@@ -154,6 +161,7 @@ def _init_actor_critic(
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(hyperparameters)
     num_streams = find_agent(config.agent).num_streams
+    # The first value gets the key itself, so that it is the same in all agents.
     value_keys = [value_key, *jax.random.split(value_key, num_streams)[1:]]
     policy_params = policy.init(policy_key, observation)
     policy_params["params"]["log_std"] += jnp.log(hyperparameters.initial_deviation)
@@ -169,8 +177,17 @@ def _init_actor_critic(
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
-    Returns the next state and a dict of float32 scalars. Means over the whole episodes
-    that ended in the batch are NaN if none did.
+    Args:
+      env: the environment that `init` was given.
+      config: the config that `init` was given.
+      state: the state before the iteration.
+
+    Returns:
+      The next state, and metrics, float32 () each; means over the whole episodes that
+      ended in the batch are NaN if none did.
+
+    Raises:
+      ValueError: if an agent's metric has a name that is taken.
     """
     agent = find_agent(config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
@@ -184,7 +201,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Update the good trajectory buffer.
     history, buffer = remember(config, state, batch, hyperparameters)
-    # The buffer ranks and keeps what the environment gives; what PPO maximizes is this.
+    # The buffer ranks and keeps the environment's own rewards; PPO maximizes these.
     rewards, reward_metrics = learner_rewards(
         env,
         config,
@@ -205,8 +222,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         policy=policy,
         value=value,
     )
-    # Sample good trajectories, update the discriminator by equation 8, and shape the
-    # reward with it (section 4.3): what the agent imitates with does so.
+    # The agent's own part of Algorithm 1: sample good trajectories, update the
+    # discriminator (equation 8) and shape the reward with it (section 4.3).
     imitation, streams, imitation_metrics = agent.update_and_reward(
         state.imitation, context, imitate_key
     )
@@ -300,7 +317,8 @@ def remember(
         state.history,
         batch.observation,
         batch.action,
-        # No return of an episode with a faulty step, or of one cut short, is one.
+        # NaN marks an episode whose return does not count: one with a faulty step, or
+        # one that was cut short.
         jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
         batch.ended,
         batch.next_observation,
@@ -372,7 +390,7 @@ def learner_rewards(
             hyperparameters=hyperparameters,
             action_range=wrappers.action_range(env),
         )
-        # What is not a number in the history marks an episode without a return.
+        # A NaN reward in the history marks an episode that has no valid return.
         has_no_return = jnp.isnan(history.reward)
         history = history.replace(
             reward=jnp.where(has_no_return, jnp.nan, decomposition.reward)
@@ -533,7 +551,7 @@ def check(env: Any, config: Config) -> None:
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
-    validate(config, agents())
+    validate(config)
     for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
         if (value := getattr(config, name)) not in allowed:
             raise ValueError(unknown(name, value, tuple(allowed)))

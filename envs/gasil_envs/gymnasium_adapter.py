@@ -130,10 +130,11 @@ class GymnasiumEnv(gymnasium.Env):
             self._episode.append(self._state.pipeline_state)
 
     def _time_limits(self) -> list[Any]:
-        """Return the `TimeLimit` wrappers around it, which call `reset`.
+        """Return the `TimeLimit` wrappers around this environment, from the call stack.
 
-        `gymnasium.make` keeps its argument max_episode_steps from the environment and
-        wraps it; an environment does not know its wrappers, but these have called it.
+        `gymnasium.make` does not pass max_episode_steps on but wraps the environment in
+        a `TimeLimit`. An environment has no reference to its wrappers, but their
+        `reset` has called this one, so each is the `self` of a caller's frame.
         """
         limits, frame = [], inspect.currentframe()
         while frame is not None:
@@ -234,6 +235,6 @@ def register() -> None:
         )
 
 
-# As an entry point of the installed package this would make every program that imports
-# Gymnasium load JAX.
+# Not an entry point of the package: every program that imports Gymnasium would then
+# load JAX.
 register()

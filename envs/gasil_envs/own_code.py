@@ -12,7 +12,7 @@ def find(kind: str, name: str) -> Any:
     """Return the object that MODULE:NAME names.
 
     Args:
-      kind: what it is of, for the error message, such as "env".
+      kind: what the object is, for the error message, such as "env".
       name: MODULE:NAME.
 
     Raises:
@@ -41,8 +41,4 @@ def in_a_line(error: Exception) -> str:
     return f"{message} ({frame.filename}, line {frame.lineno})"
 
 
-_NOT_THE_USERS = (
-    str(pathlib.Path(jax.__file__).parent),
-    __file__,
-    str(pathlib.Path(__file__).with_name("own_environment.py")),
-)
+_NOT_THE_USERS = tuple(str(pathlib.Path(x).parent) for x in (jax.__file__, __file__))

@@ -42,21 +42,6 @@ class Settings:
     integrator: str = "model"
 
 
-def _constructors() -> dict[str, Callable[[Settings], Env]]:
-    def of_task(name: str) -> Callable[[Settings], Env]:
-        return lambda settings: locomotion.Locomotion(
-            name,
-            physics=settings.physics,
-            solver=settings.solver,
-            integrator=settings.integrator,
-        )
-
-    return {
-        "point_mass": lambda settings: point_mass.PointMass(),
-        **{name: of_task(name) for name in locomotion.TASKS},
-    }
-
-
 #: Prefix of the names of environments in ``brax.envs``.
 BRAX = "brax:"
 _EPISODE_LENGTH = 1000
@@ -91,7 +76,7 @@ def _refuse_unknown(
 
 def names() -> tuple[str, ...]:
     """Return the names of our own environments."""
-    return tuple(_constructors())
+    return ("point_mass", *locomotion.TASKS)
 
 
 def _constructor(name: str) -> Callable[[Settings], Env]:
@@ -107,7 +92,18 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
     _refuse_unknown("env", name, names(), (f"{BRAX}NAME", "MODULE:NAME"))
-    return _constructors()[name]
+    return lambda settings: _build_ours(name, settings)
+
+
+def _build_ours(name: str, settings: Settings) -> Env:
+    if name == "point_mass":
+        return point_mass.PointMass()
+    return locomotion.Locomotion(
+        name,
+        physics=settings.physics,
+        solver=settings.solver,
+        integrator=settings.integrator,
+    )
 
 
 def _build_of_brax(name: str) -> Env:

@@ -37,7 +37,7 @@ def _refuse_taken(state: State, *names: str) -> None:
     """Raise `ValueError` if an environment's info has one of a wrapper's names."""
     for name in names:
         if name in state.info:
-            raise ValueError(f"info[{name!r}] is a wrapper's own: name yours otherwise")
+            raise ValueError(f"info[{name!r}] is used by a wrapper: rename yours")
 
 
 class EpisodeLimit(Wrapper):
@@ -143,7 +143,9 @@ class ObservationNoise(Wrapper):
     def reset(self, rng: jax.Array) -> State:
         """Start an episode; `rng` is split between the environment and the noise."""
         env_key, noise_key = jax.random.split(rng)
-        return self._noisy(self.env.reset(env_key), noise_key)
+        state = self.env.reset(env_key)
+        _refuse_taken(state, "noise_key", "true_observation")
+        return self._noisy(state, noise_key)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and add fresh noise to the observation."""
@@ -156,8 +158,9 @@ class ObservationNoise(Wrapper):
 class FaultyStepEnds(Wrapper):
     """End an episode in which the physics fails, for the users of other libraries.
 
-    The step has reward 0 and the observation of the step before: no number that is not
-    finite, or beyond 1e10, leaves it. `gasil_jax` does the same in its own rollout.
+    The step has reward 0 and the observation of the step before: no observation and no
+    reward that is not finite, or beyond 1e10, leaves it. `gasil_jax` does the same in
+    its own rollout.
     """
 
     def step(self, state: State, action: jax.Array) -> State:
@@ -194,10 +197,10 @@ class AutoReset(Wrapper):
 
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and replace an ended episode's state by a fresh start."""
-        # The episode that ended is seen by the caller once, with its done flag.
         key, reset_key = jax.random.split(state.info["reset_key"])
         info = dict(state.info)
         del info["reset_key"], info["final_observation"]
+        # `done` is set back: the caller saw it in the state before.
         stepped = self.env.step(state.replace(info=info, done=0.0 * state.done), action)
         fresh = self.env.reset(reset_key)
         done = stepped.done > 0

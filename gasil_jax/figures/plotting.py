@@ -15,18 +15,24 @@ from gasil_jax.figures.statistics import (
     interquartile_mean,
 )
 
-#: Okabe and Ito's colours, which colour-blind readers can distinguish, but for their
-#: yellow, which is too light for lines; grey and brown stand for it.
+#: The palette of Okabe and Ito, which colour-blind readers can distinguish. Its yellow
+#: is too light for lines and is left out; grey and brown are added.
 COLORS = (
-    *("#0072B2", "#D55E00", "#009E73", "#CC79A7"),
-    *("#E69F00", "#56B4E9", "#000000", "#999999", "#8C510A"),
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#000000",
+    "#999999",
+    "#8C510A",
 )
 
+_MOST_PARTS = 50
 
-_POINTS = 50
 
-
-def in_parts(
+def binned_returns(
     env_steps: np.ndarray, returns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean returns over equal parts of training, at most 50.
@@ -40,7 +46,7 @@ def in_parts(
     Returns:
       The steps at the end of each part, (parts,), and the means, (seeds, parts).
     """
-    parts = np.array_split(np.arange(len(env_steps)), min(_POINTS, len(env_steps)))
+    parts = np.array_split(np.arange(len(env_steps)), min(_MOST_PARTS, len(env_steps)))
     complete = [x for x in parts if np.isfinite(returns[:, x]).any(axis=1).all()]
     if not complete:
         return env_steps[:0], returns[:, :0]
@@ -132,7 +138,7 @@ def learning_curve(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    steps, returns = in_parts(env_steps, episode_return)
+    steps, returns = binned_returns(env_steps, episode_return)
     figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
     axes.plot(steps / 1e6, returns.T, color="0.75", linewidth=0.8)
     draw_returns(axes, steps, returns, evaluations, color=COLORS[0])
@@ -199,8 +205,8 @@ def marginals(
         text += "; importance: share of the points' variance that these means explain, "
         text += "corrected for their number"
     if left_out:
-        text += f"; left out for a seed without a return: {left_out} of "
-        text += f"{len(returns) + left_out} points"
+        text += f"; {left_out} of {len(returns) + left_out} points are left out, "
+        text += "because a seed has no return"
     text = textwrap.fill(text, 10 + 50 * columns)
     figure.supxlabel(text, fontsize="small", color="0.3")
     save(figure, path, dpi=150)

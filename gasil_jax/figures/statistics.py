@@ -1,6 +1,7 @@
 """Interquartile means and their intervals over seeds (Agarwal et al. 2021).
 
-And, of a sweep, how much of its points' returns one hyperparameter explains.
+Also, for a sweep, the share of the variance of its points' returns that one
+hyperparameter explains.
 """
 
 import numbers
@@ -74,9 +75,9 @@ def are_numbers(values: Sequence[Any]) -> bool:
 def groups(values: Sequence[Any]) -> list[np.ndarray]:
     """Return the groups of points that have the same value, or neighbouring ones.
 
-    Neighbouring numbers are a group where most of them differ: if there are eight
-    points or more, and fewer than two for each value. A group then has about three
-    values, or more, so that there are at most eight groups.
+    Neighbouring numbers form a group if there are eight points or more, and fewer than
+    two for each value. A group then has about three values, or more where that would
+    make more than eight groups.
 
     Args:
       values: each point's value of one hyperparameter.
@@ -103,7 +104,8 @@ def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
     (`groups`), and S and T the sums of squared distances of their returns to the mean
     of their group and to the mean of all. It is near 0 on average for a hyperparameter
     without effect, however many groups there are, and may be below 0; it is 0 if all
-    returns are equal. What hyperparameters do only together counts for none.
+    returns are equal. Effects that only several hyperparameters have
+    together are credited to none.
 
     Args:
       values: each point's value of the hyperparameter.

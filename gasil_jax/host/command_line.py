@@ -198,10 +198,10 @@ def exit_status(work: Callable[[], int | None]) -> int:
     """Do the work of a command line, print its errors and return its exit status.
 
     Returns:
-      The status that the work returns, or 0 if it is done; 1 if a folder or file can't
-      be read or written, or if a program that it started failed; 2 for bad input, to
-      which a name belongs that is too long for a file; 128 plus the signal's number if
-      it was interrupted after saving.
+      The status that the work returns, or 0 if it returns none; 1 if a folder or file
+      can't be read or written, or if a program that it started failed; 2 for bad input,
+      which includes a file name that is too long; 128 plus the signal's number if it
+      was interrupted after saving.
     """
     try:
         return work() or 0

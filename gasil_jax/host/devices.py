@@ -43,7 +43,8 @@ def _keep_compiled_programs() -> None:
     config: Any = jax.config  # Its options are attributes that its type does not have.
     if config.jax_compilation_cache_dir is not None or not quiet:
         return
-    with contextlib.suppress(OSError):
+    # Without a home folder there is a RuntimeError.
+    with contextlib.suppress(OSError, RuntimeError):
         described = pathlib.Path("/proc/cpuinfo")
         lines = described.read_text().splitlines() if described.exists() else []
         features = {

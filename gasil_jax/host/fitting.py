@@ -98,7 +98,9 @@ def fit(
     if folder is None and (resume or checkpoint_every is not None):
         name = "resume" if resume else "checkpoint_every"
         raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")
-    schedule = driver.CheckpointSchedule(checkpoint_every, keep=2 if folder else 0)
+    schedule = driver.CheckpointSchedule(
+        checkpoint_every, keep=0 if folder is None else 2
+    )
     evaluation_schedule = None
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
@@ -171,7 +173,7 @@ def _opened(
     """
     path = folder / _DESCRIPTION
     with contextlib.ExitStack() as stack:
-        run_folder.create(folder, "", option="folder")
+        run_folder.create(folder, option="folder")
         stack.enter_context(run_folder.lock(folder, option="folder"))
         begun = path.is_file()
         if begun and not resume:

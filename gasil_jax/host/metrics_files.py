@@ -157,7 +157,8 @@ def _cut(path: pathlib.Path, size: int) -> None:
         while True:
             beside = path.with_name(f"{path.stem}-cut-{number}{path.suffix}")
             try:
-                beside.open("xb").write(rest)
+                with beside.open("xb") as other:
+                    other.write(rest)
                 break
             except FileExistsError:
                 number += 1

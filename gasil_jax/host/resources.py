@@ -92,7 +92,7 @@ def _free_in_the_container(group: pathlib.Path = _CONTROL_GROUP) -> int:
 
 
 def _padded(count: int, devices: Sequence[jax.Device]) -> int:
-    """Return the number of members with those that make all devices' shares equal."""
+    """Return the number of members, rounded up to a multiple of that of devices."""
     return math.ceil(count / len(devices)) * len(devices)
 
 
@@ -189,9 +189,9 @@ def check_disk(
 
 
 def size_of_checkpoints(folder: pathlib.Path) -> int:
-    """Return the bytes of the checkpoints below a folder, which need not exist."""
+    """Return the bytes of a folder's checkpoints, of which there may be none."""
     size = 0
-    for path in folder.glob("**/checkpoints/**/*"):
+    for path in folder.glob("checkpoints/**/*"):
         # Another process may delete it meanwhile.
         with contextlib.suppress(OSError):
             size += path.stat().st_size if path.is_file() else 0

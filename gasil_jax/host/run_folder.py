@@ -16,7 +16,6 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import json_reader, metrics_files
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
-from gasil_jax.imitation import agents
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
@@ -31,7 +30,7 @@ def check(out: pathlib.Path, resume: bool) -> None:
         empty and `resume` is false, or if its training has ended and can't continue.
     """
     if out.is_dir():
-        with lock(create(out, "")):
+        with lock(create(out)):
             if resume and is_described(out):
                 _refuse_without_checkpoints(out)
             else:
@@ -59,34 +58,44 @@ def _refuse_without_checkpoints(out: pathlib.Path) -> None:
             )
 
 
-def create(out: pathlib.Path | None, name: str, *, option: str = "out") -> pathlib.Path:
-    """Create the folder `out` or, if it is None, a new folder `name` under runs/.
+def create(out: pathlib.Path, *, option: str = "out") -> pathlib.Path:
+    """Create a folder if it is missing, and return it.
 
     Args:
       out: the folder.
-      name: name of the new folder.
       option: what the error message calls the folder.
 
     Raises:
       InputError: if it can't be written.
     """
     try:
-        if out is not None:
-            out.mkdir(parents=True, exist_ok=True)
-            probe = out / f"{_PROBE}{os.getpid()}"
-            probe.touch()
-            probe.unlink()
-            return out
-        number = 1
-        while True:
-            folder = pathlib.Path("runs", name if number == 1 else f"{name}-{number}")
-            with contextlib.suppress(FileExistsError):
-                folder.mkdir(parents=True)
-                return folder
-            number += 1
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / f"{_PROBE}{os.getpid()}"
+        probe.touch()
+        probe.unlink()
     except OSError as error:
-        where = folder if out is None else out
-        raise InputError(unwritable(where, error, option)) from None
+        raise InputError(unwritable(out, error, option)) from None
+    return out
+
+
+def create_new(name: str) -> pathlib.Path:
+    """Create a folder under runs/, with a number after its name if that is taken.
+
+    Raises:
+      InputError: if it can't be written.
+    """
+    runs = create(pathlib.Path("runs"))
+    number = 1
+    while True:
+        folder = runs / (name if number == 1 else f"{name}-{number}")
+        try:
+            folder.mkdir()
+        except FileExistsError:
+            number += 1
+        except OSError as error:
+            raise InputError(unwritable(folder, error, "out")) from None
+        else:
+            return folder
 
 
 @contextlib.contextmanager
@@ -203,7 +212,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
             for name in ("share_counts", "shard"):
                 if name not in described:
                     raise ValueError(f"{name} is missing")
-        validate(described["config"], agents())
+        validate(described["config"])
         check_seeds(described["seeds"], described["first_seed"])
     except ValueError as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None

@@ -20,7 +20,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.imitation import agents, find_agent, unused
+from gasil_jax.imitation import find_agent, unused
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,7 +85,7 @@ def parse(
     kind: type[T],
     arguments: Sequence[str] | None,
     program: str,
-    began: pathlib.Path | None = None,
+    resumed: pathlib.Path | None = None,
 ) -> T:
     """Return the command line's options, on top of the preset that they name.
 
@@ -93,14 +93,14 @@ def parse(
       kind: the class of the options.
       arguments: the command line; default the one that the program was started with.
       program: name of the module that was started.
-      began: folder of the run to continue. Its own options are then the defaults,
-        and the preset is not used.
+      resumed: folder of the run to continue. Its own options are then the
+        defaults, and the preset is not used.
 
     Raises:
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
-    if began is not None:
-        described = run_folder.read(began)
+    if resumed is not None:
+        described = run_folder.read(resumed)
         fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
         # An option with the default None or False may be newer than the run.
         newer = {
@@ -109,7 +109,7 @@ def parse(
         names = {f.name for f in fields}
         missing = names - set(newer) - set(described)
         if missing or set(described) - names - {"out", "points"}:
-            raise InputError(f"out is {began}, which another program has written")
+            raise InputError(f"out is {resumed}, which another program has written")
         stored = newer | described
         values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
         before = kind(**values)
@@ -117,7 +117,7 @@ def parse(
         changed = run_folder.differences(vars(before), vars(options))
         if changed:
             raise InputError(
-                f"resume continues with {began}, where {'; '.join(changed)}: "
+                f"resume continues with {resumed}, where {'; '.join(changed)}: "
                 "only total_steps may differ, and grow"
             )
         return options
@@ -153,7 +153,7 @@ def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
     return kind(env=tyro.MISSING, config=Config(agent=agent))
 
 
-def begun_run(arguments: Sequence[str] | None) -> pathlib.Path | None:
+def resumed_folder(arguments: Sequence[str] | None) -> pathlib.Path | None:
     """Return the folder of the run that --resume continues, or None if there is none.
 
     Raises:
@@ -189,7 +189,7 @@ def check(options: Options) -> None:
     """
     with command_line.input_checked():
         environments.check(options.env, options.settings)
-        validate(options.config, agents())
+        validate(options.config)
         trackers.check(options.log)
     command_line.check_least(
         options,
@@ -292,7 +292,8 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
-    folder = run_folder.create(options.out, name)
+    out = options.out
+    folder = run_folder.create_new(name) if out is None else run_folder.create(out)
     with run_folder.lock(folder):
         if not (options.resume and run_folder.is_described(folder)):
             run_folder.refuse_used(folder)

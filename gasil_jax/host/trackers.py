@@ -62,8 +62,8 @@ class _WeightsAndBiases:
             )
         except wandb.errors.Error as error:
             raise InputError(
-                f"log is 'wandb', which says: {' '.join(str(error).split())} (solve "
-                "that, or set WANDB_MODE=offline, and continue with --resume)"
+                f"log is 'wandb', which can't start: {' '.join(str(error).split())} "
+                "(solve that, or set WANDB_MODE=offline, and continue with --resume)"
             ) from None
 
     def log(self, step: int, scalars: Mapping[str, float]) -> None:

@@ -50,8 +50,8 @@ class Adaptive(struct.PyTreeNode):
 
     Attributes:
       discriminator: D.
-      bonus_normalizer: of the bonus, so that its value learns in the same unit as that
-        of a normalized reward.
+      bonus_normalizer: normalizes the bonus, so that its value has targets of the same
+        scale as that of a normalized reward.
       policy_return: float32 (), moving mean of the discounted returns of the policy's
         latest episodes; 0 before the first.
       has_episodes: bool (), whether there was one.
@@ -138,17 +138,19 @@ def mix(advantages: jax.Array, weight: jax.Array | float) -> jax.Array:
 def _mix(
     state: Adaptive, advantages: jax.Array, context: Context
 ) -> tuple[jax.Array, Metrics]:
-    correlated = correlation(advantages)
+    advantage_correlation = correlation(advantages)
     buffer = context.good_trajectories
     good_return = good_trajectories.mean_return(buffer)
-    behind = gap(good_return, state.policy_return)
-    factor = RULES[context.config.imitation_rule](jnp.maximum(correlated, 0.0), behind)
+    return_gap = gap(good_return, state.policy_return)
+    factor = RULES[context.config.imitation_rule](
+        jnp.maximum(advantage_correlation, 0.0), return_gap
+    )
     weight = context.hyperparameters.imitation_weight * factor
     weight = jnp.where(buffer.size > 0, weight, 0.0)
     metrics = {
         "imitation_weight": weight,
-        "advantage_correlation": correlated,
-        "return_gap": behind,
+        "advantage_correlation": advantage_correlation,
+        "return_gap": return_gap,
     }
     return mix(advantages, weight), metrics
 

@@ -174,7 +174,7 @@ GOOD_TRAJECTORIES = Source(
 _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
 
 
-def _input(
+def _preprocessor(
     context: Context,
 ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
     """Return the function from pairs to what the discriminator sees of them."""
@@ -205,7 +205,7 @@ def _train_discriminator(
     action = rollout.action.reshape(-1, rollout.action.shape[-1])
     minibatch_size = config.discriminator_minibatch_size
 
-    enter = _input(context)
+    preprocess = _preprocessor(context)
     penalty = config.discriminator_gradient_penalty
 
     def objective(params: Any, policy_pair: Any, good_pair: Any, key: Any) -> Any:
@@ -220,40 +220,42 @@ def _train_discriminator(
             value += penalty * gradient_penalty(logit, policy_pair, good_pair, share)
         return value, metrics
 
-    def step(state: Learner, key_and_counts: tuple[Any, Any]) -> Any:
-        key, counts = key_and_counts
+    select = lambda condition, new, old: jax.tree.map(
+        lambda a, b: jnp.where(condition, a, b), new, old
+    )
+
+    def step(state: Learner, key_and_is_taken: tuple[Any, Any]) -> Any:
+        key, is_taken = key_and_is_taken
         policy_key, good_key, between_key = jax.random.split(key, 3)
         rows = jax.random.randint(
             policy_key, (minibatch_size,), 0, observation.shape[0]
         )
         gradient, metrics = jax.grad(objective, has_aux=True)(
             state.params,
-            enter(observation[rows], action[rows]),
-            enter(*source.sample(good_key, context, minibatch_size)),
+            preprocess(observation[rows], action[rows]),
+            preprocess(*source.sample(good_key, context, minibatch_size)),
             between_key,
         )
         stepped = learner.descend(
             state, gradient, transform, hyperparameters.discriminator_learning_rate
         )
-        return choose(counts, stepped, state), metrics
+        return select(is_taken, stepped, state), metrics
 
-    choose = lambda condition, new, old: jax.tree.map(
-        lambda a, b: jnp.where(condition, a, b), new, old
-    )
     num_updates = config.hyperparameters.discriminator_updates
-    counts = jnp.arange(num_updates) < jnp.asarray(
+    is_taken = jnp.arange(num_updates) < jnp.asarray(
         hyperparameters.discriminator_updates, jnp.int32
     )
     trained, metrics = jax.lax.scan(
-        step, state, (jax.random.split(key, num_updates), counts)
+        step, state, (jax.random.split(key, num_updates), is_taken)
     )
     ready = source.is_ready(context)
-    # Times the inverse, as XLA divides by a constant: a single run has the same bits.
-    mean = lambda x: jnp.sum(x, where=counts) * (1.0 / jnp.sum(counts))
+    # Multiplied by the inverse, as XLA does for a division by a constant, so that a
+    # constant count and a traced one give the same bits.
+    mean = lambda x: jnp.sum(x, where=is_taken) * (1.0 / jnp.sum(is_taken))
     metrics = {
         name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
     }
-    return choose(ready, trained, state), metrics
+    return select(ready, trained, state), metrics
 
 
 @jax.named_scope("discriminator")
@@ -274,7 +276,7 @@ def update_and_score(
     """
     state, metrics = _train_discriminator(state, source, context, key)
     rollout = context.rollout
-    pairs = _input(context)(rollout.observation, rollout.action)
+    pairs = _preprocessor(context)(rollout.observation, rollout.action)
     logit = _network(context.config).apply(state.params, *pairs)
     form = BONUSES[context.config.bonus]
     return state, jnp.where(source.is_ready(context), form(logit), 0.0), metrics
@@ -303,7 +305,7 @@ def _check_expert(config: Config, observation_size: int, action_size: int) -> No
 _reward_and_bonus = lambda reward, bonus: reward + bonus
 _bonus_alone = lambda reward, bonus: bonus
 
-#: What every discriminator uses.
+#: Fields that every agent with a discriminator uses.
 FIELDS = (
     "bonus",
     "discriminator_learning_rate",
@@ -314,22 +316,22 @@ FIELDS = (
     "discriminator_gradient_penalty",
     "discriminator_normalizes_actions",
 )
-_FIELDS = ("alpha", "alpha_schedule", *FIELDS)
-_FIELDS_OF_BUFFER = (*_FIELDS, *good_trajectories.FIELDS)
+_GAIL_FIELDS = ("alpha", "alpha_schedule", *FIELDS)
+_GASIL_FIELDS = (*_GAIL_FIELDS, *good_trajectories.FIELDS)
 
 #: r - alpha log D (section 4.3).
 PPO_GASIL = Imitation(
     init,
     _update_and_reward(GOOD_TRAJECTORIES, _reward_and_bonus),
     leave_policy,
-    fields=_FIELDS_OF_BUFFER,
+    fields=_GASIL_FIELDS,
 )
 #: -alpha log D alone (Algorithm 1).
 GASIL = Imitation(
     init,
     _update_and_reward(GOOD_TRAJECTORIES, _bonus_alone),
     leave_policy,
-    fields=_FIELDS_OF_BUFFER,
+    fields=_GASIL_FIELDS,
     uses_reward=False,
 )
 #: -alpha log D alone, D against expert trajectories (section 3.2).
@@ -338,6 +340,6 @@ GAIL = Imitation(
     _update_and_reward(_EXPERT, _bonus_alone),
     leave_policy,
     _check_expert,
-    _FIELDS,
+    _GAIL_FIELDS,
     uses_reward=False,
 )

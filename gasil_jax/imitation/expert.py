@@ -124,6 +124,7 @@ def check(source: str | None, observation_size: int, action_size: int) -> None:
     sizes = (observation.shape[1], action.shape[1])
     if sizes != (observation_size, action_size):
         raise ValueError(
-            f"expert {source!r} has {sizes[0]} observations and {sizes[1]} actions a "
-            f"step: the environment has {observation_size} and {action_size}"
+            f"expert {source!r} has observations of size {sizes[0]} and actions of "
+            f"size {sizes[1]}: the environment's are of size {observation_size} and "
+            f"{action_size}"
         )

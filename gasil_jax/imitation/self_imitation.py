@@ -194,7 +194,8 @@ def loss(
     num_samples = jnp.maximum(num_positive, _LEAST_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
     policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
-    # This has the gradient of half the clipped square, also where the clip is active.
+    # Its gradient is minus the clipped advantage, in the unit of the returns: that of
+    # half the square and, where the clip is active, constant instead of 0.
     value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
     fraction = num_positive / advantage.shape[0]
     return policy_loss + value_coefficient * value_loss, fraction
@@ -219,7 +220,8 @@ def _update_policy(
 ) -> tuple[Replay, ActorCritic, Metrics]:
     config, hyperparameters = context.config, context.hyperparameters
     normalize = lambda x: normalization.normalize(context.normalizer, x)
-    # The replay's returns are of the environment's rewards, the value's of normalized.
+    # The replay's returns are in the environment's unit, the value's targets in that of
+    # the normalized reward.
     scale = return_scale(replay) / context.reward_scale
 
     def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:

@@ -22,7 +22,7 @@ from gasil_jax.host import (
     run_options,
     trackers,
 )
-from gasil_jax.host.interruption import Interruption
+from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.progress import Progress, announced
 from gasil_jax.host.run_options import Options, evaluation_schedule, make_env
@@ -68,6 +68,9 @@ def prepare(
       InputError: if the programs do not fit the devices or the disk.
     """
     num_members = sum(len(program.members) for program in programs)
+    out = options.out
+    # A run's checkpoints are in its own folder, a sweep's in those of its programs.
+    folders = [out, *(program.folder(out) for program in unfinished)] if out else []
     devices.use_devices(options.settings, options.devices, num_members)
     env = make_env(options)
     schedule = evaluation_schedule(options)
@@ -88,10 +91,10 @@ def prepare(
         resources.check_disk(
             env,
             [(program.config, len(program.members)) for program in unfinished],
-            options.out or pathlib.Path("runs"),
+            out or pathlib.Path("runs"),
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
-            written=resources.size_of_checkpoints(options.out) if options.out else 0,
+            written=sum(map(resources.size_of_checkpoints, folders)),
         )
     run_options.tell_if_untuned(options)
     run_options.tell_without_effect(options, num_members)
@@ -147,6 +150,8 @@ def train(
     ):
         for job in jobs:
             if not job.finished:
+                if interruption.signal is not None:
+                    raise Interrupted(interruption.signal)
                 job.folder.mkdir(parents=True, exist_ok=True)
                 with progress.aside("starting the trackers"):
                     described = run_folder.flat(vars(options))

@@ -113,7 +113,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
         raise InputError(
             f"not finished: shards {', '.join(unfinished)}; continue them with --resume"
         )
-    run_folder.create(out, out.name)
+    run_folder.create(out)
     with run_folder.lock(out):
         _refuse_used(out, next(iter(every.items())))
         content = described | {"shard": None, "resume": False, "out": str(out)}

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import math
 import pathlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -10,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.config import Config, Hyperparameters, own_names, ranges, validate
-from gasil_jax.errors import InputError, instead
+from gasil_jax.errors import InputError, did_you_mean
 from gasil_jax.host.command_line import whole_number
-from gasil_jax.imitation import agents, unused
+from gasil_jax.imitation import unused
 
 Point = Mapping[str, Any]
 
@@ -78,7 +79,7 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
     """
     try:
         points = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(
             f"points_file is {path}, which can't be read: {error}"
         ) from None
@@ -92,10 +93,13 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
         with _naming(f"points_file is {path}"):
             check_point(point, agent)
     allowed = kinds(agent)
-    read = [
-        {name: allowed[name](value) for name, value in point.items()}
-        for point in points
-    ]
+    try:
+        read = [
+            {name: allowed[name](value) for name, value in point.items()}
+            for point in points
+        ]
+    except OverflowError as error:
+        raise InputError(f"points_file is {path}: {error}") from None
     for index, point in enumerate(read):
         if point in read[:index]:
             raise InputError(f"points_file is {path}: it has {point} twice")
@@ -129,11 +133,11 @@ def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> 
     with _naming(f"{path} is damaged or of another program: points"):
         for point in points:
             check_point(point, config.agent)
-            validate(config.replace(**point), agents())
+            validate(config.replace(**point))
 
 
 def _unknown_name(name: str, allowed: Iterable[str]) -> str:
-    return f"{name!r} can't vary: {instead(name, tuple(allowed))}"
+    return f"{name!r} can't vary: {did_you_mean(name, tuple(allowed))}"
 
 
 def _refuse_unused(names: Iterable[str], agent: str) -> None:
@@ -142,8 +146,8 @@ def _refuse_unused(names: Iterable[str], agent: str) -> None:
         if name in idle:
             others = [x for x in kinds(agent) if x not in idle]
             raise InputError(
-                f"{name} can't vary: agent {agent!r} does not look at it (one of "
-                f"{', '.join(others)})"
+                f"{name} can't vary: agent {agent!r} does not use it; it must be one "
+                f"of {', '.join(others)}"
             )
 
 
@@ -160,7 +164,7 @@ def make_points(
       grid: NAME=VALUE,VALUE,... for each name that varies.
       random: number of points to draw from the grid or, without a grid, from
         `PAPER_RANGES`; None takes the whole grid.
-      points_file: a file that lists the points, instead of grid and random.
+      points_file: a file that lists the points, did_you_mean of grid and random.
       seed: seed of the draws.
       agent: the agent of the sweep. Names that it does not use are refused in the
         grid and the file, and left out of `PAPER_RANGES`.
@@ -191,11 +195,17 @@ def make_points(
     values = values or {
         name: PAPER_RANGES[name] for name in PAPER_RANGES if name not in unused(agent)
     }
-    every = list(itertools.product(*values.values()))
-    if random > len(every):
+    sizes = [len(listed) for listed in values.values()]
+    count = math.prod(sizes)
+    if random > count:
         raise InputError(
-            f"random is {random}: it must be at most {len(every)}, which is how many "
-            "points there are"
+            f"random is {random}: it must be at most {count}, the number of points"
         )
-    chosen = np.random.default_rng(seed).choice(len(every), random, replace=False)
-    return [dict(zip(values, every[i], strict=True)) for i in chosen]
+    chosen = np.random.default_rng(seed).choice(count, random, replace=False)
+    return [
+        {
+            name: listed[i]
+            for (name, listed), i in zip(values.items(), indices, strict=True)
+        }
+        for indices in zip(*np.unravel_index(chosen, sizes), strict=True)
+    ]

@@ -127,7 +127,8 @@ def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
     others = cuts - {str(shard.count)}
     if others:
         raise InputError(
-            f"shard is {shard}: {out} holds a sweep that is cut into {min(others)}"
+            f"shard is {shard}: {out} holds a sweep that is cut into {min(others)} "
+            "shards"
         )
 
 

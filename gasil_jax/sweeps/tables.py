@@ -218,13 +218,13 @@ def write(
                 writer.writerow([index, seed, *own, *cells, bad])
     np.savez_compressed(folder / "curves.npz", **curves)
     trainings = [training for part in parts for training in part.trainings()]
-    fine = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
-    best = lambda scores: int(fine[scores[fine].argmax()]) if fine.size else None
+    sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
+    best = lambda scores: int(sound[scores[sound].argmax()]) if sound.size else None
     mean = final.mean(axis=1)
     ended = [i for i in range(len(points)) if math.isfinite(mean[i])]
     varied = _varied(parts, names, ended)
     shares = {name: importance(values, mean[ended]) for name, values in varied.items()}
-    # What is below 0 is so by chance.
+    # An estimate below 0 is so by chance alone.
     shares = {name: x if x is None else max(0.0, x) for name, x in shares.items()}
     summary = {
         "points": [
@@ -377,7 +377,8 @@ def _plot(
 
     names = {name for point in points for name in point}
     varied = {x for x in names if len({point.get(x) for point in points}) > 1}
-    size = (8.0, 1.4 + 0.35 * len(points))
+    # Matplotlib refuses pictures of more than 2**16 pixels.
+    size = (8.0, min(1.4 + 0.35 * len(points), 400.0))
     figure, axes = plt.subplots(figsize=size, layout="constrained")
     for row in range(len(points)):
         axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)

@@ -75,7 +75,9 @@ def test_an_expert_of_another_size_is_refused(expert, tmp_path):
             action=arrays["action"],
         )
     config = gasil_jax.Config(agent="gail", expert=str(tmp_path / "other.npz"))
-    with pytest.raises(ValueError, match="3 observations and 2 actions a step"):
+    with pytest.raises(
+        ValueError, match="of size 3 and actions of size 2"
+    ):
         gasil_jax.make_train(env, config)
 
 
@@ -102,7 +104,7 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
     for got, name in ((observation, "observations"), (action, "actions")):
         expected = [getattr(e, name)[:n] for e, n in zip(episodes, lengths)]
         np.testing.assert_array_equal(got, np.concatenate(expected))
-    with pytest.raises(ValueError, match=r"and 2 actions .* has 4 and 3"):
+    with pytest.raises(ValueError, match=r"of size 2: .* of size 4 and 3"):
         expert_module.check("minari:test/expert-v0", 4, 3)
     # Another data set under the same name is read, not the one before.
     minari.delete_dataset("test/expert-v0")

@@ -220,7 +220,7 @@ def test_fit_is_r_squared_of_the_windows_that_count():
     rng = np.random.default_rng(0)
     predicted, actual = rng.normal(size=(2, 7, 3)).astype(np.float32)
     valid = rng.random((7, 3)) < 0.5
-    metrics = reward_decomposition.fit(predicted, actual, valid)
+    metrics = reward_decomposition.goodness_of_fit(predicted, actual, valid)
     p, a = predicted[valid], actual[valid]
     np.testing.assert_allclose(
         metrics["decomposition_fit"],
@@ -230,7 +230,7 @@ def test_fit_is_r_squared_of_the_windows_that_count():
     np.testing.assert_allclose(
         metrics["decomposition_error"], np.sqrt(np.mean((p - a) ** 2)), rtol=1e-4
     )
-    none = reward_decomposition.fit(predicted, actual, np.zeros_like(valid))
+    none = reward_decomposition.goodness_of_fit(predicted, actual, np.zeros_like(valid))
     assert np.isnan(none["decomposition_fit"])
 
 
@@ -238,7 +238,7 @@ def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():
     length = jnp.array([1, 4, 9])
     keys = jax.random.split(jax.random.key(0), 200)
     offset, weight = jax.vmap(
-        lambda key: reward_decomposition.represent(key, length, 4)
+        lambda key: reward_decomposition.sample_window_steps(key, length, 4)
     )(keys)
     np.testing.assert_allclose(weight.sum(axis=-1), 1.0, rtol=1e-6)
     assert (weight[:, 0] > 0).sum() == 200  # one step of it

@@ -1,5 +1,6 @@
 """The constraint solver against plain NumPy, and C MuJoCo on the host."""
 
+import functools
 import inspect
 
 import jax
@@ -31,6 +32,12 @@ SIMPLE, FLAT, PYRAMID = (
 )
 
 
+def solve(problem, iterations=4):
+    """Solve one problem."""
+    function = functools.partial(newton.solve_many, iterations, 4)
+    return batching.batch_last(batching.in_tiles(function))(problem)
+
+
 def problems(batch, size, groups, seed=0):
     """Random problems, and the same with every constraint as a row of a matrix."""
     rng = np.random.default_rng(seed)
@@ -38,11 +45,11 @@ def problems(batch, size, groups, seed=0):
     sign = rng.integers(-1, 2, size=(*batch, size)).astype(float)
     draw_reference = lambda *shape: rng.normal(size=(*batch, *shape)) - 1.0
     draw_weight = lambda *shape: 10.0 ** rng.uniform(-1.0, 2.0, size=(*batch, *shape))
-    limits = newton.Limits(sign, draw_reference(size), draw_weight(size))
+    limits = newton.LimitRows(sign, draw_reference(size), draw_weight(size))
     jacobian = [sign[..., None] * np.eye(size)]
     reference, weight, contacts = [limits.reference], [limits.weight], []
     for count, edges in groups:
-        group = newton.Contacts(
+        group = newton.ContactRows(
             normal=rng.normal(size=(*batch, count, size)),
             tangents=0.7 * rng.normal(size=(*batch, count, len(edges[0]), size)),
             reference=draw_reference(count, len(edges)),
@@ -105,7 +112,7 @@ def plain_newton(inertia, force, jacobian, reference, weight):
 )
 def test_newton_against_plain_numpy(size, groups):
     arrays, problem = problems((20,), size, groups)
-    solution = jax.jit(jax.vmap(lambda p: newton.solve(p, 20)))(problem)
+    solution = jax.jit(jax.vmap(lambda p: solve(p, 20)))(problem)
     edge_forces = [np.zeros((20, 0)), *solution.edge_forces]
     edge_forces = np.concatenate([x.reshape(20, -1) for x in edge_forces], axis=1)
     for i in range(20):
@@ -125,8 +132,8 @@ def test_newton_against_plain_numpy(size, groups):
 @pytest.mark.parametrize("batch", [(3, 4), (5, 32)])  # one tile, and more of them
 def test_a_problem_alone_equals_itself_in_nested_batches(batch):
     _, problem = problems(batch, 6, [(2, SIMPLE), (4, FLAT)])
-    nested = jax.jit(jax.vmap(jax.vmap(newton.solve)))(problem)
-    alone = jax.jit(newton.solve)(jax.tree.map(lambda x: x[2, 1], problem))
+    nested = jax.jit(jax.vmap(jax.vmap(solve)))(problem)
+    alone = jax.jit(solve)(jax.tree.map(lambda x: x[2, 1], problem))
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a[2, 1], b, rtol=5e-5, atol=5e-5),
         nested,

@@ -129,11 +129,14 @@ class Counted(Scripted):
 
 def test_a_wrappers_name_in_an_environments_info_is_refused():
     key = jax.random.key(0)
-    with pytest.raises(ValueError, match=r"info\['steps'\] is a wrapper's own"):
+    with pytest.raises(ValueError, match=r"info\['steps'\] is used by a wrapper"):
         wrappers.EpisodeLimit(Counted("steps"), 9).reset(key)
     for name in ("held_reward", "delay_steps"):
-        with pytest.raises(ValueError, match=f"{name}.* is a wrapper's own"):
+        with pytest.raises(ValueError, match=f"{name}.* is used by a wrapper"):
             wrappers.RewardDelay(Counted(name), 3)
+    for name in ("noise_key", "true_observation"):
+        with pytest.raises(ValueError, match=f"{name}.* is used by a wrapper"):
+            wrappers.ObservationNoise(Counted(name), 0.1).reset(key)
     wrappers.RewardDelay(wrappers.EpisodeLimit(Counted("count"), 9), 3).reset(key)
 
 

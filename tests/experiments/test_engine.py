@@ -242,6 +242,24 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
     assert list(__main__._small(FIGURES["matrix"], ()).panels) == ["hopper-delayed"]
 
 
+def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
+    figure = __main__._small(FIGURES["delayed_rewards"], ["hopper-delayed"])
+    decomposed = {
+        name: curve.runs(Store(tmp_path))[0].config.decompose_rewards
+        for _, name, curve in figure.curves()
+    }
+    assert decomposed["ppo, decomposed"] and not decomposed["ppo"]
+
+
+def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, capsys):
+    out = ["--runs", f"{tmp_path}", "--list"]
+    arguments = ["matrix", "--quick", "--only", "hopper-delayed", "hopper-delayed ppo"]
+    assert __main__.main([*arguments, *out]) == 0
+    assert "matrix: 24 runs are missing" in capsys.readouterr().out
+    assert __main__.main(["matrix", "--quick", "--only", "hopper ppo", *out]) == 2
+    assert "only is hopper ppo: --quick trains panels" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -257,6 +275,10 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
         (("report", "--help-me"), "Unrecognized options: --help-me"),
         (("benchmark", "--tables", "speed"), "tables has 'speed': allowed physics"),
         (("benchmark", "--repeats", "0"), "repeats is 0: it must be 1 or more"),
+        (
+            ("benchmark", "--tables", "scaling", "--training-envs", "100"),
+            "num_envs is 100, which does not divide batch_steps 2048",
+        ),
         (("point_mass_moments", "--total-steps", "0"), "total_steps is 0"),
         (("point_mass_moments", "--out", "/proc/x"), "out is /proc/x/point_mass_mom"),
     ],

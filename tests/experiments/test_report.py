@@ -323,13 +323,13 @@ def test_a_block_is_made_anew():
         ([], "not measured yet"),
         (
             ["worse"],
-            "open so far: in 0 of 1 cases; the opposite in 1 (0); 2 not measured yet",
+            "open so far: in 0 of 1 cases; the opposite: 0; 2 not measured yet",
         ),
         (["better", "better"], "holds: in 2 of 2 cases (0; 1); 1 not measured yet"),
         (["not clear"] * 2, "does not hold: in 0 of 2 cases; 1 not measured yet"),
         (
             ["worse", "better", "worse"],
-            "holds in part: in 1 of 3 cases (1); the opposite in 2 (0; 2)",
+            "holds in part: in 1 of 3 cases (1); the opposite: 0, 2",
         ),
     ],
 )

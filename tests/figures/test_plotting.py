@@ -12,12 +12,12 @@ def test_parts_are_means_where_every_seed_has_ended_an_episode():
     steps = np.arange(1, 101) * 10
     returns = np.stack([np.arange(100.0), np.ones(100)])
     returns[0, :3], returns[1, 4] = np.nan, np.nan
-    ends, means = plotting.in_parts(steps, returns)
+    ends, means = plotting.binned_returns(steps, returns)
     # Fifty parts of two iterations each, the first without the first seed.
     np.testing.assert_array_equal(ends, np.arange(40, 1001, 20))
     np.testing.assert_array_equal(means[0], [3.0, *np.arange(4.5, 100, 2)])
     np.testing.assert_array_equal(means[1], 1.0)
-    ends, means = plotting.in_parts(steps, np.full((2, 100), np.nan))
+    ends, means = plotting.binned_returns(steps, np.full((2, 100), np.nan))
     assert ends.shape == (0,) and means.shape == (2, 0)
 
 
@@ -92,7 +92,7 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     # All values of gamma differ: three neighbours have a mean.
     np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), [1.0, 4.0, 7.0])
     caption = figure.get_supxlabel().replace("\n", " ")
-    assert "left out for a seed without a return: 2 of 11 points" in caption
+    assert "2 of 11 points are left out, because a seed has no return" in caption
     assert "neighbouring values" in caption and "share of the points' var" in caption
 
 

@@ -130,7 +130,7 @@ def configurations(draw):
 
 def accepted(config):
     try:
-        validate(config, gasil_jax.agents())
+        validate(config)
     except ValueError as error:
         fields = [f.name for f in dataclasses.fields(gasil_jax.Config)]
         fields += [f.name for f in dataclasses.fields(gasil_jax.Hyperparameters)]
@@ -172,14 +172,14 @@ WRONG = [
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_a_value_of_any_type_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name) as refusal:
-        validate(gasil_jax.Config().replace(**{name: value}), gasil_jax.agents())
+        validate(gasil_jax.Config().replace(**{name: value}))
     assert "\n" not in str(refusal.value)
 
 
 def test_traced_values_pass_unlooked_at():
     def check(gamma):
         config = gasil_jax.Config().replace(gamma=gamma, alpha_schedule=lambda s: gamma)
-        validate(config, gasil_jax.agents())
+        validate(config)
         return gamma
 
     jax.eval_shape(check, -1.0)

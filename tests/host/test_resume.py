@@ -19,6 +19,7 @@ import test_members
 
 import gasil_jax
 from gasil_jax import run
+from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, run_folder
 from gasil_jax.host.members import Members
 
@@ -221,6 +222,19 @@ def test_changed_settings_are_refused(arguments, message, whole, capsys):
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
     assert {p.name: p.stat().st_mtime_ns for p in whole.iterdir()} == before
+
+
+def test_a_new_folder_has_a_name_of_its_own(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    made = [run_folder.create_new("hopper").name for _ in range(3)]
+    assert made == ["hopper", "hopper-2", "hopper-3"]
+
+
+def test_a_disk_that_is_not_mounted_is_told(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs").symlink_to(tmp_path / "unmounted")
+    with pytest.raises(InputError, match="out is runs"):
+        run_folder.create_new("hopper")
 
 
 def test_resume_needs_a_folder(capsys):

@@ -133,7 +133,7 @@ def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
     out = ("--out", str(tmp_path / "out"))
     assert run.main([*SMALL, "--log", "wandb", *out]) == 2
     *_, message = capsys.readouterr().err.splitlines()
-    assert "error: log is 'wandb', which says: No API key configured." in message
+    assert "error: log is 'wandb', which can't start: No API key configured." in message
 
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):

@@ -226,7 +226,7 @@ def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, caps
     assert "continue each of them with --shard and --resume" in capsys.readouterr().err
     for again in (["--shard", "1/3"], ["--launcher", "local", "--shards", "3"]):
         assert sweep.main([*more, str(tmp_path / "parts"), *again]) == 2
-        assert "is cut into 2" in capsys.readouterr().err
+        assert "is cut into 2 shards" in capsys.readouterr().err
 
 
 def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):

@@ -41,6 +41,19 @@ SMALL = (
 )
 
 
+_MANY = (
+    "learning_rate",
+    "learning_rate_decay",
+    "gamma",
+    "gae_lambda",
+    "clip_epsilon",
+    "entropy_coefficient",
+    "max_grad_norm",
+    "initial_deviation",
+    "alpha",
+)
+
+
 def points_of(*arguments):
     given = ["--env", "point_mass", *arguments]
     options = command_line.parse(sweep.Options, given, "x")
@@ -67,6 +80,10 @@ def test_a_grid_is_every_combination():
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges():
+    # Without a list of all 6**9 combinations.
+    many = [f"{name}=0.1,0.2,0.3,0.4,0.5,0.6" for name in _MANY]
+    points = points_of("--agent", "ppo+gasil", "--random", "20", "--grid", *many)
+    assert len({tuple(point.items()) for point in points}) == 20
     points = points_of("--random", "16")
     assert len({tuple(point.items()) for point in points}) == 16
     for point in points:
@@ -120,6 +137,8 @@ def test_points_from_a_file(tmp_path):
     assert points == [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
     for text, message in (
         ("[", "can't be read"),
+        ("[" * 100_000, "can't be read"),
+        (f'[{{"alpha": 1{"0" * 400}}}]', "too large"),
         ("{}", "a list of points"),
         ("[3]", "3 is not a point"),
         ('[{"alhpa": 1}]', "did you mean 'alpha'"),
@@ -135,8 +154,8 @@ def test_points_from_a_file(tmp_path):
     ("arguments", "message"),
     [
         ("--grid alhpa=1", "did you mean 'alpha'"),
-        ("--agent ppo --grid alpha=1", "agent 'ppo' does not look at it (one of learn"),
-        ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not look at it"),
+        ("--agent ppo --grid alpha=1", "does not use it; it must be one of learn"),
+        ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not use it"),
         (
             "--grid decomposition_learning_rate=1e-3,1e-4",
             "decomposition_learning_rate can't vary: decompose_rewards is off",
@@ -159,6 +178,7 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=1 --launcher local --out x", "None: --launcher needs --shards"),
         ("--grid alpha=1 --launcher local --shards 1", "launcher needs --out"),
         ("--grid alpha=1 --launcher local --shards 2 --out x", "make 1 shards"),
+        ("--grid alpha=1 --launcher local --shards 999999999 --out x", "make 1 shards"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
@@ -281,18 +301,26 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
     assert sweep.main([*long, *grid, "--out", str(whole)]) == 0
     train = Members.train
 
-    def interrupted(self, advance, states, first, count):
-        # In the second program, after some chunks.
-        if self.config.hyperparameters.discriminator_updates == 2 and first >= 20:
-            os.kill(os.getpid(), signal.SIGTERM)
-        return train(self, advance, states, first, count)
+    def interrupt(program, at_least, arguments):
+        """Send SIGTERM in a program's chunk that ends there or later."""
 
-    with monkeypatch.context() as patch:
-        patch.setattr(Members, "train", interrupted)
-        status = sweep.main([*long, *grid, "--out", str(out)])
-    assert status == 128 + signal.SIGTERM
-    assert f"gasil_jax.sweep --resume --out {out}" in capsys.readouterr().err
-    assert not (out / "results.csv").exists()
+        def interrupted(self, advance, states, first, count):
+            number = self.config.hyperparameters.discriminator_updates - 1
+            if number == program and first + count >= at_least:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return train(self, advance, states, first, count)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Members, "train", interrupted)
+            assert sweep.main(arguments) == 128 + signal.SIGTERM
+        assert f"gasil_jax.sweep --resume --out {out}" in capsys.readouterr().err
+        assert not (out / "results.csv").exists()
+
+    # In the last chunk of a program, and so before the next one has begun.
+    interrupt(0, 60, [*long, *grid, "--out", str(out)])
+    assert not (out / "programs" / "1").exists()
+    # In the second program, after some chunks.
+    interrupt(1, 30, ["--resume", "--out", str(out)])
     seconds = (out / "programs" / "0" / "training.json").read_bytes()
     assert sweep.main(["--resume", "--out", str(out)]) == 0
     assert (out / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()

@@ -1,1 +1,1 @@
-"""Physics engines behind one small interface: ``init(qpos, qvel)`` and ``step``."""
+"""Physics engines behind one small interface: ``init``, ``kinematics`` and ``step``."""

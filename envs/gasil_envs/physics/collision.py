@@ -34,21 +34,21 @@ _PLANE, _SPHERE, _CAPSULE = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pairs:
-    """The geoms whose contacts one group has.
+    """The pairs of geoms of one group of contacts.
 
     Attributes:
       on_plane: (2, n), the plane's and the other geom.
       end: (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
       between: (2, m), the geoms of contacts without a plane; these follow the others.
       num_tangents: number of tangents of a contact.
-      flat: (3,), the normal of the plane that all motion is in, or None.
+      motion_normal: (3,), the normal of the plane that all motion is in, or None.
     """
 
     on_plane: np.ndarray
     end: np.ndarray
     between: np.ndarray
     num_tangents: int
-    flat: np.ndarray | None
+    motion_normal: np.ndarray | None
 
     @property
     def geoms(self) -> np.ndarray:
@@ -57,7 +57,7 @@ class Pairs:
 
 
 class Touch(NamedTuple):
-    """Where contacts are, metres; a length of 1 stands for the same in all.
+    """Where contacts are, in metres. An axis of length 1 is broadcast.
 
     Attributes:
       distance: (C, B), negative if they penetrate.
@@ -71,9 +71,12 @@ class Touch(NamedTuple):
 
 
 def pairs(
-    model: mujoco.MjModel, geoms: np.ndarray, num_tangents: int, flat: np.ndarray | None
+    model: mujoco.MjModel,
+    geoms: np.ndarray,
+    num_tangents: int,
+    motion_normal: np.ndarray | None,
 ) -> Pairs:
-    """Sort the contacts between geoms (C, 2), a pair for each."""
+    """Divide contacts, by their geoms (C, 2), into those with a plane and others."""
     plane = model.geom_type[geoms[:, 0]] == _PLANE
     on_plane, between = geoms[plane], geoms[~plane]
     # The two ends of a capsule follow each other.
@@ -81,7 +84,7 @@ def pairs(
     again[1:] = (on_plane[1:] == on_plane[:-1]).all(axis=1)
     capsule = model.geom_type[on_plane[:, 1]] == _CAPSULE
     end = np.where(capsule, np.where(again, -1.0, 1.0), 0.0)
-    return Pairs(on_plane.T, end, between.T, num_tangents, flat)
+    return Pairs(on_plane.T, end, between.T, num_tangents, motion_normal)
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -157,8 +160,8 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
         normal = normal[:1]
     if pairs.num_tangents == 0:
         return Touch(distance, position, constant(normal[:, None]))
-    if pairs.flat is not None:
-        tangent = np.cross(pairs.flat, normal)
+    if pairs.motion_normal is not None:
+        tangent = np.cross(pairs.motion_normal, normal)
         return Touch(distance, position, constant(np.stack([normal, tangent], axis=1)))
     # mjc_PlaneCapsule gives the capsule's axis, mju_makeFrame projects it.
     up, axis = constant(normal), lines.half[geom]
@@ -197,9 +200,9 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     distance = apart - (radius[0] + radius[1])
     position = near_a + normal * (radius[0] + 0.5 * distance)[:, None]
     axes = [normal]
-    if pairs.num_tangents and pairs.flat is not None:
-        flat = pairs.flat.astype(np.float32)[:, None]
-        axes.append(tree.cross(jnp.broadcast_to(flat, normal.shape), normal))
+    if pairs.num_tangents and pairs.motion_normal is not None:
+        across = pairs.motion_normal.astype(np.float32)[:, None]
+        axes.append(tree.cross(jnp.broadcast_to(across, normal.shape), normal))
     elif pairs.num_tangents:
         axes.append(_orthogonal(normal))
         axes.append(tree.cross(normal, axes[1]))

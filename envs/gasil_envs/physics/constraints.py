@@ -113,12 +113,15 @@ class Limits:
 
 
 class Constants(struct.PyTreeNode):
-    """What does not depend on the state of the contacts of a group, (C or 1, ..., 1).
+    """The constants of a group's contacts, (C or 1, ..., 1) each.
+
+    They do not depend on the state.
 
     Attributes:
       chain: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it
         moves the first and 0 where it moves both or none.
-      body: (C, N, 1), 1 for the second body and -1 for the first, 0 for the world.
+      body: (C, N, 1), 1 at the second body and -1 at the first, unless that is the
+        world; 0 elsewhere.
       friction: of sliding.
       margin: distance from which a contact is in play.
       inverse_weight: of an edge of the pyramid.
@@ -134,7 +137,7 @@ class Constants(struct.PyTreeNode):
 
 
 class Group(NamedTuple):
-    """The possible contacts with the same condim; `edges` as in `newton.Contacts`."""
+    """The possible contacts of one condim; `edges` are as in `newton.ContactRows`."""
 
     edges: tuple[tuple[int, ...], ...]
     pairs: collision.Pairs
@@ -193,16 +196,16 @@ def layout(model: mujoco.MjModel) -> Layout:
         mjx_model = mjx.put_model(model)
         collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
         contact = jax.tree.map(np.asarray, collide(mjx.make_data(model)))
-    flat = _plane(model, contact.geom.reshape(-1, 2))
-    pyramid = _PYRAMID if flat is None else _FLAT_PYRAMID
+    motion_normal = _motion_normal(model, contact.geom.reshape(-1, 2))
+    pyramid = _PYRAMID if motion_normal is None else _FLAT_PYRAMID
     groups = [
-        _group(model, contact, dim, edges, flat)
+        _group(model, contact, dim, edges, motion_normal)
         for dim, edges in ((1, ((),)), (3, pyramid))
     ]
     return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
 
 
-def _plane(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
+def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
     """Return the normal of the plane that contains all motion, or None if none does.
 
     It is also None if a contact's tangents may be neither in the plane nor across it:
@@ -242,7 +245,7 @@ def _group(
     contact: mjx.Contact,
     condim: int,
     edges: tuple[tuple[int, ...], ...],
-    flat: np.ndarray | None,
+    motion_normal: np.ndarray | None,
 ) -> Group:
     index = np.flatnonzero(contact.dim.reshape(-1) == condim)
     geom = contact.geom.reshape(-1, 2)
@@ -267,7 +270,7 @@ def _group(
         inverse_weight=_constant(inverse_weight),
         impedance=Impedance.of(model, at(contact.solref, 2), at(contact.solimp, 5)),
     )
-    pairs = collision.pairs(model, geom[index], len(edges[0]), flat)
+    pairs = collision.pairs(model, geom[index], len(edges[0]), motion_normal)
     return Group(edges, pairs, constants)
 
 
@@ -277,7 +280,7 @@ def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
 
 
 @jax.named_scope("constraint_rows")
-def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limits:
+def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.LimitRows:
     """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
     joint = qpos[limits.qpos]
     above_low, below_high = joint - limits.low, limits.high - joint
@@ -293,7 +296,7 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     index = np.full(qvel.shape[0], limits.dof.size)
     index[limits.dof] = np.arange(limits.dof.size)
     none = jnp.zeros((1, qvel.shape[1]), jnp.float32)
-    return newton.Limits(*(jnp.concatenate([x, none])[index] for x in of_limit))
+    return newton.LimitRows(*(jnp.concatenate([x, none])[index] for x in of_limit))
 
 
 @jax.named_scope("constraint_rows")
@@ -302,7 +305,7 @@ def contact_rows(
     contacts: Contacts,
     at: tree.Kinematics,
     qvel: jax.Array,
-) -> newton.Contacts:
+) -> newton.ContactRows:
     """Return the rows of a group of contacts at qvel (V, B)."""
     (distance, position, axes), constants = contacts
     gap = distance - constants.margin
@@ -324,7 +327,7 @@ def contact_rows(
     weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)
     # A normal that stands for two edges weighs as both.
     count = [2.0 if edges == _FLAT_PYRAMID and not any(s) else 1.0 for s in edges]
-    return newton.Contacts(
+    return newton.ContactRows(
         normal=along[:, 0],
         tangents=along[:, 1:],
         reference=-constants.impedance.damping[:, None] * speed - pull[:, None],

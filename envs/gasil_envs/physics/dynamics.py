@@ -87,7 +87,7 @@ def make(
     )
 
 
-class _Accelerations(NamedTuple):
+class _Evaluation(NamedTuple):
     """The result of one evaluation of the dynamics.
 
     Attributes:
@@ -120,7 +120,7 @@ def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
 
 def forward(
     dynamics: Dynamics, state: PhysicsState, actuation: jax.Array
-) -> _Accelerations:
+) -> _Evaluation:
     """Compute accelerations and fields; `actuation` are the motors' forces (V, B)."""
     model, (qpos, qvel) = dynamics.model, (state.qpos, state.qvel)
     at = tree.kinematics(model, qpos)
@@ -164,7 +164,7 @@ def forward(
         "qfrc_actuator": actuation,
         "cfrc_ext": of_bodies,
     }
-    return _Accelerations(
+    return _Evaluation(
         smooth.inertia,
         force + constraint_force,
         qacc,
@@ -172,8 +172,8 @@ def forward(
     )
 
 
-# On a GPU a decision needs the host, which pays from this many possible contacts on.
-_FEWEST_WORTH_A_DECISION = 20
+# On a GPU a branch waits for the host, which pays from this many possible contacts on.
+_FEWEST_WORTH_A_BRANCH = 20
 
 
 def _with_contacts_in_play(
@@ -188,7 +188,7 @@ def _with_contacts_in_play(
     count = [x.touch.distance.shape[0] for x in contacts]
     most = max(count, default=0)
     if most <= constraints.MOST_IN_PLAY or not (
-        on_cpu() or most >= _FEWEST_WORTH_A_DECISION
+        on_cpu() or most >= _FEWEST_WORTH_A_BRANCH
     ):
         return function(contacts, True)
     in_play = jnp.stack([constraints.num_in_play(x) for x in contacts])

@@ -50,7 +50,7 @@ def _check_threads() -> None:
     on_cpu = jax.default_backend() == "cpu"
     if _NEEDS_THREADS and on_cpu and devices > 1 and threads <= devices:
         raise RuntimeError(
-            f"physics 'mujoco' on {devices} CPU devices would wait for ever in jax "
+            f"physics 'mujoco' on {devices} CPU devices would deadlock in jax "
             f"{jax.__version__}: set {_POOL_SIZE}={2 * devices} before JAX starts"
         )
 

@@ -23,7 +23,6 @@ It is not reverse-mode differentiable. Neither is MJX's own solver, because its 
 dynamic.
 """
 
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -34,8 +33,6 @@ from flax import struct
 from gasil_envs.physics import newton_kernel
 from gasil_envs.physics.batching import (
     add,
-    batch_last,
-    in_tiles,
     materialize,
     on_cpu,
     on_gpu,
@@ -45,8 +42,8 @@ from gasil_envs.physics.batching import (
 # same number of edges: C contacts, T tangents, E edges.
 
 
-class Contacts(struct.PyTreeNode):
-    """A group of contacts with the same number of edges; float32.
+class ContactRows(struct.PyTreeNode):
+    """The rows of a group of contacts with the same number of edges; float32.
 
     Attributes:
       normal: (C, V), Jacobian of the normal; zero where out of play.
@@ -63,8 +60,8 @@ class Contacts(struct.PyTreeNode):
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
 
 
-class Limits(struct.PyTreeNode):
-    """At most one limit on each degree of freedom; float32.
+class LimitRows(struct.PyTreeNode):
+    """The rows of joint limits, at most one for each degree of freedom; float32.
 
     Attributes:
       sign: (V,), the Jacobian: 1 at a lower, -1 at an upper limit, 0 in between.
@@ -91,8 +88,8 @@ class Problem(struct.PyTreeNode):
     inertia: jax.Array
     force: jax.Array
     warmstart: jax.Array
-    limits: Limits
-    contacts: tuple[Contacts, ...] = ()
+    limits: LimitRows
+    contacts: tuple[ContactRows, ...] = ()
 
 
 class Solution(struct.PyTreeNode):
@@ -107,12 +104,6 @@ class Solution(struct.PyTreeNode):
     qacc: jax.Array
     edge_forces: tuple[jax.Array, ...]
     constraint_force: jax.Array
-
-
-def solve(problem: Problem, iterations: int = 4, line_search: int = 4) -> Solution:
-    """Solve one problem; use `jax.vmap`, nested if needed, for many."""
-    function = functools.partial(solve_many, iterations, line_search)
-    return batch_last(in_tiles(function))(problem)
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -307,7 +298,7 @@ def _repeat(
     """Call a function `least` to `most` times, and on a CPU until nothing changes.
 
     The function returns the carry and whether something has changed. On a GPU each
-    decision would wait for the host, and a loop costs more than a small body, so it
+    test would wait for the host, and a loop costs more than a small body, so it
     may be unrolled there. On a CPU unrolling it only costs compile time.
     """
     if not on_cpu():
@@ -337,26 +328,27 @@ def solve_many(
     weight = rows.weight
     each = jax.tree.map
     total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
-    distance_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
+    # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
+    jaref_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
     qacc_smooth = eliminate(inertia, force)
 
-    is_pushing = lambda distance: each(lambda d: d < 0.0, distance)
+    is_pushing = lambda jaref: each(lambda d: d < 0.0, jaref)
     changes = lambda a, b: jnp.any(total(each(jnp.not_equal, a, b)) > 0)
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
         square = lambda d, w: w * jnp.minimum(d, 0.0) ** 2
-        constraint_cost = total(each(square, distance_at(qacc), weight))
+        constraint_cost = total(each(square, jaref_at(qacc), weight))
         return _dot(away, _matvec(inertia, away, spell_out)) + constraint_cost
 
     better = cost(problem.warmstart) < cost(qacc_smooth)
     start = jnp.where(better, problem.warmstart, qacc_smooth)
 
     def iterate(carry: tuple[jax.Array, list[jax.Array]]) -> Any:
-        qacc, distance = carry
-        active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), distance, weight)
+        qacc, jaref = carry
+        active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), jaref, weight)
         residual = _matvec(inertia, qacc, spell_out) - force
-        pull = rows.transposed_times(each(jnp.multiply, active, distance))
+        pull = rows.transposed_times(each(jnp.multiply, active, jaref))
         active, gradient = materialize((active, residual + pull))
         hessian = inertia + rows.gram(active)
         direction = -eliminate(hessian, gradient)
@@ -366,9 +358,9 @@ def solve_many(
         linear = _dot(direction, residual)
         quadratic = _dot(direction, _matvec(inertia, direction, spell_out))
 
-        def newton(search: tuple[Any, ...]) -> Any:
+        def search_step(search: tuple[Any, ...]) -> Any:
             step, low, high, pushing = search
-            there = each(lambda d, s: d + step * s, distance, slope)
+            there = each(lambda d, s: d + step * s, jaref, slope)
             pushed = each(
                 lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
             )
@@ -384,16 +376,16 @@ def solve_many(
             return (following, low, high, now), changes(pushing, now)
 
         step = jnp.ones_like(linear)
-        pushing = is_pushing(distance)
+        pushing = is_pushing(jaref)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
-        step = _repeat(newton, search, least=1, most=line_search, unroll=True)[0]
-        moved = each(lambda d, s: d + step * s, distance, slope)
+        step = _repeat(search_step, search, least=1, most=line_search, unroll=True)[0]
+        moved = each(lambda d, s: d + step * s, jaref, slope)
         return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
 
-    begin = (start, distance_at(start))
+    begin = (start, jaref_at(start))
     unroll = force.shape[0] <= _MOST_DEGREES_UNROLLED
-    qacc, distance = _repeat(iterate, begin, least=2, most=iterations, unroll=unroll)
-    push = each(lambda d, w: w * jnp.maximum(-d, 0.0), distance, weight)
+    qacc, jaref = _repeat(iterate, begin, least=2, most=iterations, unroll=unroll)
+    push = each(lambda d, w: w * jnp.maximum(-d, 0.0), jaref, weight)
     return Solution(
         qacc=qacc,
         edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in push[1:]),

@@ -2,7 +2,7 @@
 
 Written as XLA's operations, each step of an elimination is a kernel that reads and
 writes all matrices. Here a warp has one matrix in its registers from the first step to
-the last. Arrays are filled up to powers of two, as Triton needs them.
+the last. Arrays are padded to powers of two, as Triton needs them.
 """
 
 import functools
@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax.experimental import pallas as pl
 from jax.experimental.pallas import triton
 
-# Shape letters: V unknowns, filled up in a kernel; B batch.
+# Shape letters: V unknowns, padded in a kernel; B batch.
 
 # On an H100 the elimination of 14 and of 23 unknowns is faster in a kernel, and that of
 # 9 is not. The registers of a warp have no room for matrices of more than 32.
@@ -23,9 +23,11 @@ SIZES = range(12, 33)
 def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
     """Return x of A x = b for symmetric positive A: (V, V), (V,) -> (V,).
 
-    Gauss-Jordan elimination of the first `size` rows; the others are filled up. Columns
-    that are done would be those of the identity. Instead they mirror what the rows that
-    are done have elsewhere, so that a pivot's row is its column, the factors of all.
+    Gauss-Jordan elimination of the first `size` rows; the others are padding. The block
+    that is not eliminated yet stays symmetric. An entry in an eliminated row i and
+    another column j is kept at (j, i), where plain elimination would have a zero of the
+    identity. So the pivot's row alone holds the factors of all rows, and no column
+    needs to be read.
     """
     index = jax.lax.broadcasted_iota(jnp.int32, right.shape, 0)
     row_of = jax.lax.broadcasted_iota(jnp.int32, matrix.shape, 0)
@@ -45,11 +47,11 @@ def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
 
 
 def _kernel(size: int, matrix: Any, right: Any, out: Any) -> None:
-    """Solve one system; what is filled up lies outside the arrays."""
-    (full,) = out.shape
-    index = jax.lax.broadcasted_iota(jnp.int32, (full,), 0)
-    row_of = jax.lax.broadcasted_iota(jnp.int32, (full, full), 0)
-    column_of = jax.lax.broadcasted_iota(jnp.int32, (full, full), 1)
+    """Solve one system; the padding lies outside the arrays."""
+    (padded,) = out.shape
+    index = jax.lax.broadcasted_iota(jnp.int32, (padded,), 0)
+    row_of = jax.lax.broadcasted_iota(jnp.int32, (padded, padded), 0)
+    column_of = jax.lax.broadcasted_iota(jnp.int32, (padded, padded), 1)
     inside = (row_of < size) & (column_of < size)
     matrix = triton.load(matrix, mask=inside, other=0.0)
     right = triton.load(right, mask=index < size, other=0.0)
@@ -67,14 +69,15 @@ def solve_linear(
       interpret: run the kernel as XLA's operations, on any device, to test it.
     """
     size, batch = right.shape
-    full = max(8, pl.next_power_of_2(size))
-    of_vectors = pl.BlockSpec((None, full), lambda b: (b, 0))
+    padded = max(8, pl.next_power_of_2(size))
+    of_vectors = pl.BlockSpec((None, padded), lambda b: (b, 0))
+    of_matrices = pl.BlockSpec((None, padded, padded), lambda b: (b, 0, 0))
     result = pl.pallas_call(
         functools.partial(_kernel, size),
         grid=(batch,),
-        in_specs=[pl.BlockSpec((None, full, full), lambda b: (b, 0, 0)), of_vectors],
+        in_specs=[of_matrices, of_vectors],
         out_specs=of_vectors,
-        out_shape=jax.ShapeDtypeStruct((batch, full), jnp.float32),
+        out_shape=jax.ShapeDtypeStruct((batch, padded), jnp.float32),
         compiler_params=triton.CompilerParams(num_warps=1, num_stages=1),
         interpret=interpret,
         name="eliminate",

@@ -330,21 +330,21 @@ def smooth(
     moved = materialize(jnp.stack([in_subtree[i] for i in model.dof_bodyid]))
     bias = jnp.sum(cdof * moved[:, 10:], axis=1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
-    hinge = model.jnt_type != FREE
+    scalar = model.jnt_type != FREE
     if model.jnt_stiffness.any():
-        index = model.jnt_qposadr[hinge]
+        index = model.jnt_qposadr[scalar]
         stretch = qpos[index] - model.qpos_spring[index].astype(np.float32)[:, None]
-        stiffness = np.zeros((model.nv, hinge.sum()), np.float32)
-        stiffness[model.jnt_dofadr[hinge], np.arange(hinge.sum())] = (
-            model.jnt_stiffness[hinge]
+        stiffness = np.zeros((model.nv, scalar.sum()), np.float32)
+        stiffness[model.jnt_dofadr[scalar], np.arange(scalar.sum())] = (
+            model.jnt_stiffness[scalar]
         )
         passive = passive - stiffness @ stretch
-    push = materialize(_momentum(moved[:, :10], cdof))
-    return Smooth(_joint_inertia(model, push, cdof), passive - bias, cvel)
+    unit_momentum = materialize(_momentum(moved[:, :10], cdof))
+    return Smooth(_joint_inertia(model, unit_momentum, cdof), passive - bias, cvel)
 
 
 def _joint_inertia(
-    model: mujoco.MjModel, push: jax.Array, cdof: jax.Array
+    model: mujoco.MjModel, unit_momentum: jax.Array, cdof: jax.Array
 ) -> jax.Array:
     """Return the inertia (V, V, B), from the momentum of each unit motion (V, 6, B)."""
     above = np.zeros((model.nv, model.nv, 1), bool)
@@ -353,7 +353,7 @@ def _joint_inertia(
         while ancestor >= 0:
             above[dof, ancestor] = True
             ancestor = model.dof_parentid[ancestor]
-    product = add(push[:, None, k] * cdof[None, :, k] for k in range(6))
+    product = add(unit_momentum[:, None, k] * cdof[None, :, k] for k in range(6))
     product = materialize(product)
     own = np.eye(model.nv, dtype=bool)[..., None]
     armature = np.diag(model.dof_armature).astype(np.float32)[..., None]
