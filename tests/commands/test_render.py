@@ -178,7 +178,7 @@ def test_a_film_is_whole_or_not_there(point_mass, tmp_path, monkeypatch, capsys)
         path.write_bytes(b"x")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(render, "write", half)
+    monkeypatch.setattr(render, "write_film", half)
     path = tmp_path / "film.gif"
     assert render.main([str(point_mass), "--out", str(path), "--steps", "2"]) == 1
     assert "No space left on device" in capsys.readouterr().err
