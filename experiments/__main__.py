@@ -88,10 +88,11 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
     chosen yet.
 
     Raises:
-      InputError: if there is no panel of a name, or if only searches are named.
+      InputError: if the figure has no panel or search of a name, or if only searches
+        are named.
     """
-    small_figure = _selected(figure, names or [*figure.panels][:1])
-    if not small_figure.panels:
+    selected = _selected(figure, names or [*figure.panels][:1])
+    if not selected.panels:
         raise InputError(
             f"only is {' '.join(names)}: --quick trains panels, which are "
             f"{', '.join(figure.panels)}"
@@ -105,7 +106,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 
     panels = {
         panel: {name: small(curve) for name, curve in curves.items()}
-        for panel, curves in small_figure.panels.items()
+        for panel, curves in selected.panels.items()
     }
     return dataclasses.replace(figure, panels=panels, searches={})
 

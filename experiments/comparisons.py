@@ -14,7 +14,7 @@ import numpy as np
 from experiments.figures import Comparisons
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
-#: The probability that any verdict of a family is wrong, at most.
+#: The probability that any verdict of a family is wrong, about.
 LEVEL = 0.05
 _DRAWS = 10_000
 #: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
@@ -157,7 +157,10 @@ def in_words(middle: float, low: float, high: float) -> str:
 
 
 def interval(scores: np.ndarray) -> str:
-    """Return the interquartile mean of (seeds,); and its interval, if not too few."""
+    """Return the interquartile mean of (seeds,) and, if there are enough, its interval.
+
+    The result is text.
+    """
     middle = float(interquartile_mean(scores))
     if len(scores) < FEWEST_SEEDS:
         return number(middle)

@@ -60,11 +60,12 @@ evaluated: in brackets how many, if not all. Better and worse are verdicts on
 differences, by a permutation test and the bootstrap together (differences of
 differences: by the bootstrap alone), corrected by Holm's method for the {} comparisons
 of final returns on this page: where nothing differs, the probability of any verdict at
-all is 5% at most. Verdicts on evaluated returns are a family of their own. All verdicts
-are about these settings: the intervals leave out that another search might have chosen
-others. "Not clear" does not mean that two are equal. The probability of improvement is
-the probability that a random seed of the first curve has a higher return than a random
-seed of the second, where equal ones count half, averaged over the tasks."""
+all is at most 5%, or about 5% among differences of differences. Verdicts on evaluated
+returns are a family of their own. All verdicts are about these settings: the intervals
+leave out that another search might have chosen others. "Not clear" does not mean that
+two are equal. The probability of improvement is the probability that a random seed of
+the first curve has a higher return than a random seed of the second, where equal ones
+count half, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -149,7 +149,7 @@ class Summary:
         words = f"{word}: in {len(agree)} of {len(measured)} cases"
         words += f" ({'; '.join(agree)})" if agree else ""
         if opposite:
-            words += f"; the opposite: {', '.join(opposite)}"
+            words += f"; the opposite ({'; '.join(opposite)})"
         return words + (f"; {lacking} not measured yet" if lacking else "")
 
     def claims(self) -> str:

@@ -65,6 +65,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         "env": described["env"],
         "reward_delay": delay,
         "agent": described["config"].agent,
+        "decompose_rewards": described["config"].decompose_rewards,
         "seed": seed,
         "env_steps": described["config"].total_steps,
         "mean": round(float(returns.mean()), 1),
@@ -97,7 +98,9 @@ def table() -> str:
         about = numpy_policy.about(f"{numpy_policy.ZOO_PREFIX}{name}")
         score = f"{about['mean']:,.0f} ± {about['deviation']:,.0f}"
         steps = f"{about['env_steps']:,}"
-        rows.append([f"`zoo:{name}`", about["agent"], steps, score])
+        # Older policies of adaptive imitation do not say so.
+        agent = about["agent"] + ", decomposed" * about.get("decompose_rewards", False)
+        rows.append([f"`zoo:{name}`", agent, steps, score])
     head = ["policy", "trained with", "steps", "return in Gymnasium"]
     return report.markdown_table(head, rows)
 

@@ -68,7 +68,7 @@ class Episode(NamedTuple):
     Attributes:
       observation: float32 (steps, obs).
       action: float32 (steps, action).
-      return_: discounted return.
+      return_: the return that the buffer ranks it by.
     """
 
     observation: np.ndarray

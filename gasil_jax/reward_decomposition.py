@@ -239,8 +239,9 @@ def decompose(
 
     Returns:
       The state after the batch, the batch with decomposed rewards, whether the update
-      of the network was finite and is kept, (), and metrics: the `fit` of the windows
-      of more than one step, which had not been trained on when they were predicted.
+      of the network was finite and is kept, (), and metrics: the `goodness_of_fit` of
+      the windows of more than one step, which had not been trained on when they were
+      predicted.
     """
     network = _network(config)
     low, high = action_range

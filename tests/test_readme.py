@@ -47,9 +47,9 @@ NOT_RUN = {
     "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
     "python -m experiments profile": "it measures for minutes",
-    "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/test_sweep.py "
-    "and tests/test_ray.py train shards",
-    "python -m gasil_jax.merge": "tests/test_sweep.py merges shards",
+    "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
+    "test_shards.py and tests/sweeps/test_ray.py train shards",
+    "python -m gasil_jax.merge": "tests/sweeps/test_shards.py merges shards",
 }
 
 

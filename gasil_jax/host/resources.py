@@ -92,7 +92,7 @@ def _free_in_the_container(group: pathlib.Path = _CONTROL_GROUP) -> int:
 
 
 def _padded(count: int, devices: Sequence[jax.Device]) -> int:
-    """Return the number of members, rounded up to a multiple of that of devices."""
+    """Return the number of members, rounded up to a multiple of the devices' number."""
     return math.ceil(count / len(devices)) * len(devices)
 
 

@@ -164,7 +164,7 @@ def make_points(
       grid: NAME=VALUE,VALUE,... for each name that varies.
       random: number of points to draw from the grid or, without a grid, from
         `PAPER_RANGES`; None takes the whole grid.
-      points_file: a file that lists the points, did_you_mean of grid and random.
+      points_file: a file that lists the points, instead of grid and random.
       seed: seed of the draws.
       agent: the agent of the sweep. Names that it does not use are refused in the
         grid and the file, and left out of `PAPER_RANGES`.
@@ -197,6 +197,8 @@ def make_points(
     }
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)
+    if count >= 2**63:
+        raise InputError(f"random is {random}: the grid must have under 2**63 points")
     if random > count:
         raise InputError(
             f"random is {random}: it must be at most {count}, the number of points"

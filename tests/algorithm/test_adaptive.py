@@ -10,7 +10,8 @@ import pytest
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax.imitation import adaptive, adversarial
+from gasil_jax.imitation import adaptive, adversarial, find_agent
+from gasil_jax.testing import example_context
 
 AGENT = "ppo+gasil-adaptive"
 ENV = gasil_jax.make_env("point_mass")
@@ -120,9 +121,28 @@ def test_the_control_is_paid_for_every_step():
     (without, _), (plain, _) = train(agent="ppo+bonus", alpha=0.0), train()
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     jax.tree.map(close, without.actor_critic, plain.actor_critic)
-    paid, _ = train(agent="ppo+bonus", alpha=1.0)
-    value = lambda state: jax.tree.leaves(state.actor_critic.values[0].params)[0]
-    assert not np.allclose(value(paid), value(without))
+    config, key = SMALL.replace(agent="ppo+bonus", alpha=0.7), jax.random.key(0)
+    context = jax.jit(lambda key: example_context(ENV, config, key))(key)
+    _, rewards, _ = find_agent("ppo+bonus").update_and_reward((), context, key)
+    np.testing.assert_allclose(rewards - context.rollout.reward, 0.7, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("agent", "share"), [("ppo+gasil", 1.0), ("gasil", 0.0)])
+def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
+    config = SMALL.replace(agent=agent, alpha=0.7)
+
+    @jax.jit
+    def first(key):
+        context = example_context(ENV, config, key)
+        state = gasil_jax.init(ENV, config, key).imitation
+        _, rewards, _ = find_agent(agent).update_and_reward(state, context, key)
+        _, bonus, _ = adversarial.update_and_score(state, context, key)
+        return context.good_trajectories.size, context.rollout.reward, bonus, rewards
+
+    size, reward, bonus, rewards = first(jax.random.key(0))
+    assert size > 0 and bonus.std() > 0.01
+    expected = share * reward + 0.7 * bonus
+    np.testing.assert_allclose(rewards, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_a_form_that_does_not_exist_is_refused():

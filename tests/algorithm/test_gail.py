@@ -75,9 +75,7 @@ def test_an_expert_of_another_size_is_refused(expert, tmp_path):
             action=arrays["action"],
         )
     config = gasil_jax.Config(agent="gail", expert=str(tmp_path / "other.npz"))
-    with pytest.raises(
-        ValueError, match="of size 3 and actions of size 2"
-    ):
+    with pytest.raises(ValueError, match="of size 3 and actions of size 2"):
         gasil_jax.make_train(env, config)
 
 

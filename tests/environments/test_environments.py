@@ -316,3 +316,17 @@ def test_a_fault_of_the_users_environment_is_one_line(
     with pytest.raises(ValueError, match=message) as refused:
         gasil_envs.make(f"{name}:Env")
     assert "\n" not in str(refused.value)
+
+
+def test_the_euler_integrator_is_mujocos():
+    env = gasil_envs.make("hopper", physics="mujoco", integrator="euler")
+    state, action = jax.jit(env.reset)(jax.random.key(0)), jnp.full(3, 0.5)
+    model = gymnasium.make("Hopper-v5").unwrapped.model
+    assert model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    data, start = mujoco.MjData(model), state.pipeline_state.physics
+    data.qpos[:], data.qvel[:], data.ctrl[:] = start.qpos, start.qvel, action
+    mujoco.mj_step(model, data, 4)
+    after = jax.jit(env.step)(state, action).pipeline_state.physics
+    np.testing.assert_allclose(after.qpos, data.qpos, atol=1e-6)
+    np.testing.assert_allclose(after.qvel, data.qvel, atol=1e-6)

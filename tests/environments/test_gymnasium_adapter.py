@@ -2,14 +2,17 @@
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs import Env, State
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
 
 import gasil_envs
 from gasil_envs import gymnasium_adapter
+from gasil_envs.gymnax_adapter import GymnaxEnv
 
 
 @pytest.mark.parametrize(
@@ -147,3 +150,39 @@ def test_pictures_show_the_episode():
     assert env.metadata["render_fps"] == 10
     with pytest.raises(ValueError, match="it must be 'rgb_array'"):
         gymnasium_adapter.GymnasiumEnv("point_mass", render_mode="ansi")
+
+
+class Breaking(Env):
+    """Its third observation is not a number."""
+
+    observation_size, action_size, backend = 1, 1, "none"
+
+    def reset(self, rng):
+        return State(None, jnp.zeros(1), jnp.float32(0), jnp.float32(0))
+
+    def step(self, state, action):
+        count = state.obs + 1
+        broken = jnp.where(count == 3, jnp.nan, count)
+        return state.replace(obs=broken, reward=jnp.float32(1))
+
+
+def test_a_step_of_failed_physics_terminates_in_every_adapter():
+    name = f"{__name__}:Breaking"
+    one = gymnasium_adapter.GymnasiumEnv(name)
+    many = gymnasium_adapter.GymnasiumVectorEnv(name, 2)
+    for env, shape in ((one, (1,)), (many, (2, 1))):
+        env.reset(seed=0)
+        for count in (1, 2, 3):
+            obs, reward, terminated, truncated, _ = env.step(np.zeros(shape))
+            np.testing.assert_array_equal(obs, np.full(shape, min(count, 2)))
+            np.testing.assert_array_equal(reward, np.full(shape[:-1], count < 3))
+            np.testing.assert_array_equal(terminated, np.full(shape[:-1], count == 3))
+            assert not np.any(truncated)
+    env, key = GymnaxEnv(name), jax.random.key(0)
+    _, state = env.reset(key)
+    for count in (1, 2, 3):
+        _, state, reward, terminated, truncated, info = env.step(
+            key, state, jnp.zeros(1)
+        )
+        assert info["final_observation"] == min(count, 2) and reward == (count < 3)
+        assert terminated == (count == 3) and not truncated

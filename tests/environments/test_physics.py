@@ -38,6 +38,17 @@ def solve(problem, iterations=4):
     return batching.batch_last(batching.in_tiles(function))(problem)
 
 
+def test_host_calls_that_would_deadlock_are_refused(monkeypatch):
+    monkeypatch.setattr(native, "_NEEDS_THREADS", True)
+    monkeypatch.setattr(jax, "local_device_count", lambda: 2)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setenv("PJRT_NPROC", "2")
+    with pytest.raises(RuntimeError, match="set PJRT_NPROC=4 before JAX starts"):
+        native._check_threads()
+    monkeypatch.setenv("PJRT_NPROC", "3")
+    native._check_threads()
+
+
 def problems(batch, size, groups, seed=0):
     """Random problems, and the same with every constraint as a row of a matrix."""
     rng = np.random.default_rng(seed)

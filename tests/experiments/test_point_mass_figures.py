@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 
+import jax
 import numpy as np
 
 import gasil_jax
@@ -73,7 +74,7 @@ def test_the_states_at_moments_are_those_of_training():
     )
     states = point_mass_moments.states_at(env, config, (0.0, 0.5, 1.0))
     assert [int(state.iteration) for state in states] == [1, 4, 8]
-    final, _ = gasil_jax.make_train(env, config)(gasil_jax.train.jax.random.key(0))
+    final, _ = gasil_jax.make_train(env, config)(jax.random.key(0))
     one, other = (
         x.actor_critic.policy.params["params"]["log_std"] for x in (states[-1], final)
     )

@@ -307,8 +307,8 @@ def test_seeds_in_words():
     assert report._ranges([3]) == "3"
 
 
-def test_a_block_is_made_anew():
-    made = summary.Summary(STORE)
+def test_a_block_is_made_anew(tmp_path):
+    made = summary.Summary(Store(tmp_path))
     text = "before\n<!-- begin claims -->\nold\n<!-- end -->\nafter"
     filled = report.fill_blocks(text, made.value)
     assert filled == text.replace("old\n", f"\n{made.claims()}\n\n")
@@ -323,18 +323,18 @@ def test_a_block_is_made_anew():
         ([], "not measured yet"),
         (
             ["worse"],
-            "open so far: in 0 of 1 cases; the opposite: 0; 2 not measured yet",
+            "open so far: in 0 of 1 cases; the opposite (0); 2 not measured yet",
         ),
         (["better", "better"], "holds: in 2 of 2 cases (0; 1); 1 not measured yet"),
         (["not clear"] * 2, "does not hold: in 0 of 2 cases; 1 not measured yet"),
         (
             ["worse", "better", "worse"],
-            "holds in part: in 1 of 3 cases (1); the opposite: 0, 2",
+            "holds in part: in 1 of 3 cases (1); the opposite (0; 2)",
         ),
     ],
 )
-def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words):
-    made = summary.Summary(STORE)
+def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words, tmp_path):
+    made = summary.Summary(Store(tmp_path))
     keys = [("panel", "ppo+gasil", f"other {i}") for i in range(3)]
     of = {"better": (1.0, 0.0), "worse": (-1.0, 0.0), "not clear": (1.0, 1.0)}
     made.pages["matrix"].comparisons = {

@@ -1,5 +1,6 @@
 """The parts that curves are drawn of, and what the figures say and show."""
 
+import matplotlib.figure
 import numpy as np
 import pytest
 
@@ -124,3 +125,12 @@ def test_a_sweeps_labels_are_what_varies(monkeypatch, tmp_path):
     labels = kept[0].axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == ["alpha=0.1", "alpha=1"]
     assert [label.get_weight() for label in labels] == ["normal", "bold"]
+
+
+def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
+    kept = []
+    pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
+    monkeypatch.setattr(matplotlib.figure.Figure, "savefig", pixels)
+    points = [{"alpha": float(i)} for i in range(1300)]
+    tables._plot(tmp_path / "x.png", points, np.zeros((1300, 1)), None)
+    assert kept[0] < 2**16

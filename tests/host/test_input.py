@@ -65,7 +65,7 @@ def test_a_value_that_is_never_valid_is_refused(name, value):
     argument = f"--{name.replace('_', '-')}={value}"
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            # An unknown environment stops the run should all else be accepted.
+            # A folder that can't be made stops the run should all else be accepted.
             status = run.main(["--env", "hopper", argument, "--out", "/proc/no/run"])
         except SystemExit as exit_:
             pytest.fail(f"{argument} exits with {exit_.code}")
@@ -100,7 +100,7 @@ ANY_FLOAT = st.one_of(
 
 @st.composite
 def configurations(draw):
-    """Draw small configs, about half of them valid."""
+    """Draw small configs, about one in seven valid."""
     floats = {"buffer_steps": draw(st.integers(1, 60))} | {
         field.name: draw(ANY_FLOAT)
         for field in dataclasses.fields(gasil_jax.Hyperparameters)

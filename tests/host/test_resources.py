@@ -66,7 +66,7 @@ def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatc
     assert written == 3 * state
     resources.check_disk(env, members, tmp_path, 3, written=written)
     assert resources.size_of_checkpoints(tmp_path / "none") == 0
-    # Those of a sweep's other programs are not in the way of this one's.
+    # The checkpoints of folders below do not count.
     assert resources.size_of_checkpoints(tmp_path.parent) == 0
 
 
