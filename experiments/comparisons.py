@@ -14,7 +14,7 @@ import numpy as np
 from experiments.figures import Comparisons
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
-#: The probability that any verdict of a family is wrong, about.
+#: About the probability that any verdict of a family is wrong.
 LEVEL = 0.05
 _DRAWS = 10_000
 #: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
@@ -117,8 +117,8 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) ->
     It is the probability that a random seed of `ours` has a higher score than a random
     seed of `other`, where equal scores count half, averaged over the panels, with the
     95% percentile bootstrap interval over seeds, drawn within each panel (Agarwal et
-    al. 2021). A score that is not a number, of a seed
-    that ended no episode, is less than all others.
+    al. 2021). A score that is not a number, of a seed that ended no episode, is less
+    than all others.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
 

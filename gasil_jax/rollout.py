@@ -150,10 +150,9 @@ def collect(
       gamma: discount of the episodes' return.
 
     If the physics diverges, the episode terminates with reward 0 and the step is marked
-    in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in
-    the observation or for a reward, given or held back. An episode that is truncated
-    here is given the reward that the environment still holds back,
-    ``info["held_reward"]``.
+    in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in the
+    observation or for a reward, given or held back. An episode that is truncated here
+    is given the reward that the environment still holds back, ``info["held_reward"]``.
 
     A first episode that began at an age above 0 is truncated at the same limit and
     marked in ``cut_short``. PPO learns from its steps, but its return is not reported.

@@ -68,14 +68,14 @@ def prepare(
       InputError: if the programs do not fit the devices or the disk.
     """
     num_members = sum(len(program.members) for program in programs)
-    out = options.out
-    # A run's checkpoints are in its own folder, a sweep's in those of its programs.
-    folders = [out, *(program.folder(out) for program in unfinished)] if out else []
     devices.use_devices(options.settings, options.devices, num_members)
     env = make_env(options)
     schedule = evaluation_schedule(options)
     with announced(options.env, "starting the devices"):
         every = jax.devices()
+    out = options.out
+    # A run's checkpoints are in its own folder, a sweep's in those of its programs.
+    folders = [out, *(program.folder(out) for program in unfinished)] if out else []
     with command_line.input_checked():
         for program in programs:
             count = len(program.members)

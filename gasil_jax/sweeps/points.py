@@ -93,13 +93,11 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
         with _naming(f"points_file is {path}"):
             check_point(point, agent)
     allowed = kinds(agent)
-    try:
+    with _naming(f"points_file is {path}"):
         read = [
             {name: allowed[name](value) for name, value in point.items()}
             for point in points
         ]
-    except OverflowError as error:
-        raise InputError(f"points_file is {path}: {error}") from None
     for index, point in enumerate(read):
         if point in read[:index]:
             raise InputError(f"points_file is {path}: it has {point} twice")
@@ -110,7 +108,8 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
 def _naming(where: str) -> Iterator[None]:
     try:
         yield
-    except ValueError as error:
+    # A whole number that is too large for a float is an OverflowError.
+    except (ValueError, OverflowError) as error:
         raise InputError(f"{where}: {error}") from None
 
 

@@ -157,7 +157,10 @@ def test_points_from_a_file(tmp_path):
     ("arguments", "message"),
     [
         ("--grid alhpa=1", "did you mean 'alpha'"),
-        ("--agent ppo --grid alpha=1", "does not use it; it must be one of learn"),
+        (
+            "--agent ppo --grid alpha=1",
+            "agent 'ppo' does not use it; it must be one of learn",
+        ),
         ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not use it"),
         (
             "--grid decomposition_learning_rate=1e-3,1e-4",

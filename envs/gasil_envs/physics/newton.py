@@ -31,12 +31,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs.physics import newton_kernel
-from gasil_envs.physics.batching import (
-    add,
-    materialize,
-    on_cpu,
-    on_gpu,
-)
+from gasil_envs.physics.batching import add, materialize, on_cpu, on_gpu
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges.
