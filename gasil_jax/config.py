@@ -12,6 +12,7 @@ import numbers
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from flax import struct
 
@@ -356,10 +357,6 @@ _LARGEST_FLOAT = 3.4e38
 def validate(config: Config) -> None:
     """Check that every value of a config is allowed.
 
-    Args:
-      config: the config to check. Hyperparameters that are arrays are skipped, because
-        they may be traced.
-
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
@@ -377,15 +374,49 @@ def validate(config: Config) -> None:
         _validate_divides(name, getattr(config, name), config.batch_steps)
     for name in ("learning_rate_schedule", "clip_epsilon_schedule", "alpha_schedule"):
         _validate_schedule(name, getattr(config, name), config.total_steps)
-    if not isinstance(config.hyperparameters, Hyperparameters):
-        raise _refusal("hyperparameters", config.hyperparameters, "Hyperparameters")
-    for name, allowed in ranges(type(config.hyperparameters)).items():
-        value = getattr(config.hyperparameters, name)
-        # NumPy's bool has a shape and is not a `Number`.
-        scalar = isinstance(value, numbers.Number | np.bool_)
-        is_array = hasattr(value, "shape") and not scalar
-        if not is_array:
-            _validate_number(name, value, allowed)
+    validate_hyperparameters(config, config.hyperparameters)
+
+
+def validate_hyperparameters(config: Config, hyperparameters: Hyperparameters) -> None:
+    """Check that the numbers of one run are allowed, as far as they are known.
+
+    Args:
+      config: the config of the run, whose counts are upper limits.
+      hyperparameters: scalars. Those that are traced have no value yet; only their
+        shapes are checked.
+
+    Raises:
+      ValueError: if a value is not allowed; the message names the value and the range.
+    """
+    if not isinstance(hyperparameters, Hyperparameters):
+        raise _refusal("hyperparameters", hyperparameters, "Hyperparameters")
+    for name, allowed in ranges(type(hyperparameters)).items():
+        value = getattr(hyperparameters, name)
+        if shape := getattr(value, "shape", ()):
+            raise ValueError(
+                f"{name} has shape {shape}: it must be one number; jax.vmap trains many"
+            )
+        if isinstance(value, jax.core.Tracer):
+            continue
+        value = _unboxed(value, allowed)
+        _validate_number(name, value, allowed)
+        most = getattr(config.hyperparameters, name, value)
+        if allowed.whole and not isinstance(most, jax.core.Tracer) and value > most:
+            raise ValueError(
+                f"{name} is {value}: it must be at most the config's, {int(most)}"
+            )
+
+
+def _unboxed(value: Any, allowed: Range) -> Any:
+    """Return the number of an array without dimensions, and other values as they are.
+
+    Members of a sweep have all their numbers as float32, counts too.
+    """
+    if not isinstance(value, np.generic | np.ndarray | jax.Array):
+        return value
+    number = value.item()
+    whole = allowed.whole and isinstance(number, float) and number.is_integer()
+    return int(number) if whole else number
 
 
 def _refusal(name: str, value: Any, allowed: object) -> ValueError:
@@ -461,8 +492,6 @@ def _validate_function(
     name: str, function: Callable[[Any], Any], total_steps: int
 ) -> None:
     """Check the factors that a schedule gives at the start and the end of training."""
-    import jax
-
     for step in (0, total_steps):
         try:
             factor = function(jax.numpy.float32(step))

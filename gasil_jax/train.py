@@ -24,7 +24,12 @@ from gasil_jax import (
     rollout,
     schedules,
 )
-from gasil_jax.config import Config, Hyperparameters, validate
+from gasil_jax.config import (
+    Config,
+    Hyperparameters,
+    validate,
+    validate_hyperparameters,
+)
 from gasil_jax.errors import unknown
 from gasil_jax.imitation import find_agent
 from gasil_jax.imitation.adaptive import RULES
@@ -86,9 +91,13 @@ def init(
       config: decides the agent and all shapes; only `make_train` checks it.
       key: random key; consumed.
       hyperparameters: scalars, which may be traced; default the config's.
+
+    Raises:
+      ValueError: if a hyperparameter that is not traced is not allowed.
     """
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
+    validate_hyperparameters(config, hyperparameters)
     # Of the agent's class, with its own numbers.
     hyperparameters = config.replace(hyperparameters=hyperparameters).hyperparameters
     hyperparameters = jax.tree.map(

@@ -31,6 +31,9 @@ from gasil_jax.host import json_reader
 
 _STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
 _DAMAGED = ".damaged"
+#: The errors of reading what is not whole. Others, such as those of a network's file
+#: system, say nothing about the checkpoint.
+_NOT_WHOLE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError)
 
 
 def _is_key(leaf: Any) -> bool:
@@ -124,10 +127,10 @@ def write(
     """
     whole = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
-    with contextlib.suppress(ValueError):
-        read(whole)
-        return
     try:
+        with contextlib.suppress(ValueError):
+            read(whole)
+            return
         root.mkdir(parents=True, exist_ok=True)
         # Remove what a killed process has left.
         shutil.rmtree(partial, ignore_errors=True)
@@ -194,11 +197,12 @@ def read(folder: pathlib.Path) -> Checkpoint:
 
     Raises:
       ValueError: if it is damaged.
+      OSError: if it can't be read now.
     """
     try:
         manifest = json_reader.read(folder / _MANIFEST, _Manifest)
         hashes = _hashes(folder)
-    except (OSError, ValueError) as error:
+    except _NOT_WHOLE as error:
         raise ValueError(f"{folder} is damaged: {error}") from None
     files, record = manifest["files"], manifest["record"]
     if hashes != files:
@@ -238,7 +242,7 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
     """Return the scores of the checkpoints that have one."""
     scores = {}
     for folder in folders:
-        with contextlib.suppress(OSError, ValueError):
+        with contextlib.suppress(*_NOT_WHOLE):
             record = json_reader.read(folder / _MANIFEST, _Manifest)["record"]
             if record.get("score") is not None:
                 scores[folder] = record["score"]
@@ -267,12 +271,19 @@ def delete_partial(root: pathlib.Path) -> None:
 
 
 def prune(root: pathlib.Path, keep: int) -> None:
-    """Delete all but the newest `keep` and the best one."""
-    folders = _folders(root)
-    scores = _scores(folders)
-    kept = set(folders[-keep:])
-    if scores:
-        kept.add(max(scores, key=scores.__getitem__))
-    for folder in folders:
-        if folder not in kept:
-            shutil.rmtree(folder)
+    """Delete all but the newest `keep` and the best one, as far as that is possible.
+
+    What can't be deleted is left to the next call or to `delete_partial`.
+    """
+    with contextlib.suppress(OSError):
+        folders = _folders(root)
+        scores = _scores(folders)
+        kept = set(folders[-keep:])
+        if scores:
+            kept.add(max(scores, key=scores.__getitem__))
+        for folder in folders:
+            if folder not in kept:
+                # A checkpoint that is half deleted must not look like a damaged one.
+                partial = folder.with_name(f"{folder.name}{_PARTIAL}")
+                folder.rename(partial)
+                shutil.rmtree(partial, ignore_errors=True)

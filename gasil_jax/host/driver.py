@@ -15,7 +15,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.errors import InputError
@@ -32,6 +31,8 @@ from gasil_jax.train import TrainState
 # takes effect at this rate.
 _SECONDS_OF_A_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
+#: Files that are written when training has ended.
+_RESULTS = ("summary.json", "training.json", "policy.npz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +61,8 @@ class FitProgress:
       metrics: the metrics of the chunk, (seeds, iterations) each.
       evaluation: columns of evaluations.csv, (seeds,) each; None if the policies were
         not evaluated after this chunk.
-      copy_states: returns `states`.
+      copy_states: returns a copy of the training states, (seeds, ...), while training
+        waits for the callback.
     """
 
     iteration: int
@@ -71,7 +73,13 @@ class FitProgress:
 
     @functools.cached_property
     def states(self) -> TrainState:
-        """A copy of the training states, (seeds, ...); only while training waits."""
+        """A copy of the training states, (seeds, ...).
+
+        It must be asked for in the callback, and may be kept.
+
+        Raises:
+          RuntimeError: if it is asked for only when training has gone on.
+        """
         return self.copy_states()
 
 
@@ -208,8 +216,10 @@ def _restored(
     a warning, and those that are half written are deleted.
 
     Raises:
-      InputError: if the checkpoint is of another state or has not seen a table.
+      InputError: if the checkpoint is of another state or has not seen a table, or if
+        there is none although the folder holds the results of training that has ended.
     """
+    folder = root.parent
     with progress.aside("reading the checkpoints"):
         newest, damages = checkpoint.latest(root)
     for name in [f"{table}_size" for table in tables]:
@@ -218,23 +228,29 @@ def _restored(
                 f"{newest.folder} has no {name}: it was written with other options, "
                 "for example without evaluate_every"
             )
+    ended = any((folder / name).exists() for name in _RESULTS)
+    if newest is None and ended:
+        raise InputError(
+            f"{folder} holds the results of training that has ended, and no undamaged "
+            "checkpoint to continue from: name another folder"
+        )
     for damage in damages:
         instead = "starting anew" if newest is None else f"using {newest.folder.name}"
         print(f"warning: {damage}; {instead}", file=sys.stderr)
     checkpoint.delete_partial(root)
     checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
     if newest is None:
-        if not damages and (root.parent / "metrics.csv").exists():
+        if not damages and (folder / "metrics.csv").exists():
             print(
-                f"warning: {root.parent} has no checkpoint: starting anew, the old "
+                f"warning: {folder} has no checkpoint: starting anew, the old "
                 "tables are kept under other names",
                 file=sys.stderr,
             )
         return None, 0, None
     with progress.aside(f"restoring {newest.folder.name}"):
-        like = jax.eval_shape(lambda: members.trim(members.init()))
         with command_line.input_checked():
-            return newest.restore(like), newest.iteration, newest.record
+            states = newest.restore(members.shapes())
+    return states, newest.iteration, newest.record
 
 
 def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
@@ -279,8 +295,8 @@ def drive(
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint is of another state or has not seen a table, or if a
-        table is damaged.
+      InputError: if the checkpoint is of another state or has not seen a table, if a
+        table is damaged, or if the folder holds results but no undamaged checkpoint.
       OSError: if the folder can't be written, or if the disk is full.
     """
     config, last = members.config, members.config.num_iterations
@@ -318,6 +334,14 @@ def drive(
         with progress.aside("saving a checkpoint"):
             checkpoints.save(done, states, tables.sizes() | {"score": score})
 
+    def copy_states(iteration: int) -> TrainState:
+        if iteration != done:
+            raise RuntimeError(
+                f"the states of iteration {iteration} are gone: read "
+                "FitProgress.states in the callback"
+            )
+        return jax.tree.map(lambda x: x.copy(), members.trim(states))
+
     stopped = False
     while done < last and not stopped and interruption.signal is None:
         count = min(
@@ -344,8 +368,10 @@ def drive(
             save()
             returns = []
         if callback is not None:
-            copy = lambda: jax.tree.map(jnp.copy, members.trim(states))  # noqa: B023
-            steps = done * config.batch_steps
+            steps, copy = (
+                done * config.batch_steps,
+                functools.partial(copy_states, done),
+            )
             stopped = bool(callback(FitProgress(done, steps, metrics, scores, copy)))
     train_seconds = time.monotonic() - started
     save()

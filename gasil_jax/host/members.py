@@ -16,7 +16,7 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from gasil_jax import train
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
 
 
 def member(states: Any, index: int) -> Any:
@@ -198,8 +198,25 @@ class Members:
         return jax.device_put(jax.tree.map(padded_rows, states), self.sharding)
 
     def trim(self, states: Any) -> Any:
-        """Return the members' arrays without the padding: (members, ...)."""
-        return jax.tree.map(lambda x: x[: self.num_members], states)
+        """Return the members' arrays without the padding, (members, ...).
+
+        If there is padding, they are NumPy arrays and random keys.
+        """
+        if not self._padding:
+            return states
+
+        # JAX would copy all rows to all devices, whose memory may hold only a share.
+        def rows(leaf: Any) -> Any:
+            if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+                return jax.random.wrap_key_data(rows(jax.random.key_data(leaf)))
+            return np.asarray(leaf)[: self.num_members]
+
+        return jax.tree.map(rows, states)
+
+    def shapes(self) -> Any:
+        """Return the shapes and dtypes of the members' states, (members, ...) each."""
+        resized = lambda x: x.update(shape=(self.num_members, *x.shape[1:]))
+        return jax.tree.map(resized, jax.eval_shape(self.init))
 
 
 def make_members(
@@ -221,10 +238,12 @@ def make_members(
         used.
 
     Raises:
-      ValueError: if the config is not valid.
+      ValueError: if the config or a hyperparameter is not allowed.
     """
     train.check(env, config)
     if hyperparameters is None:
         hyperparameters = [config.hyperparameters] * len(seeds)
+    for one in hyperparameters:
+        validate_hyperparameters(config, one)
     devices = list(devices or jax.devices())[: len(seeds)]
     return Members(env, config, seeds, hyperparameters, devices)

@@ -94,6 +94,39 @@ def test_a_bad_configuration_is_refused(change, message):
         gasil_jax.make_train(env, SMALL.replace(**change))
 
 
+@pytest.mark.parametrize(
+    ("hyperparameters", "message"),
+    [
+        ({"learning_rate": 1e-3}, "hyperparameters is {.*: it must be Hyperparameters"),
+        (gasil_jax.Hyperparameters(gamma=1.5), "gamma is 1.5"),
+        (gasil_jax.Hyperparameters(learning_rate=-jnp.ones(())), "rate is -1.0"),
+        (
+            gasil_jax.Hyperparameters(alpha=np.ones(3)),
+            r"alpha has shape \(3,\): .*vmap",
+        ),
+        (gasil_jax.Hyperparameters(), "discriminator_updates is 5: .* the config's, 2"),
+        (gasil_jax.Hyperparameters(discriminator_updates=jnp.float32(1.5)), "is 1.5"),
+    ],
+)
+def test_hyperparameters_that_are_not_allowed_are_refused(hyperparameters, message):
+    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), SMALL)
+    with pytest.raises(ValueError, match=message):
+        jax.eval_shape(lambda key: train(key, hyperparameters), jax.random.key(0))
+
+
+def test_the_shape_of_a_traced_hyperparameter_is_checked():
+    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), SMALL)
+    # jit traces all its arguments; under vmap each run has one number.
+    many = gasil_jax.Hyperparameters(alpha=jnp.ones(3))
+    with pytest.raises(ValueError, match="alpha has shape"):
+        jax.eval_shape(train, jax.random.key(0), many)
+    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, many)
+    trained = jax.vmap(train, in_axes=(None, axes))
+    assert (
+        jax.eval_shape(trained, jax.random.key(0), many)[1]["env_steps"].shape[0] == 3
+    )
+
+
 def test_a_name_is_not_an_environment():
     with pytest.raises(ValueError, match=r"env is 'hopper': .*make_env"):
         gasil_jax.make_train("hopper", SMALL)

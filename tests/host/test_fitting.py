@@ -1,7 +1,9 @@
 """`gasil_jax.fit` trains as the command line does."""
 
+import dataclasses
 import json
 import os
+import shutil
 import signal
 
 import jax
@@ -76,9 +78,10 @@ def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
 
 def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     """What stops it is a state, which is still there when training has gone on."""
-    states, out = [], tmp_path / "out"
+    states, late, out = [], [], tmp_path / "out"
 
     def callback(progress):
+        late.append(dataclasses.replace(progress))
         states.append(progress.states)
         return progress.iteration >= 50
 
@@ -87,6 +90,8 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     assert first.metrics["policy_loss"].shape == (2, 50)
     assert first.evaluations["mean"].shape == (2, 1)
     assert [int(x.iteration[1]) for x in states][-2:] == [48, 50]
+    with pytest.raises(RuntimeError, match=r"iteration \d+ are gone: read"):
+        late[0].states  # noqa: B018
     for last, result in zip(*map(jax.tree.leaves, (states[-1], first.states))):
         if not jax.dtypes.issubdtype(last.dtype, jax.dtypes.prng_key):
             np.testing.assert_array_equal(last, result)
@@ -110,6 +115,13 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     for name in policies[1]:
         np.testing.assert_array_equal(*(arrays[name] for arrays in policies))
     assert gasil_jax.load_policy(out)(np.zeros(env.observation_size)).shape == (2,)
+    # Without its checkpoints it would begin anew, and replace the policy.
+    shutil.rmtree(out / "checkpoints")
+    with pytest.raises(ValueError, match="holds the results of training that has end"):
+        gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED)
+    np.testing.assert_array_equal(
+        np.load(out / "policy.npz")["mean"], policies[1]["mean"]
+    )
 
 
 def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):

@@ -4,6 +4,7 @@ import functools
 
 import jax
 import numpy as np
+import pytest
 
 import gasil_jax
 from gasil_jax.host.members import make_members
@@ -39,6 +40,22 @@ def compiled(agent):
     members = make_members(env, config, [3, 4, 5], devices=jax.devices()[:2])
     states, advance = members.compile()
     return members, members.trim(states), advance
+
+
+@pytest.mark.xdist_group("members ppo")
+def test_the_members_of_padded_states_are_taken_on_the_host():
+    """Sliced by JAX, each device would get the states of all members."""
+    members, states, _ = compiled("ppo")
+    arrays = [
+        jax.random.key_data(x)
+        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
+        else x
+        for x in jax.tree.leaves(states)
+    ]
+    assert {len(x) for x in arrays} == {3}
+    assert sum(isinstance(x, np.ndarray) for x in arrays) == len(arrays) - 2
+    like = jax.tree.map(lambda x: (x.shape, x.dtype), members.shapes())
+    assert jax.tree.map(lambda x: (x.shape, x.dtype), states) == like
 
 
 def test_a_seed_does_not_depend_on_the_number_of_devices():

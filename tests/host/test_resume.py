@@ -1,5 +1,6 @@
 """A run that is stopped early loses nothing, and continues bit for bit."""
 
+import errno
 import itertools
 import json
 import os
@@ -11,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+from unittest import mock
 
 import jax
 import numpy as np
@@ -287,8 +289,19 @@ def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
     error = capsys.readouterr().err.splitlines()[-1]
     assert "has ended and its checkpoints are gone" in error
     assert all(path.read_bytes() == content for path, content in before.items())
+    # Nor if there are some, but all are damaged.
+    shutil.copytree(whole / "checkpoints", out / "checkpoints")
+    for name in checkpoints(out):
+        delete_the_manifest(out / "checkpoints" / name)
+    damaged = checkpoints(out)
+    assert run.main(["--resume", "--out", str(out)]) == 2
+    assert "no undamaged checkpoint" in capsys.readouterr().err.splitlines()[-1]
+    assert all(path.read_bytes() == content for path, content in before.items())
+    assert checkpoints(out) == damaged
     # Where it has not ended, its table is kept under another name.
+    shutil.rmtree(out / "checkpoints")
     (out / "summary.json").unlink()
+    (out / "policy.npz").unlink()
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert "has no checkpoint: starting anew" in capsys.readouterr().err
     assert (out / "metrics.csv").read_bytes() == before[out / "metrics.csv"]
@@ -374,12 +387,15 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_used(damage, tmp
 def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     whole, tmp_path, capsys
 ):
-    out = copy(whole, tmp_path)
-    # The best and the last.
+    out = tmp_path / "out"
+    twice = ("--checkpoint-every", str(ITERATIONS // 2 * 128))
+    assert run.main([*SMALL, *twice, "--out", str(out)]) == 0
     *_, last = checkpoints(out)
+    assert len(checkpoints(out)) == 2
     flip_a_bit(out / "checkpoints" / last)
     assert run.main(["--resume", "--out", str(out)]) == 0
-    assert f"{last} is damaged" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert f"{last} is damaged" in told and "using 00000200" in told
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
     assert (out / "checkpoints" / f"{last}.damaged").is_dir()
@@ -395,6 +411,36 @@ def test_a_damaged_checkpoint_does_not_count_as_the_newest(tmp_path):
     checkpoint.write(root, 2, {"x": np.zeros(1000)}, {"score": None})
     checkpoint.prune(root, 1)
     assert checkpoint.latest(root) == (checkpoint.read(root / "00000002"), [])
+
+
+def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_damaged(
+    tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    checkpoint.write(out / "checkpoints", 1, {"x": np.zeros(3)}, {"score": None})
+
+    def fail(folder):
+        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "_hashes", fail)
+        with pytest.raises(OSError, match="Stale"):
+            checkpoint.latest(out / "checkpoints")
+        with pytest.raises(checkpoint.WriteError, match="Stale"):
+            checkpoint.write(out / "checkpoints", 1, {"x": np.ones(3)}, {})
+    assert checkpoint.latest(out / "checkpoints")[0].iteration == 1
+
+
+def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
+    for i in range(3):
+        checkpoint.write(tmp_path, i, {"x": np.zeros(3)}, {"score": None})
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "unlink", mock.Mock(side_effect=PermissionError))
+        checkpoint.prune(tmp_path, 1)
+    assert checkpoint.latest(tmp_path)[0].iteration == 2
+    checkpoint.prune(tmp_path, 1)
+    checkpoint.delete_partial(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["00000002"]
 
 
 def test_the_best_and_the_newest_are_kept(tmp_path):
