@@ -73,10 +73,10 @@ def run_episodes(
     def step(carry: Any, key: jax.Array) -> Any:
         states, running, return_, length = carry
         action = act(states.obs, None if deterministic else key)
+        sound = wrappers.is_sound(states.obs).all(axis=-1)
         states = jax.vmap(env.step)(states, action)
         reward = states.info.get("true_reward", states.reward)
-        sound = wrappers.is_sound(states.obs).all(axis=-1)
-        sound &= wrappers.is_sound(reward)
+        sound &= wrappers.is_sound(states.obs).all(axis=-1) & wrappers.is_sound(reward)
         # As in training, a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running

@@ -72,6 +72,8 @@ def about(name: str) -> dict[str, Any]:
     Raises:
       ValueError: if there is no such policy.
     """
+    if not name.startswith(ZOO_PREFIX):
+        raise ValueError(f"name is {name!r}: it must be one of the zoo, zoo:NAME")
     return json.loads(str(npz.read(_file(name))["about"]))
 
 

@@ -67,7 +67,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
             "hyperparameters.png, and its curves are in curves.npz"
         )
     read_table = lambda name, column: metrics_files.read_metrics(
-        folder / name, ("seed",), described["seeds"], (column,)
+        folder / name, ("seed",), described["seeds"], (column,), unfinished=True
     )
     evaluations, path = None, folder / "evaluations.csv"
     # The file may still be empty.

@@ -57,7 +57,15 @@ def load_policy(
 
 
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """Return the policy of a single `TrainState`, as `load_policy` does for a file."""
+    """Return the policy of a single `TrainState`, as `load_policy` does for a file.
+
+    Raises:
+      ValueError: if it is a batch of states.
+    """
+    if shape := jnp.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
     return make(weights(state, env))
 
 

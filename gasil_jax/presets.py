@@ -138,6 +138,12 @@ def names() -> tuple[str, ...]:
     return tuple(PRESETS)
 
 
+def check(name: str) -> None:
+    """Raise `ValueError` unless there is a preset of this name."""
+    if name not in PRESETS:
+        raise ValueError(unknown("preset", name, names()))
+
+
 def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> Config:
     """Return the config that runs of `agent` in `env` start from.
 
@@ -151,8 +157,7 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
     Raises:
       ValueError: if the agent or the preset is unknown.
     """
-    if name not in PRESETS:
-        raise ValueError(unknown("preset", name, names()))
+    check(name)
     find_agent(agent)
     chosen = PRESETS[name]
     row = _row(chosen, env, agent, reward_delay)

@@ -151,8 +151,9 @@ def collect(
 
     If the physics diverges, the episode terminates with reward 0 and the step is marked
     in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in the
-    observation or for a reward, given or held back. An episode that is truncated here
-    is given the reward that the environment still holds back, ``info["held_reward"]``.
+    observation before or after the step or for a reward, given or held back. An episode
+    that is truncated here is given the reward that the environment still holds back,
+    ``info["held_reward"]``.
 
     A first episode that began at an age above 0 is truncated at the same limit and
     marked in ``cut_short``. PPO learns from its steps, but its return is not reported.
@@ -168,7 +169,9 @@ def collect(
 
     def step(carry: EnvironmentStates, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
-        observation = carry.state.obs
+        # The physics of a reset may have diverged, too.
+        sound = wrappers.is_sound(carry.state.obs).all(axis=-1)
+        observation = jnp.where(sound[:, None], carry.state.obs, 0.0)
         with jax.named_scope("policy"):
             mean, log_std = policy(observation)
         noise = jax.random.normal(action_key, mean.shape, mean.dtype)
@@ -178,7 +181,7 @@ def collect(
 
         true_reward = stepped.info.get("true_reward", stepped.reward)
         held = stepped.info.get("held_reward", jnp.zeros_like(stepped.reward))
-        sound = wrappers.is_sound(stepped.obs).all(axis=-1)
+        sound &= wrappers.is_sound(stepped.obs).all(axis=-1)
         for number in (stepped.reward, true_reward, held):
             sound &= wrappers.is_sound(number)
         length = carry.episode_length + 1

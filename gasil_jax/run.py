@@ -13,6 +13,7 @@ from gasil_jax.host import (
     driver,
     json_reader,
     metrics_files,
+    output_file,
     policy_file,
 )
 from gasil_jax.host.members import Members
@@ -75,13 +76,9 @@ def _write_results(
     evaluations = None
     if options.evaluate_every is not None:
         evaluations = read("evaluations.csv", ("mean",))
-    plotting.learning_curve(
-        folder / "learning_curve.png",
-        steps,
-        returns,
-        f"{options.env}, {config.agent}",
-        evaluations=evaluations,
-    )
+    title = f"{options.env}, {config.agent}"
+    with output_file.whole(folder / "learning_curve.png") as partial:
+        plotting.learning_curve(partial, steps, returns, title, evaluations=evaluations)
     final = metrics_files.final_returns(returns)
     policy_file.save(folder / "policy.npz", outcome.states, env, seeds, final)
     faulty = np.nansum(metrics["faulty_steps"], axis=1)

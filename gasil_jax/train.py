@@ -539,7 +539,7 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
     """Return all metrics of an iteration as float32 scalars, by name.
 
     Raises:
-      ValueError: an agent's metric has a name that another one has.
+      ValueError: an agent's metric has a name that another one has, or a shape.
     """
     for own in more:
         if taken := metrics.keys() & own.keys():
@@ -548,15 +548,23 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
                 f"{', '.join(sorted(taken))}"
             )
         metrics = {**metrics, **own}
+    for name, value in metrics.items():
+        if shape := jnp.shape(value):
+            raise ValueError(
+                f"metric {name!r} of agent {agent!r} has shape {shape}: it must be one "
+                "number"
+            )
     return {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
 
 
 def check(env: Any, config: Config) -> None:
     """Raise `ValueError` for what can't run, before anything compiles."""
-    if not hasattr(env, "reset"):
-        raise ValueError(
-            f"env is {env!r}: it must be an environment, as gasil_jax.make_env gives"
-        )
+    for name in ("reset", "step", "observation_size", "action_size"):
+        if not hasattr(env, name):
+            raise ValueError(
+                f"env is {env!r}, which has no {name}: it must be an environment with "
+                "Brax's interface, as gasil_jax.make_env gives"
+            )
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")

@@ -10,6 +10,7 @@ episode is also given the rest of its reward where ``max_episode_steps`` cuts it
 """
 
 import inspect
+import os
 from typing import Any
 
 import gymnasium
@@ -23,6 +24,7 @@ from gymnasium.wrappers import TimeLimit
 from gasil_envs import pictures, registry, wrappers
 
 _NAMESPACE = "gasil_envs"
+_PROCESS = os.getpid()
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -34,6 +36,31 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
         gymnasium.spaces.Box(-np.inf, np.inf, (env.observation_size,), np.float32),
         gymnasium.spaces.Box(wide(low), wide(high), shape, np.float32),
     )
+
+
+def _refuse_forked_process(name: str) -> None:
+    """Raise `RuntimeError` in a process that was forked, where JAX would hang."""
+    if os.getpid() != _PROCESS:
+        raise RuntimeError(
+            f"env {name!r} is in a forked process, where JAX does not work: take "
+            'vectorization_mode="vector_entry_point", or vector_kwargs={"context": '
+            '"spawn"} for processes'
+        )
+
+
+def _checked(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
+    """Return an action, or a batch of them, for a step from a state.
+
+    Raises:
+      ResetNeeded: if there is no state yet.
+      ValueError: if the action has another shape than the space.
+    """
+    if state is None:
+        raise gymnasium.error.ResetNeeded("step needs a reset before it")
+    given = jnp.asarray(action, jnp.float32)
+    if given.shape != space.shape:
+        raise ValueError(f"action has shape {given.shape}: it must have {space.shape}")
+    return given
 
 
 def _key(generator: np.random.Generator) -> jax.Array:
@@ -65,6 +92,7 @@ class GymnasiumEnv(gymnasium.Env):
         height: int = 360,
         **settings: Any,
     ):
+        _refuse_forked_process(name)
         self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.observation_space, self.action_space = _spaces(env)
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -85,10 +113,20 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode and return its first observation, (obs,) float32."""
+        """Start an episode and return its first observation, (obs,) float32.
+
+        Raises:
+          ValueError: if a `TimeLimit` allows more steps than the environment.
+        """
         super().reset(seed=seed)
-        self._state = self._reset(_key(self.np_random))
         self._limits = self._time_limits()
+        for limit in self._limits:
+            if limit._max_episode_steps > self._env.episode_length:
+                raise ValueError(
+                    f"max_episode_steps is {limit._max_episode_steps}: the "
+                    f"environment's own limit is {self._env.episode_length}"
+                )
+        self._state = self._reset(_key(self.np_random))
         self._episode = []
         self._remember()
         return np.array(self._state.obs), {}
@@ -99,8 +137,13 @@ class GymnasiumEnv(gymnasium.Env):
         """Return observation, reward, terminated, truncated and info.
 
         ``info["true_reward"]`` is the reward without delay.
+
+        Raises:
+          ResetNeeded: if there was no reset before.
+          ValueError: if the action has another shape than ``action_space``.
         """
-        self._state = state = self._step(self._state, jnp.asarray(action, jnp.float32))
+        given = _checked(action, self._state, self.action_space)
+        self._state = state = self._step(self._state, given)
         self._remember()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
@@ -210,8 +253,12 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Return observation (num_envs, obs), reward, terminated, truncated and info.
 
         Reward, terminated, truncated and the true reward in info are (num_envs,) each.
+
+        Raises:
+          ResetNeeded: if there was no reset before.
+          ValueError: if the actions have another shape than ``action_space``.
         """
-        given = jnp.asarray(actions, jnp.float32)
+        given = _checked(actions, self._state, self.action_space)
         self._state = state = self._step(self._state, given, _key(self.np_random))
         truncated = np.array(wrappers.truncated(state))
         terminated = np.array(state.done > 0) & ~truncated

@@ -23,18 +23,25 @@ def find(kind: str, name: str) -> Any:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         why = str(error)
-    except Exception as error:
+    # A script without `if __name__ == "__main__"` may exit.
+    except (Exception, SystemExit) as error:
         why = in_a_line(error)
     raise ValueError(f"{kind} {name!r} can't be imported: {why}")
 
 
-def in_a_line(error: Exception) -> str:
-    """Return the message of an error in the user's code, and where it was raised."""
+def in_a_line(error: BaseException, but: pathlib.Path | None = None) -> str:
+    """Return the message of an error in the user's code, and where it was raised.
+
+    Args:
+      error: the error.
+      but: a folder whose code is not the user's, besides JAX and this package.
+    """
     message = f"{type(error).__name__}: {error}".partition("\n")[0]
     if isinstance(error, SyntaxError):
         return message  # It names file and line already.
     frames = reversed(traceback.extract_tb(error.__traceback__))
-    user_frames = (x for x in frames if not x.filename.startswith(_NOT_THE_USERS))
+    others = _NOT_THE_USERS if but is None else (*_NOT_THE_USERS, str(but))
+    user_frames = (x for x in frames if not x.filename.startswith(others))
     frame = next(user_frames, None)
     if frame is None:
         return message

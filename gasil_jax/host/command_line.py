@@ -5,6 +5,7 @@ import dataclasses
 import errno
 import io
 import re
+import signal
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar, get_origin, get_type_hints
@@ -201,7 +202,7 @@ def exit_status(work: Callable[[], int | None]) -> int:
       The status that the work returns, or 0 if it returns none; 1 if a folder or file
       can't be read or written, or if a program that it started failed; 2 for bad input,
       which includes a file name that is too long; 128 plus the signal's number if it
-      was interrupted after saving.
+      was interrupted.
     """
     try:
         return work() or 0
@@ -212,3 +213,7 @@ def exit_status(work: Callable[[], int | None]) -> int:
     except Interrupted as interrupted:
         print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
         return 128 + interrupted.signal
+    # Before training, and in commands without training.
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return 128 + signal.SIGINT

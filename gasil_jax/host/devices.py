@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jaxlib
 
-from gasil_jax.host import environments
+from gasil_jax.host import command_line, environments
 from gasil_jax.host.environments import Settings
 
 
@@ -24,9 +24,15 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
     """
     count = min(requested or environments.available_cores(), num_members)
     environments.prepare(settings, count)
-    # If the program has used JAX before, the devices stay as they are.
-    with contextlib.suppress(RuntimeError):
+    try:
         jax.config.update("jax_num_cpu_devices", count)
+    except RuntimeError:
+        # The program has used JAX before, so the devices stay as they are.
+        if requested is not None and (others := jax.device_count()) != count:
+            command_line.note(
+                f"devices is {requested}, which has no effect: JAX has been started "
+                f"before, with {others}"
+            )
     _keep_compiled_programs()
     # This applies everywhere, not only to functions with `full_precision`.
     jax.config.update("jax_default_matmul_precision", "highest")

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.errors import InputError
@@ -340,7 +341,7 @@ def drive(
                 f"the states of iteration {iteration} are gone: read "
                 "FitProgress.states in the callback"
             )
-        return jax.tree.map(lambda x: x.copy(), members.trim(states))
+        return jax.tree.map(jnp.copy, members.trim(states))
 
     stopped = False
     while done < last and not stopped and interruption.signal is None:

@@ -7,6 +7,8 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.config import Config, Range
@@ -115,6 +117,7 @@ def fit(
                 "evaluate_every": evaluate_every,
                 "evaluate_episodes": evaluate_episodes if evaluate_every else None,
                 **run_folder.flat(vars(config)),
+                **run_folder.expert_hash(config),
             }
             where = pathlib.Path(folder)
             stack.enter_context(_opened(where, described, resume))
@@ -135,7 +138,7 @@ def fit(
             path = where / "policy.npz"
             policy_file.save(path, outcome.states, env, members.seeds, final)
         return FitResult(
-            outcome.states,
+            jax.tree.map(jnp.asarray, outcome.states),
             metrics,
             _table(where / "evaluations.csv", members.num_members),
         )

@@ -176,6 +176,8 @@ def read_metrics(
     labels: Sequence[str],
     num_members: int,
     required: Sequence[str] = (),
+    *,
+    unfinished: bool = False,
 ) -> dict[str, np.ndarray]:
     """Return every metric of a `MetricsWriter`'s file, (members, iterations) each.
 
@@ -184,6 +186,8 @@ def read_metrics(
       labels: names of the first columns, which are not metrics.
       num_members: number of rows per iteration.
       required: columns that it must have besides "env_steps".
+      unfinished: leave out an iteration at the end that is not whole, because training
+        may be writing it.
 
     Raises:
       InputError: if the file is damaged, has no rows or lacks a column.
@@ -195,12 +199,15 @@ def read_metrics(
             header: list[str] = []
             cells = array.array("d")
             # A table may be large: only its numbers are kept.
-            for number, row in enumerate(csv.reader(file)):
+            lines = (x for x in file if not unfinished or x.endswith("\n"))
+            for number, row in enumerate(csv.reader(lines)):
                 header = header or row
                 if len(row) != len(header):
                     raise ValueError(f"row {number} has {len(row)} cells")
                 if number:
                     cells.extend(float(x) if x else math.nan for x in row[first:])
+        if unfinished and len(header) > first:
+            del cells[len(cells) - len(cells) % (num_members * (len(header) - first)) :]
         if not cells:
             raise ValueError("it has no rows")
         values = np.array(cells).reshape(-1, num_members, len(header) - first)

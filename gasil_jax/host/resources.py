@@ -19,7 +19,9 @@ _BATCHES = 8
 # By the same report an evaluated episode needs 7 (point mass) or 25 (hopper) times the
 # memory of its environment's state.
 _STATES = 7
-_CONTROL_GROUP = pathlib.Path("/sys/fs/cgroup")
+# Where the control groups are, and which of them this process is in.
+_CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
+_OWN_CONTROL_GROUPS = pathlib.Path("/proc/self/cgroup")
 
 
 class Need(NamedTuple):
@@ -65,30 +67,66 @@ def available(devices: Sequence[jax.Device]) -> int | None:
             return None
         free = [x["bytes_limit"] - x.get("bytes_in_use", 0) for x in every]
         return len(devices) * min(free)
-    free = []
-    for read in (_free_on_the_machine, _free_in_the_container):
-        # A file is missing, or there is no limit.
-        with contextlib.suppress(OSError, ValueError, LookupError):
-            free.append(read())
+    free = _free_in_control_groups()
+    # On another system the file is missing.
+    with contextlib.suppress(OSError):
+        text = pathlib.Path("/proc/meminfo").read_text()
+        free.append(1024 * int(text.split("MemAvailable:")[1].split()[0]))
     return min(free, default=None)
 
 
-def _free_on_the_machine() -> int:
-    text = pathlib.Path("/proc/meminfo").read_text()
-    return 1024 * int(text.split("MemAvailable:")[1].split()[0])
+class _Files(NamedTuple):
+    """The names of a control group's files: of its limit, its use and its cache."""
+
+    limit: str
+    used: str
+    cached: str
 
 
-def _free_in_the_container(group: pathlib.Path = _CONTROL_GROUP) -> int:
-    """Return what is left of a control group's limit, in bytes.
+_VERSION_1 = _Files(
+    "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
+)
+_VERSION_2 = _Files("memory.max", "memory.current", "inactive_file")
 
-    Files that the kernel only caches count as free.
+
+def _free_in_control_groups(
+    root: pathlib.Path = _CONTROL_GROUPS, own: pathlib.Path = _OWN_CONTROL_GROUPS
+) -> list[int]:
+    """Return what is left of the limits of this process' control groups, in bytes.
+
+    A group's limit also holds for the groups in it. Files that the kernel only caches
+    count as free.
+
+    Args:
+      root: the folder of all groups.
+      own: the file that lists the groups of this process.
     """
-    limit, used = (
-        int((group / name).read_text()) for name in ("memory.max", "memory.current")
-    )
+    free = []
+    try:
+        lines = own.read_text().splitlines()
+    except OSError:  # another system
+        return []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        names, top = _VERSION_2, root
+        if controllers:
+            names, top = _VERSION_1, root / "memory"
+            if "memory" not in controllers.split(","):
+                continue
+        group = top / path.lstrip("/")
+        for folder in (group, *group.parents):
+            # There is no such file, or no limit.
+            with contextlib.suppress(OSError, ValueError, LookupError):
+                free.append(_free_in(folder, names))
+            if folder == top:
+                break
+    return free
+
+
+def _free_in(group: pathlib.Path, names: _Files) -> int:
+    limit, used = (int((group / x).read_text()) for x in (names.limit, names.used))
     lines = (group / "memory.stat").read_text().splitlines()
-    cached = dict(map(str.split, lines))["inactive_file"]
-    return limit - used + int(cached)
+    return limit - used + int(dict(map(str.split, lines))[names.cached])
 
 
 def _padded(count: int, devices: Sequence[jax.Device]) -> int:

@@ -2,7 +2,9 @@
 
 import contextlib
 import dataclasses
+import errno
 import fcntl
+import hashlib
 import os
 import pathlib
 import socket
@@ -13,13 +15,16 @@ from typing import Any, Required, TypedDict
 
 from gasil_jax.config import Config, validate
 from gasil_jax.errors import InputError
-from gasil_jax.host import json_reader, metrics_files
+from gasil_jax.host import command_line, json_reader, metrics_files
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
+from gasil_jax.imitation import expert
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
 _CONFIG = "config.json"
+#: The errors of file systems without locks.
+_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 
 def check(out: pathlib.Path, resume: bool) -> None:
@@ -70,9 +75,8 @@ def create(out: pathlib.Path, *, option: str = "out") -> pathlib.Path:
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / f"{_PROBE}{os.getpid()}"
-        probe.touch()
-        probe.unlink()
+        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=out):
+            pass
     except OSError as error:
         raise InputError(unwritable(out, error, option)) from None
     return out
@@ -102,7 +106,8 @@ def create_new(name: str) -> pathlib.Path:
 def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
     """Lock the folder against other processes inside the `with` block.
 
-    The operating system frees the lock when the process ends, however it ends.
+    The operating system frees the lock when the process ends, however it ends. Where
+    the file system has no locks, a note says so, and nothing is locked.
 
     Raises:
       InputError: if another process holds the lock.
@@ -116,6 +121,13 @@ def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
                 f"{option} is {folder}, which {file.read() or 'another process'} is "
                 "writing to: name another folder or wait"
             ) from None
+        except OSError as error:
+            if error.errno not in _NO_LOCKS:
+                raise
+            command_line.note(
+                f"{folder} can't be locked ({error.strerror}): no other process may "
+                "write to it"
+            )
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}")
         file.flush()
@@ -232,6 +244,8 @@ def check_seeds(seeds: int, first_seed: int) -> None:
         raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
 
 
+#: The field of `expert_hash`.
+EXPERT_HASH = "expert_sha256"
 #: Options that may differ between a run and its continuation.
 _FREE = (
     "out",
@@ -262,6 +276,20 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
         if old != new and not grown and name not in _FREE:
             changes.append(f"{name} was {old}, is {new}")
     return changes
+
+
+def expert_hash(config: Config) -> dict[str, str]:
+    """Return the hash of the expert's trajectories as a field; none without an expert.
+
+    Raises:
+      ValueError: if the expert can't be read.
+    """
+    if config.expert is None:
+        return {}
+    digest = hashlib.sha256()
+    for values in expert.load(config.expert):
+        digest.update(values.tobytes())
+    return {EXPERT_HASH: digest.hexdigest()}
 
 
 def flat(described: Mapping[str, Any]) -> dict[str, Any]:

@@ -6,11 +6,13 @@ import dataclasses
 import pathlib
 import shlex
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
+import jax
 import tyro
 
+from gasil_envs import own_code
 from gasil_jax import presets
 from gasil_jax import train as training
 from gasil_jax.config import Config, own_names, validate
@@ -100,26 +102,9 @@ def parse(
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if resumed is not None:
-        described = run_folder.read(resumed)
-        fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
-        # An option with the default None or False may be newer than the run.
-        newer = {
-            f.name: f.default for f in fields if f.default is None or f.default is False
-        }
-        names = {f.name for f in fields}
-        missing = names - set(newer) - set(described)
-        if missing or set(described) - names - {"out", "points"}:
-            raise InputError(f"out is {resumed}, which another program has written")
-        stored = newer | described
-        values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
-        before = kind(**values)
+        before, _ = _stored(kind, resumed)
         options = command_line.parse(kind, arguments, program, before)
-        changed = run_folder.differences(vars(before), vars(options))
-        if changed:
-            raise InputError(
-                f"resume continues with {resumed}, where {'; '.join(changed)}: "
-                "only total_steps may differ, and grow"
-            )
+        refuse_changes(options, resumed)
         return options
     given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
     with command_line.input_checked():
@@ -128,6 +113,42 @@ def parse(
         )
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)
+
+
+def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
+    """Return the options of the run in a folder, and the content of its config.json.
+
+    Raises:
+      InputError: if another program has written it.
+    """
+    described = run_folder.read(folder)
+    fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
+    # An option with the default None or False may be newer than the run.
+    newer = {
+        f.name: f.default for f in fields if f.default is None or f.default is False
+    }
+    names = {f.name for f in fields}
+    missing = names - set(newer) - set(described)
+    others = {"out", "points", run_folder.EXPERT_HASH}
+    if missing or set(described) - names - others:
+        raise InputError(f"out is {folder}, which another program has written")
+    stored = newer | described
+    values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
+    return kind(**values), described
+
+
+def refuse_changes(options: Options, folder: pathlib.Path) -> None:
+    """Raise `InputError` if the run in a folder has settings that differ."""
+    before, described = _stored(type(options), folder)
+    name = run_folder.EXPERT_HASH
+    expert = {name: described[name]} if name in described else {}
+    with command_line.input_checked():
+        now = {**vars(options), **run_folder.expert_hash(options.config)}
+    if changed := run_folder.differences({**vars(before), **expert}, now):
+        raise InputError(
+            f"resume continues with {folder}, where {'; '.join(changed)}: "
+            "only total_steps may differ, and grow"
+        )
 
 
 def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
@@ -189,6 +210,7 @@ def check(options: Options) -> None:
     """
     with command_line.input_checked():
         environments.check(options.env, options.settings)
+        presets.check(options.preset)
         validate(options.config)
         trackers.check(options.log)
     command_line.check_least(
@@ -287,15 +309,18 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     An `Interrupted` raised inside gets a note with the command that continues the run.
 
     Raises:
-      InputError: if another run is in the folder or uses it now, or if it can't be
-        written.
+      InputError: if another run is in the folder or uses it now, if the run to be
+        continued has other settings, or if the folder can't be written.
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
     out = options.out
     folder = run_folder.create_new(name) if out is None else run_folder.create(out)
     with run_folder.lock(folder):
-        if not (options.resume and run_folder.is_described(folder)):
+        if options.resume and run_folder.is_described(folder):
+            # Another process may have written to it since the options were parsed.
+            refuse_changes(options, folder)
+        else:
             run_folder.refuse_used(folder)
         try:
             yield folder
@@ -310,6 +335,7 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     """Write every option to config.json, the config's fields under "config"."""
     described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
+    described |= run_folder.expert_hash(options.config)
     run_folder.describe(folder, described | {"out": str(folder)} | more)
 
 
@@ -324,4 +350,35 @@ def make_env(options: Options) -> Any:
         with announced(options.env, "building the environment"):
             env = environments.make_env(options.env, **settings)
         training.check(env, options.config)
+        if ":" in options.config.agent:
+            _trace(env, options.config)
     return env
+
+
+def _trace(env: Any, config: Config) -> None:
+    """Trace two iterations of an agent of one's own, without running them.
+
+    Raises:
+      InputError: if that raises an error, or if the shapes of its state change.
+    """
+    agent = f"agent {config.agent!r}"
+    step = lambda state: training.iterate(env, config, state)[0]
+    try:
+        first = jax.eval_shape(lambda: training.init(env, config, jax.random.key(0)))
+        then = jax.eval_shape(step, first)
+    except Exception as error:
+        why = own_code.in_a_line(error, but=pathlib.Path(training.__file__).parent)
+        raise InputError(f"{agent} can't be traced: {why}") from None
+    before, after = (
+        {jax.tree_util.keystr(x): (y.shape, str(y.dtype)) for x, y in leaves}
+        for leaves in map(
+            lambda state: jax.tree_util.tree_leaves_with_path(state.imitation),
+            (first, then),
+        )
+    )
+    for name in sorted(before.keys() | after.keys()):
+        if before.get(name) != after.get(name):
+            raise InputError(
+                f"{agent} changes the shape or dtype of its state{name} from "
+                f"{before.get(name)} to {after.get(name)}: they must stay the same"
+            )

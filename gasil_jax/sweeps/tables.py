@@ -18,7 +18,7 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import importance
-from gasil_jax.host import json_reader, metrics_files
+from gasil_jax.host import json_reader, metrics_files, output_file
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point, check_saved
 from gasil_jax.sweeps.shards import Program
@@ -206,7 +206,10 @@ def write(
         )
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     names = sorted({name for point in points for name in point})
-    with (folder / "results.csv").open("w", newline="") as file:
+    with (
+        output_file.whole(folder / "results.csv") as partial,
+        partial.open("w", newline="") as file,
+    ):
         writer = csv.writer(file)
         writer.writerow([*LABELS, *names, *finals, "diverged"])
         for index, point in enumerate(points):
@@ -216,7 +219,8 @@ def write(
                 cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
                 bad = int(diverged[index, position])
                 writer.writerow([index, seed, *own, *cells, bad])
-    np.savez_compressed(folder / "curves.npz", **curves)
+    with output_file.whole(folder / "curves.npz") as partial:
+        np.savez_compressed(partial, **curves)
     trainings = [training for part in parts for training in part.trainings()]
     sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
     best = lambda scores: int(sound[scores[sound].argmax()]) if sound.size else None
@@ -249,16 +253,18 @@ def write(
     }
     metrics_files.write_json(folder / "summary.json", summary)
     chosen = summary["best_by_mean"]
-    _plot(folder / "sweep.png", points, final, chosen)
+    with output_file.whole(folder / "sweep.png") as partial:
+        _plot(partial, points, final, chosen)
     if varied:
-        plotting.marginals(
-            folder / "hyperparameters.png",
-            varied,
-            mean[ended],
-            shares,
-            best=None if chosen is None else ended.index(chosen),
-            left_out=len(points) - len(ended),
-        )
+        with output_file.whole(folder / "hyperparameters.png") as partial:
+            plotting.marginals(
+                partial,
+                varied,
+                mean[ended],
+                shares,
+                best=None if chosen is None else ended.index(chosen),
+                left_out=len(points) - len(ended),
+            )
     return summary
 
 

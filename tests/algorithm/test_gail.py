@@ -1,5 +1,6 @@
 """GAIL imitates a scripted expert, and refuses files without expert data."""
 
+import shutil
 import sys
 
 import gymnasium
@@ -130,6 +131,22 @@ def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
         assert len(observation) == len(action) == length
         with pytest.raises(ValueError, match="read-only"):
             action[0] = 0.0
+
+
+def test_a_run_does_not_continue_with_another_expert(expert, tmp_path, capsys):
+    path, out = tmp_path / "own.npz", tmp_path / "out"
+    shutil.copy(expert[1], path)
+    command = ["--env", "point_mass", "--agent", "gail", "--expert", str(path)]
+    command += ["--total-steps", "2048", "--hidden-sizes", "4", "--out", str(out)]
+    assert main(command) == 0
+    with np.load(path) as arrays:
+        others = {name: -arrays[name] for name in arrays}
+    continued = ["--resume", "--out", str(out), "--total-steps", "4096"]
+    np.savez(path, **others)
+    assert main([*continued, "--env", "point_mass"]) == 2
+    assert "expert_sha256 was" in capsys.readouterr().err
+    shutil.copy(expert[1], path)
+    assert main([*continued, "--env", "point_mass"]) == 0
 
 
 @pytest.mark.parametrize(

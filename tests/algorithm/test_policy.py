@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import normalization, numpy_policy
+from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.host import policy_file
 from gasil_jax.networks import Policy
 
@@ -89,6 +89,17 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
         (tmp_path / "policy.npz").write_bytes(content)
         with pytest.raises(ValueError, match="is not a saved policy"):
             gasil_jax.load_policy(tmp_path)
+
+
+def test_a_batch_of_states_is_no_policy(trained_point_mass):
+    env, _, states = trained_point_mass
+    with pytest.raises(ValueError, match="state is a batch of 3 states"):
+        policy.from_state(states, env)
+
+
+def test_only_the_zoos_policies_have_a_description(tmp_path):
+    with pytest.raises(ValueError, match="must be one of the zoo, zoo:NAME"):
+        numpy_policy.about(str(tmp_path))
 
 
 def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_path):

@@ -3,6 +3,7 @@
 import functools
 
 import brax.envs
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -127,8 +128,15 @@ def test_the_shape_of_a_traced_hyperparameter_is_checked():
     )
 
 
+def test_an_environment_of_gymnasium_is_refused():
+    with pytest.raises(
+        ValueError, match=r"has no observation_size: .* Brax's interface"
+    ):
+        gasil_jax.make_train(gymnasium.make("CartPole-v1"), SMALL)
+
+
 def test_a_name_is_not_an_environment():
-    with pytest.raises(ValueError, match=r"env is 'hopper': .*make_env"):
+    with pytest.raises(ValueError, match=r"env is 'hopper', .*make_env"):
         gasil_jax.make_train("hopper", SMALL)
 
 

@@ -11,6 +11,8 @@ from gasil_jax import evaluate, merge, render, run, sweep
 from gasil_jax.config import Hyperparameters, validate
 
 MODULE = '''
+import jax.numpy as jnp
+
 import gasil_jax
 from gasil_jax.config import number
 from gasil_jax.imitation.interface import Imitation, leave_policy
@@ -40,10 +42,29 @@ def reward(state, context, key):
     }
 
 
+def rewards(state, context, key):
+    return state, context.rollout.reward, {"my_rewards": context.rollout.reward}
+
+
+def unfinished(state, context, key):
+    return state, context.nothing, {}
+
+
+def start(key, config, observation_size, action_size):
+    return {"count": jnp.float32(0)}
+
+
+def grows(state, context, key):
+    return {"count": jnp.zeros(3)}, context.rollout.reward, {}
+
+
 OWN = Imitation(no_state, reward, leave_policy, fields=(), hyperparameters=Own)
 TAKEN = OWN._replace(hyperparameters=Taken)
 AN_OPTION = OWN._replace(hyperparameters=AnOption)
 BARE = OWN._replace(hyperparameters=Bare)
+MANY = OWN._replace(update_and_reward=rewards)
+UNFINISHED = OWN._replace(update_and_reward=unfinished)
+GROWS = OWN._replace(init=start, update_and_reward=grows)
 NO_CLASS = OWN._replace(hyperparameters={"my_weight": 0.5})
 '''
 SMALL = (
@@ -56,6 +77,7 @@ SMALL = (
 @pytest.fixture(autouse=True)
 def my_agents(tmp_path, monkeypatch):
     (tmp_path / "my_agents.py").write_text(MODULE)
+    (tmp_path / "leaves.py").write_text("raise SystemExit(3)")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
 
@@ -105,11 +127,19 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:AN_OPTION", "'seeds', a name that is taken by an option"),
         ("my_agents:BARE", "'bare' without a range: .* gasil_jax.config.number"),
         ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
+        ("my_agents:MANY", "'my_rewards' .* has shape .*: it must be one number"),
+        (
+            "my_agents:UNFINISHED",
+            r"can't be traced: AttributeError: .*my_agents.py, li",
+        ),
+        ("my_agents:GROWS", r"state\['count'\] from \(\(\), 'float32'\) to "),
+        ("leaves:OWN", "'leaves:OWN' can't be imported: SystemExit: 3"),
         ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
     ],
 )
 def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
-    assert run.main([*SMALL, "--agent", agent, "--out", "run"]) == 2
+    # JAX has been started by other tests, so that --devices would be told of.
+    assert run.main([*SMALL[:-2], "--agent", agent, "--out", "run"]) == 2
     captured = capsys.readouterr()
     assert re.search(why, captured.err), captured.err
     assert captured.err.startswith("error: ") and captured.err.count("\n") == 1

@@ -1,5 +1,7 @@
 """Our environments as Gymnasium's, checked by Gymnasium."""
 
+import multiprocessing
+
 import gymnasium
 import jax
 import jax.numpy as jnp
@@ -137,6 +139,48 @@ def test_a_limit_above_the_environments_own_is_refused():
     for wrong in (51, 0, "5"):
         with pytest.raises(ValueError, match="whole number from 1 to 50"):
             gasil_envs.make("point_mass", max_episode_steps=wrong)
+
+
+def test_a_limit_around_it_above_its_own_is_refused():
+    env = gymnasium.make("gasil_envs/point_mass", max_episode_steps=51)
+    with pytest.raises(ValueError, match=r"max_episode_steps is 51: .* limit is 50"):
+        env.reset()
+
+
+def _told_by_a_child(connection):
+    try:
+        gymnasium_adapter.GymnasiumEnv("point_mass")
+    except RuntimeError as error:
+        connection.send(str(error))
+    finally:
+        connection.close()
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_forked_process_is_refused():
+    """JAX would wait there for ever."""
+    processes = multiprocessing.get_context("fork")
+    ours, theirs = processes.Pipe()
+    child = processes.Process(target=_told_by_a_child, args=(theirs,))
+    child.start()
+    assert ours.poll(60)
+    assert 'vector_kwargs={"context": "spawn"}' in ours.recv()
+    child.join(60)
+
+
+@pytest.mark.parametrize(
+    "env",
+    [
+        gymnasium_adapter.GymnasiumEnv("point_mass"),
+        gymnasium_adapter.GymnasiumVectorEnv("point_mass", 3),
+    ],
+)
+def test_a_wrong_use_is_told(env):
+    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
+        env.step(env.action_space.sample())
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=r"action has shape \(5, 2\): it must have \("):
+        env.step(np.zeros((5, 2)))
 
 
 def test_pictures_show_the_episode():

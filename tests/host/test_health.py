@@ -9,7 +9,7 @@ from brax.envs import State
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import run
+from gasil_jax import evaluation, run
 
 
 def as_arrays(tree):
@@ -129,18 +129,47 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
 
 
 class Fragile:
-    """A line whose reward alone is NaN beyond a certain position."""
+    """A line whose reward alone is NaN beyond a certain position.
+
+    With `bad_starts`, the first observation of half of the episodes is NaN, too.
+    """
 
     observation_size, action_size, episode_length = 1, 1, 20
 
+    def __init__(self, bad_starts=False):
+        self.bad_starts = bad_starts
+
     def reset(self, key):
         position = jax.random.uniform(key, (1,), minval=-0.5, maxval=0.5)
-        return State(position, position, jnp.float32(0), jnp.float32(0))
+        bad = self.bad_starts & (position > 0.0)
+        seen = jnp.where(bad, jnp.nan, position)
+        return State(position, seen, jnp.float32(0), jnp.float32(0))
 
     def step(self, state, action):
         position = state.pipeline_state + 0.1 * action
         reward = jnp.where(position[0] > 0.6, jnp.nan, -(position[0] ** 2))
         return state.replace(pipeline_state=position, obs=position, reward=reward)
+
+
+def test_a_first_observation_is_looked_at_too():
+    """It must not reach the buffer, nor the return of an evaluation."""
+    small = test_members.SMALL.replace(agent="ppo+gasil", total_steps=8 * 128)
+    env = wrappers.EpisodeLimit(Fragile(bad_starts=True), 20)
+    train = jax.jit(gasil_jax.make_train(env, small))
+    state, metrics = train(jax.random.key(0))
+    assert metrics["faulty_steps"].sum() > 0
+    assert metrics["skipped_updates"].sum() == 0
+    filled = int(state.good_trajectories.size)
+    assert filled > 0
+    assert np.isfinite(state.good_trajectories.observation[:filled]).all()
+    assert np.isfinite(state.normalizer.mean).all()
+    scores = jax.jit(
+        lambda key: evaluation.evaluate(env, small, state, key, num_episodes=20)
+    )(jax.random.key(1))
+    assert np.isfinite(scores["episode_return"]).all()
+    # Such an episode is over with its first step, as in training.
+    bad = scores["episode_length"] == 1
+    assert bad.any() and not bad.all() and (scores["episode_return"][bad] == 0.0).all()
 
 
 @pytest.mark.parametrize("limit", [20, 15])

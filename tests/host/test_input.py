@@ -323,6 +323,13 @@ def test_a_foreign_run_folder_is_refused(content, tmp_path, capsys):
         assert "damaged or of another program" in error
 
 
+def test_an_unknown_preset_of_a_run_is_refused(tmp_path, capsys):
+    options = {"keep_checkpoints": 2, "log": [], "preset": "tuend"}
+    (tmp_path / "config.json").write_text(json.dumps(GOOD | options))
+    assert run.main(["--env", "point_mass", "--resume", "--out", str(tmp_path)]) == 2
+    assert capsys.readouterr().err.startswith("error: preset 'tuend' is unknown: did")
+
+
 def test_a_run_folder_of_another_state_is_refused(tmp_path, capsys):
     from gasil_jax.host import checkpoint
 

@@ -3,6 +3,7 @@
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -39,13 +40,14 @@ def compiled(agent):
     )
     members = make_members(env, config, [3, 4, 5], devices=jax.devices()[:2])
     states, advance = members.compile()
-    return members, members.trim(states), advance
+    return members, jax.tree.map(jnp.asarray, members.trim(states)), advance
 
 
 @pytest.mark.xdist_group("members ppo")
 def test_the_members_of_padded_states_are_taken_on_the_host():
     """Sliced by JAX, each device would get the states of all members."""
     members, states, _ = compiled("ppo")
+    states = members.trim(members.to_devices(states))
     arrays = [
         jax.random.key_data(x)
         if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)

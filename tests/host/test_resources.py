@@ -71,13 +71,42 @@ def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatc
 
 
 def test_a_container_has_what_others_in_it_leave(tmp_path):
-    values = {"max": "1000", "current": "700", "stat": "anon 300\ninactive_file 50\n"}
-    for name, text in values.items():
-        (tmp_path / f"memory.{name}").write_text(text)
-    assert resources._free_in_the_container(tmp_path) == 350
-    (tmp_path / "memory.max").write_text("max\n")
-    with pytest.raises(ValueError):
-        resources._free_in_the_container(tmp_path)
+    """Each control group's limit holds, also those of the groups around it."""
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("0::/jobs/mine\n")
+
+    def write(group, limit):
+        values = {"max": limit, "current": "700", "stat": "anon 3\ninactive_file 50\n"}
+        group.mkdir(parents=True, exist_ok=True)
+        for name, text in values.items():
+            (group / f"memory.{name}").write_text(text)
+
+    write(root, "9000")
+    write(root / "jobs" / "mine", "1000")
+    assert resources._free_in_control_groups(root, own) == [350, 8350]
+    write(root / "jobs", "900")
+    assert min(resources._free_in_control_groups(root, own)) == 250
+    write(root / "jobs", "max\n")
+    assert min(resources._free_in_control_groups(root, own)) == 350
+    # Without a namespace of its own, a container sees its group at the root.
+    own.write_text("0::/not/mounted/here\n")
+    assert resources._free_in_control_groups(root, own) == [8350]
+    own.write_text("0::/\n")
+    assert resources._free_in_control_groups(root, own) == [8350]
+    assert resources._free_in_control_groups(root, tmp_path / "none") == []
+
+
+def test_control_groups_of_the_first_version_have_limits_too(tmp_path):
+    own, root = tmp_path / "own", tmp_path / "groups"
+    own.write_text("5:cpu,cpuacct:/a\n4:memory:/a/b\n0::/\n")
+    (root / "memory" / "a").mkdir(parents=True)
+    for name, text in (
+        ("limit_in_bytes", "1000"),
+        ("usage_in_bytes", "800"),
+        ("stat", "inactive_file 1\ntotal_inactive_file 100\n"),
+    ):
+        (root / "memory" / "a" / f"memory.{name}").write_text(text)
+    assert resources._free_in_control_groups(root, own) == [300]
 
 
 class Device:

@@ -22,7 +22,8 @@ import test_members
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, run_folder
+from gasil_jax.host import checkpoint, command_line, devices, run_folder, run_options
+from gasil_jax.host.environments import Settings
 from gasil_jax.host.members import Members
 
 ITERATIONS = 400
@@ -224,6 +225,46 @@ def test_changed_settings_are_refused(arguments, message, whole, capsys):
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
     assert {p.name: p.stat().st_mtime_ns for p in whole.iterdir()} == before
+
+
+def test_settings_that_changed_before_the_lock_are_refused(whole, tmp_path):
+    """Another process may have trained in the folder since they were read."""
+    out = copy(whole, tmp_path)
+    arguments = ["--resume", "--out", str(out)]
+    options = run_options.parse(run.Options, arguments, "gasil_jax.run", out)
+    path = out / "config.json"
+    changed = json.loads(path.read_text())
+    changed["config"]["total_steps"] *= 2
+    path.write_text(json.dumps(changed))
+    with pytest.raises(InputError, match="total_steps was 102400, is 51200"):
+        with run_options.open_folder(options, "gasil_jax.run"):
+            pass
+
+
+def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
+    def flock(file, operation):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(run_folder.fcntl, "flock", flock)
+    with run_folder.lock(tmp_path):
+        assert "can't be locked (No locks available)" in capsys.readouterr().err
+
+
+def test_ctrl_c_before_training_is_one_line(capsys):
+    def work():
+        raise KeyboardInterrupt
+
+    assert command_line.exit_status(work) == 130
+    assert capsys.readouterr().err == "interrupted\n"
+
+
+def test_devices_without_effect_are_told(capsys):
+    """JAX has been started by the tests, with two."""
+    devices.use_devices(Settings(), 1, 4)
+    assert "devices is 1, which has no effect: JAX has" in capsys.readouterr().err
+    devices.use_devices(Settings(), None, 1)
+    devices.use_devices(Settings(), 2, 4)
+    assert capsys.readouterr().err == ""
 
 
 def test_a_new_folder_has_a_name_of_its_own(tmp_path, monkeypatch):

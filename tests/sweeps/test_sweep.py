@@ -114,7 +114,12 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
         programs=shards.programs(Config(), points, [5], share_counts=True),
     )
     drawn = []
-    monkeypatch.setattr(plotting, "marginals", lambda *x, **_: drawn.append(x))
+
+    def marginals(path, *arguments, **_):
+        path.touch()
+        drawn.append((path, *arguments))
+
+    monkeypatch.setattr(plotting, "marginals", marginals)
     summary = tables.write(tmp_path, points, [5], [trained])
     assert summary["best_by_mean"] == 1
     # A point that does not name a value has the sweep's own.

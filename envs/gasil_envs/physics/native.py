@@ -168,7 +168,9 @@ class MujocoPhysics:
         threads: int | None = None,
     ):
         self._model, self._fields, self._threads = model, tuple(fields), threads
-        shape = lambda name: getattr(mujoco.MjData(model), name).shape
+        data = mujoco.MjData(model)
+        shape = lambda name: getattr(data, name).shape
+        self._at_rest = {x: getattr(data, x).copy() for x in (*_STATE, "ctrl")}
         self._shapes = {name: shape(name) for name in (*_STATE, *self._fields)}
         # By number of simulations. Devices call at the same time, and each call takes
         # its own simulations.
@@ -225,7 +227,15 @@ class MujocoPhysics:
             simulations = idle.pop()
         except IndexError:
             simulations = self._simulations(count, threads)
+        # MuJoCo would print a warning for each of these that it is given.
+        lost = ~np.all([np.isfinite(x).all(axis=-1) for x in inputs.values()], axis=0)
+        if lost.any():
+            inputs = {
+                name: np.where(lost[:, None], self._at_rest[name], value)
+                for name, value in inputs.items()
+            }
         values, failed = simulations.step(inputs, frame_skip)
+        failed = failed | lost
         results = {}
         for name, shape in self._shapes.items():
             # Copied before the next caller may use these simulations.
