@@ -416,17 +416,3 @@ def test_the_list_of_a_policys_arrays_is_complete(finished_hopper):
     arrays = np.load("runs/hopper/policy.npz").files
     assert {"kernel_0", "bias_1"} <= set(arrays)
     assert set(listed) == {x for x in arrays if not x.endswith("_2")}
-
-
-def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
-    from gasil_jax.imitation import AGENTS, none
-
-    def reward(state, context, key):
-        return state, context.rollout.reward, {"episode_return": 0.5}
-
-    monkeypatch.setitem(AGENTS, "bad", none.PPO._replace(update_and_reward=reward))
-    train = gasil_jax.make_train(
-        gasil_jax.make_env("point_mass"), gasil_jax.Config(agent="bad")
-    )
-    with pytest.raises(ValueError, match=r"metrics of agent 'bad'.*episode_return"):
-        jax.eval_shape(train, jax.random.key(0))

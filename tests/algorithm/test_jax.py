@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import compatibility, good_trajectories, policy, ppo
+from gasil_jax import compatibility, policy
 
 
 def test_batched_reduction_is_right_on_cpu():
@@ -107,42 +107,3 @@ def test_matrices_are_multiplied_in_full_precision():
     with jax.default_matmul_precision("default"):
         jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
     assert (highest, highest) not in set(products(jaxpr.jaxpr))
-
-
-def test_a_compiled_insertion_equals_an_eager_one():
-    key = jax.random.key(0)
-    history = good_trajectories.init_history(3, 8, 8, 2, 1)
-    buffer = good_trajectories.init(10, 2, 1)
-    for number in range(4):
-        keys = jax.random.split(jax.random.fold_in(key, number), 4)
-        ended = jax.random.bernoulli(keys[0], 0.4, (8, 3))
-        history = good_trajectories.record(
-            history,
-            jax.random.normal(keys[1], (8, 3, 2)),
-            jax.random.normal(keys[2], (8, 3, 1)),
-            jnp.zeros((8, 3)),
-            ended,
-        )
-        length = jnp.broadcast_to(jnp.arange(1, 9)[:, None], (8, 3))
-        return_ = jax.random.normal(keys[3], (8, 3))
-        episodes = good_trajectories.ended_episodes(history, ended, return_, length)
-        compiled = jax.jit(good_trajectories.insert)(buffer, history, episodes)
-        with jax.disable_jit():
-            eager = good_trajectories.insert(buffer, history, episodes)
-        assert_close(compiled, eager)
-        buffer = compiled
-    assert int(buffer.size) == 10
-
-
-def test_compiled_advantages_equal_eager_ones():
-    keys = jax.random.split(jax.random.key(0), 5)
-    shape = (16, 4)
-    arrays = [jax.random.normal(key, shape) for key in keys[:3]]
-    flags = [jax.random.bernoulli(key, 0.1, shape) for key in keys[3:]]
-    flags[1] = flags[0] | flags[1]
-    estimate = lambda *x: ppo.generalized_advantage_estimation(
-        *x, gamma=0.99, gae_lambda=0.95
-    )
-    compiled = jax.jit(estimate)(*arrays, *flags)
-    with jax.disable_jit():
-        assert_close(compiled, estimate(*arrays, *flags))

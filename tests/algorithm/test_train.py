@@ -12,6 +12,7 @@ import pytest
 import gasil_jax
 from gasil_jax import learner, rollout
 from gasil_jax import train as training
+from gasil_jax.imitation import AGENTS, none
 
 SMALL = gasil_jax.Config(
     total_steps=512,
@@ -177,3 +178,15 @@ def test_metrics_of_one_name_are_refused():
     assert all(value.dtype == jnp.float32 for value in merged.values())
     with pytest.raises(ValueError, match="agent 'ppo' have names that others have: a"):
         training.merge_metrics("ppo", {"a": jnp.int32(1)}, {"a": jnp.float32(2)})
+
+
+def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
+    def reward(state, context, key):
+        return state, context.rollout.reward, {"episode_return": 0.5}
+
+    monkeypatch.setitem(AGENTS, "bad", none.PPO._replace(update_and_reward=reward))
+    train = gasil_jax.make_train(
+        gasil_jax.make_env("point_mass"), gasil_jax.Config(agent="bad")
+    )
+    with pytest.raises(ValueError, match=r"metrics of agent 'bad'.*episode_return"):
+        jax.eval_shape(train, jax.random.key(0))

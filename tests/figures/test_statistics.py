@@ -1,11 +1,51 @@
-"""How much of a sweep's returns one hyperparameter explains."""
+"""Statistics against plain twins, and how much a hyperparameter explains."""
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from gasil_jax.figures import statistics
 
 ALPHA, RATE = map(np.ravel, np.meshgrid([0.02, 0.1, 0.2, 1.0], [1e-5, 1e-4, 1e-3]))
+
+
+@pytest.mark.parametrize("count", [4, 8, 20])
+def test_the_interquartile_mean_is_scipys_trimmed_mean(count):
+    scores = np.random.default_rng(count).normal(size=(count, 3))
+    np.testing.assert_allclose(
+        statistics.interquartile_mean(scores, axis=0),
+        scipy.stats.trim_mean(scores, 0.25, axis=0),
+    )
+
+
+def test_the_interquartile_mean_of_counts_that_no_four_divides():
+    assert statistics.interquartile_mean(np.array([7.0])) == 7.0
+    assert statistics.interquartile_mean(np.array([1.0, 3.0])) == 2.0
+    # Of five: a quarter of 5 is 1.25, so 2 and 4 count 0.75 each and 3 whole.
+    scores = np.array([100.0, 3.0, 2.0, 4.0, -50.0])
+    assert statistics.interquartile_mean(scores) == pytest.approx(
+        (0.75 * 2 + 3 + 0.75 * 4) / 2.5
+    )
+
+
+def test_the_interval_is_scipys():
+    scores = np.random.default_rng(0).gamma(2.0, size=(30, 2))
+    low, high = statistics.bootstrap_interval(scores, resamples=4000)
+    for i in range(2):
+        expected = scipy.stats.bootstrap(
+            (scores[:, i],),
+            statistics.interquartile_mean,
+            n_resamples=4000,
+            method="percentile",
+            rng=np.random.default_rng(1),
+        ).confidence_interval
+        np.testing.assert_allclose([low[i], high[i]], expected, atol=0.05)
+
+
+def test_the_profile_counts():
+    scores, levels = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 2.0, 3.5, 9.0])
+    profile = statistics.performance_profile(scores, levels)
+    np.testing.assert_array_equal(profile, [1.0, 0.5, 0.25, 0.0])
 
 
 def test_only_what_decides_the_return_is_important():
