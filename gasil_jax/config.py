@@ -294,6 +294,13 @@ class Config:
         return dataclasses.replace(changed, hyperparameters=hyperparameters)
 
 
+#: What the tables and the summary of a sweep have beside its points' hyperparameters.
+_COLUMNS = frozenset(
+    "point seed mean worst_seed diverged diverged_seeds final_return final_length "
+    "final_evaluation".split()
+)
+
+
 def _names(kind: type) -> tuple[str, ...]:
     """Return the names of a dataclass' fields."""
     return tuple(field.name for field in dataclasses.fields(kind))
@@ -317,7 +324,8 @@ def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
         )
     for parent in kind.__mro__[: kind.__mro__.index(Hyperparameters)]:
         for name in inspect.get_annotations(parent):
-            if hasattr(Hyperparameters, name) or name in _names(Config):
+            taken = hasattr(Hyperparameters, name) or name in _names(Config)
+            if taken or name in _COLUMNS:
                 raise ValueError(
                     f"agent {agent!r} has a hyperparameter {name!r}, a name that is "
                     "taken: it must be a new one"
@@ -394,16 +402,19 @@ def validate_hyperparameters(config: Config, hyperparameters: Hyperparameters) -
         value = getattr(hyperparameters, name)
         if shape := getattr(value, "shape", ()):
             raise ValueError(
-                f"{name} has shape {shape}: it must be one number; jax.vmap trains many"
+                f"{name} has shape {shape}: it must be a single number (to train with "
+                "several, use jax.vmap)"
             )
         if isinstance(value, jax.core.Tracer):
             continue
         value = _unboxed(value, allowed)
         _validate_number(name, value, allowed)
         most = getattr(config.hyperparameters, name, value)
-        if allowed.whole and not isinstance(most, jax.core.Tracer) and value > most:
+        if not allowed.whole or isinstance(most, jax.core.Tracer):
+            continue
+        if value > (most := _unboxed(most, allowed)):
             raise ValueError(
-                f"{name} is {value}: it must be at most the config's, {int(most)}"
+                f"{name} is {value}: it must be at most the config's, {most}"
             )
 
 

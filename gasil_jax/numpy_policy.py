@@ -73,7 +73,10 @@ def about(name: str) -> dict[str, Any]:
       ValueError: if there is no such policy.
     """
     if not name.startswith(ZOO_PREFIX):
-        raise ValueError(f"name is {name!r}: it must be one of the zoo, zoo:NAME")
+        raise ValueError(
+            f"name is {name!r}: it must be zoo:NAME, with NAME one of "
+            f"{', '.join(zoo())}"
+        )
     return json.loads(str(npz.read(_file(name))["about"]))
 
 

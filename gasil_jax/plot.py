@@ -69,14 +69,13 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     read_table = lambda name, column: metrics_files.read_metrics(
         folder / name, ("seed",), described["seeds"], (column,), unfinished=True
     )
-    evaluations, path = None, folder / "evaluations.csv"
-    # The file may still be empty.
-    if path.is_file() and path.stat().st_size:
-        evaluations = read_table("evaluations.csv", "mean")
+    evaluations = None
+    if (folder / "evaluations.csv").is_file():
+        evaluations = read_table("evaluations.csv", "mean") or None
     path = folder / "metrics.csv"
-    if not (path.is_file() and path.stat().st_size):
+    metrics = read_table("metrics.csv", "episode_return") if path.is_file() else {}
+    if not metrics:
         raise InputError(f"{path} has no curves to draw yet")
-    metrics = read_table("metrics.csv", "episode_return")
     steps, returns = metrics["env_steps"][0], metrics["episode_return"]
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):

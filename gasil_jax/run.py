@@ -15,6 +15,7 @@ from gasil_jax.host import (
     metrics_files,
     output_file,
     policy_file,
+    run_folder,
 )
 from gasil_jax.host.members import Members
 from gasil_jax.host.progress import announced
@@ -42,7 +43,10 @@ def train(
       OSError: if the folder can no longer be written.
       ValueError: if the run to continue does not fit the options.
     """
-    write_config(options, folder)
+    write = lambda: write_config(options, folder)
+    # What describes a run that has begun is replaced only when it continues.
+    if not run_folder.is_described(folder):
+        write()
     title = f"{options.env} {options.config.agent}"
     job = assembly.Job(program, folder, {"seed": seeds_of(options)})
     finished: list[tuple[Members, driver.Outcome]] = []
@@ -52,6 +56,7 @@ def train(
         [job],
         title=title,
         on_finished=lambda job, members, outcome: finished.append((members, outcome)),
+        on_restored=write,
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):

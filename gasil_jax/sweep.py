@@ -82,7 +82,10 @@ def train(
       OSError: if the folder can no longer be written.
       ValueError: if the sweep to continue does not fit the options.
     """
-    run_options.write_config(options, folder, points=points)
+    write = lambda: run_options.write_config(options, folder, points=points)
+    # What describes a sweep that has begun is replaced only when it continues.
+    if not run_folder.is_described(folder):
+        write()
 
     def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
         tables.write_training(
@@ -106,7 +109,9 @@ def train(
         for program in programs
     ]
     title = f"{options.env} {options.config.agent} sweep"
-    assembly.train(options, env, jobs, title=title, on_finished=on_finished)
+    assembly.train(
+        options, env, jobs, title=title, on_finished=on_finished, on_restored=write
+    )
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -258,7 +258,11 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     state = state.replace(
         actor_critic=actor_critic,
         # Only now: within an iteration the policy that acts is the one that learns.
-        normalizer=normalization.update(state.normalizer, batch.observation),
+        normalizer=normalization.update(
+            state.normalizer,
+            # It leaves out what is NaN.
+            jnp.where(batch.faulty[..., None], jnp.nan, batch.observation),
+        ),
         reward_decomposition=rewards.decomposition,
         reward_normalizer=rewards.normalizer,
         environments=environments,
@@ -539,7 +543,8 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
     """Return all metrics of an iteration as float32 scalars, by name.
 
     Raises:
-      ValueError: an agent's metric has a name that another one has, or a shape.
+      ValueError: if an agent's metric has a name that is taken, or is not a single
+        number.
     """
     for own in more:
         if taken := metrics.keys() & own.keys():

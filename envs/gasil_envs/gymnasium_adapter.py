@@ -24,7 +24,8 @@ from gymnasium.wrappers import TimeLimit
 from gasil_envs import pictures, registry, wrappers
 
 _NAMESPACE = "gasil_envs"
-_PROCESS = os.getpid()
+#: The process that has used these environments first; None if none has.
+_process: int | None = None
 
 
 def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
@@ -38,17 +39,22 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     )
 
 
-def _refuse_forked_process(name: str) -> None:
-    """Raise `RuntimeError` in a process that was forked, where JAX would hang."""
-    if os.getpid() != _PROCESS:
+def _refuse_fork() -> None:
+    """Raise `RuntimeError` in a process forked from one that has used JAX.
+
+    JAX would wait there for ever.
+    """
+    global _process
+    _process = _process or os.getpid()
+    if os.getpid() != _process:
         raise RuntimeError(
-            f"env {name!r} is in a forked process, where JAX does not work: take "
-            'vectorization_mode="vector_entry_point", or vector_kwargs={"context": '
-            '"spawn"} for processes'
+            "JAX does not work in a process that was forked from one in which it "
+            'runs: take vectorization_mode="vector_entry_point", or vector_kwargs='
+            '{"context": "spawn"} for processes'
         )
 
 
-def _checked(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
+def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
     """Return an action, or a batch of them, for a step from a state.
 
     Raises:
@@ -92,7 +98,7 @@ class GymnasiumEnv(gymnasium.Env):
         height: int = 360,
         **settings: Any,
     ):
-        _refuse_forked_process(name)
+        _refuse_fork()
         self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.observation_space, self.action_space = _spaces(env)
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -118,6 +124,7 @@ class GymnasiumEnv(gymnasium.Env):
         Raises:
           ValueError: if a `TimeLimit` allows more steps than the environment.
         """
+        _refuse_fork()
         super().reset(seed=seed)
         self._limits = self._time_limits()
         for limit in self._limits:
@@ -142,7 +149,8 @@ class GymnasiumEnv(gymnasium.Env):
           ResetNeeded: if there was no reset before.
           ValueError: if the action has another shape than ``action_space``.
         """
-        given = _checked(action, self._state, self.action_space)
+        _refuse_fork()
+        given = _checked_action(action, self._state, self.action_space)
         self._state = state = self._step(self._state, given)
         self._remember()
         truncated = bool(wrappers.truncated(state))
@@ -215,6 +223,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
                 f"render_mode is {render_mode!r}: it must be None, as only a single "
                 "environment can be drawn"
             )
+        _refuse_fork()
         self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.num_envs = num_envs
         self.single_observation_space, self.single_action_space = _spaces(env)
@@ -243,6 +252,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in each and return the observations, (num_envs, obs)."""
+        _refuse_fork()
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
         return np.array(self._state.obs), {}
@@ -258,7 +268,8 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
           ResetNeeded: if there was no reset before.
           ValueError: if the actions have another shape than ``action_space``.
         """
-        given = _checked(actions, self._state, self.action_space)
+        _refuse_fork()
+        given = _checked_action(actions, self._state, self.action_space)
         self._state = state = self._step(self._state, given, _key(self.np_random))
         truncated = np.array(wrappers.truncated(state))
         terminated = np.array(state.done > 0) & ~truncated

@@ -2,6 +2,7 @@
 
 import importlib
 import pathlib
+import sysconfig
 import traceback
 from typing import Any
 
@@ -21,31 +22,39 @@ def find(kind: str, name: str) -> Any:
     module, attribute = name.split(":", 1)
     try:
         return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError, ValueError) as error:
-        why = str(error)
     # A script without `if __name__ == "__main__"` may exit.
     except (Exception, SystemExit) as error:
         why = in_a_line(error)
     raise ValueError(f"{kind} {name!r} can't be imported: {why}")
 
 
-def in_a_line(error: BaseException, but: pathlib.Path | None = None) -> str:
-    """Return the message of an error in the user's code, and where it was raised.
+def in_a_line(error: BaseException, package: pathlib.Path | None = None) -> str:
+    """Return the message of an error, with its type and place if they are the user's.
 
     Args:
       error: the error.
-      but: a folder whose code is not the user's, besides JAX and this package.
+      package: folder of another package whose code is not the user's.
     """
-    message = f"{type(error).__name__}: {error}".partition("\n")[0]
+    message = str(error).partition("\n")[0]
+    typed = f"{type(error).__name__}: {message}"
     if isinstance(error, SyntaxError):
-        return message  # It names file and line already.
-    frames = reversed(traceback.extract_tb(error.__traceback__))
-    others = _NOT_THE_USERS if but is None else (*_NOT_THE_USERS, str(but))
-    user_frames = (x for x in frames if not x.filename.startswith(others))
-    frame = next(user_frames, None)
-    if frame is None:
-        return message
-    return f"{message} ({frame.filename}, line {frame.lineno})"
+        return typed  # It names file and line already.
+    others = (*_NOT_THE_USERS, package or _NOT_THE_USERS[0])
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        path = pathlib.Path(frame.filename)
+        if not any(path.is_relative_to(x) for x in others) and path.is_file():
+            return f"{typed} ({path}, line {frame.lineno})"
+    plain = isinstance(error, ImportError | AttributeError | ValueError)
+    return message if plain else typed
 
 
-_NOT_THE_USERS = tuple(str(pathlib.Path(x).parent) for x in (jax.__file__, __file__))
+def described(leaf: Any) -> str:
+    """Return an array's dtype and shape, such as float32[3]; None is missing."""
+    return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"
+
+
+_NOT_THE_USERS = (
+    *(pathlib.Path(sysconfig.get_path(x)) for x in ("stdlib", "purelib", "platlib")),
+    pathlib.Path(jax.__file__).parent,
+    pathlib.Path(__file__).parent,
+)

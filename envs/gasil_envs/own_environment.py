@@ -118,13 +118,9 @@ def _check_states(name: str, env: Env) -> None:
         for leaves in map(jax.tree_util.tree_leaves_with_path, (first, then))
     ]
     for path in flat[0] | flat[1]:
-        before, after = (_described(leaves.get(path)) for leaves in flat)
+        before, after = (own_code.described(leaves.get(path)) for leaves in flat)
         if before != after:
             raise ValueError(
                 f"env {name!r}: state{path} is {before} in its reset and {after} in "
                 "its step, must be alike"
             )
-
-
-def _described(leaf: Any) -> str:
-    return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"

@@ -159,19 +159,30 @@ class FaultyStepEnds(Wrapper):
     """End an episode in which the physics fails, for the users of other libraries.
 
     The step has reward 0 and the observation of the step before: no observation and no
-    reward that is not finite, or beyond 1e10, leaves it. `gasil_jax` does the same in
-    its own rollout.
+    reward that is not finite, or beyond 1e10, leaves it. An episode whose first
+    observation is such has zeros instead, and ends with its first step. `gasil_jax`
+    does the same in its own rollout.
     """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; adds ``info["unsound_start"]``, a bool."""
+        state = self.env.reset(rng)
+        _refuse_taken(state, "unsound_start")
+        sound = is_sound(state.obs).all()
+        info = {**state.info, "unsound_start": ~sound}
+        return state.replace(obs=jnp.where(sound, state.obs, 0.0), info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and terminate the episode if the physics fails."""
         stepped = self.env.step(state, action)
         of_step = ("held_reward", *_LAST_STEP_INFO)
         sound = is_sound(stepped.obs).all() & is_sound(stepped.reward)
+        sound &= ~state.info["unsound_start"]
         for name in of_step:
             sound &= is_sound(stepped.info.get(name, jnp.float32(0)))
         zero = lambda x: jnp.where(sound, x, jnp.zeros_like(x))
         info = {k: zero(x) if k in of_step else x for k, x in stepped.info.items()}
+        info["unsound_start"] = jnp.zeros_like(state.info["unsound_start"])
         return stepped.replace(
             obs=jnp.where(sound, stepped.obs, state.obs),
             reward=zero(stepped.reward),

@@ -104,8 +104,8 @@ def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
     (`groups`), and S and T the sums of squared distances of their returns to the mean
     of their group and to the mean of all. It is near 0 on average for a hyperparameter
     without effect, however many groups there are, and may be below 0; it is 0 if all
-    returns are equal. Effects that only several hyperparameters have
-    together are credited to none.
+    returns are equal. Effects that only several hyperparameters have together are
+    credited to none.
 
     Args:
       values: each point's value of the hyperparameter.

@@ -273,17 +273,20 @@ def delete_partial(root: pathlib.Path) -> None:
 def prune(root: pathlib.Path, keep: int) -> None:
     """Delete all but the newest `keep` and the best one, as far as that is possible.
 
-    What can't be deleted is left to the next call or to `delete_partial`.
+    What can't be deleted is left; `delete_partial` deletes it when training continues.
     """
-    with contextlib.suppress(OSError):
+    try:
         folders = _folders(root)
         scores = _scores(folders)
-        kept = set(folders[-keep:])
-        if scores:
-            kept.add(max(scores, key=scores.__getitem__))
-        for folder in folders:
-            if folder not in kept:
-                # A checkpoint that is half deleted must not look like a damaged one.
-                partial = folder.with_name(f"{folder.name}{_PARTIAL}")
-                folder.rename(partial)
-                shutil.rmtree(partial, ignore_errors=True)
+    except OSError:
+        return
+    kept = set(folders[-keep:])
+    if scores:
+        kept.add(max(scores, key=scores.__getitem__))
+    for folder in set(folders) - kept:
+        # A checkpoint that is half deleted must not look like a damaged one.
+        partial = folder.with_name(f"{folder.name}{_PARTIAL}")
+        shutil.rmtree(partial, ignore_errors=True)
+        with contextlib.suppress(OSError):
+            folder.rename(partial)
+            shutil.rmtree(partial, ignore_errors=True)

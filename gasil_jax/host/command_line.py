@@ -213,7 +213,7 @@ def exit_status(work: Callable[[], int | None]) -> int:
     except Interrupted as interrupted:
         print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
         return 128 + interrupted.signal
-    # Before training, and in commands without training.
+    # Ctrl-C outside of training, or a second one during it.
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 128 + signal.SIGINT

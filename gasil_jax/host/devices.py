@@ -28,10 +28,11 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
         jax.config.update("jax_num_cpu_devices", count)
     except RuntimeError:
         # The program has used JAX before, so the devices stay as they are.
-        if requested is not None and (others := jax.device_count()) != count:
+        running = len(jax.devices("cpu"))
+        if requested is not None and running != count:
             command_line.note(
-                f"devices is {requested}, which has no effect: JAX has been started "
-                f"before, with {others}"
+                f"devices is {requested}, which has no effect: JAX is already running "
+                f"with {running} CPU device{'s' if running > 1 else ''}"
             )
     _keep_compiled_programs()
     # This applies everywhere, not only to functions with `full_precision`.

@@ -15,11 +15,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, command_line, metrics_files
+from gasil_jax.host import checkpoint, command_line, metrics_files, run_folder
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.interval import Interval
 from gasil_jax.host.members import Members
@@ -32,8 +31,6 @@ from gasil_jax.train import TrainState
 # takes effect at this rate.
 _SECONDS_OF_A_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
-#: Files that are written when training has ended.
-_RESULTS = ("summary.json", "training.json", "policy.npz")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,8 +59,7 @@ class FitProgress:
       metrics: the metrics of the chunk, (seeds, iterations) each.
       evaluation: columns of evaluations.csv, (seeds,) each; None if the policies were
         not evaluated after this chunk.
-      copy_states: returns a copy of the training states, (seeds, ...), while training
-        waits for the callback.
+      copy_states: makes the copy that `states` returns; works only in the callback.
     """
 
     iteration: int
@@ -74,12 +70,12 @@ class FitProgress:
 
     @functools.cached_property
     def states(self) -> TrainState:
-        """A copy of the training states, (seeds, ...).
+        """A copy of the training states, (seeds, ...), as in `fitting.FitResult`.
 
-        It must be asked for in the callback, and may be kept.
+        Read it in the callback; the copy may be kept.
 
         Raises:
-          RuntimeError: if it is asked for only when training has gone on.
+          RuntimeError: if it is first read after training has gone on.
         """
         return self.copy_states()
 
@@ -229,11 +225,11 @@ def _restored(
                 f"{newest.folder} has no {name}: it was written with other options, "
                 "for example without evaluate_every"
             )
-    ended = any((folder / name).exists() for name in _RESULTS)
-    if newest is None and ended:
+    if newest is None and run_folder.has_results(folder):
+        why = f" ({damages[0]})" if damages else ""
         raise InputError(
             f"{folder} holds the results of training that has ended, and no undamaged "
-            "checkpoint to continue from: name another folder"
+            f"checkpoint to continue from{why}: name another folder"
         )
     for damage in damages:
         instead = "starting anew" if newest is None else f"using {newest.folder.name}"
@@ -278,6 +274,7 @@ def drive(
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
     callback: Callback | None = None,
+    on_restored: Callable[[], None] = lambda: None,
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
@@ -293,6 +290,7 @@ def drive(
       steps_before: environment steps that `progress` has already counted.
       trackers: trackers that also get the metrics; they are closed at the end.
       callback: called after each chunk; if it returns true, training ends there.
+      on_restored: called when it is certain that training can begin or continue.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
@@ -314,7 +312,9 @@ def drive(
             trackers=trackers,
             record=record,
         )
+    on_restored()
     evaluation = tables.evaluation
+    best_score = checkpoint.best_score(checkpoints.root)
 
     started = time.monotonic()
     if first < last:
@@ -341,7 +341,7 @@ def drive(
                 f"the states of iteration {iteration} are gone: read "
                 "FitProgress.states in the callback"
             )
-        return jax.tree.map(jnp.copy, members.trim(states))
+        return jax.tree.map(lambda x: x.copy(), members.trim(states))
 
     stopped = False
     while done < last and not stopped and interruption.signal is None:
@@ -364,15 +364,14 @@ def drive(
             with progress.aside("evaluating the policies"):
                 scores = evaluation.score(states, done)
             evaluated = float(scores["mean"].mean(dtype=np.float64))
-            due |= evaluated > checkpoint.best_score(checkpoints.root)
+            due |= evaluated > best_score
+            best_score = max(best_score, evaluated)
         if due:
             save()
             returns = []
         if callback is not None:
-            steps, copy = (
-                done * config.batch_steps,
-                functools.partial(copy_states, done),
-            )
+            steps = done * config.batch_steps
+            copy = functools.partial(copy_states, done)
             stopped = bool(callback(FitProgress(done, steps, metrics, scores, copy)))
     train_seconds = time.monotonic() - started
     save()

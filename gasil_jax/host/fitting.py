@@ -4,11 +4,9 @@ import contextlib
 import os
 import pathlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.config import Config, Range
@@ -36,7 +34,8 @@ class FitResult(NamedTuple):
     """The result of `fit`.
 
     Attributes:
-      states: the training states after the last iteration, (seeds, ...).
+      states: the training states after the last iteration, (seeds, ...). They are NumPy
+        arrays and random keys where the seeds can't be divided equally by the devices.
       metrics: every metric from the first iteration on, (seeds, iterations) each.
       evaluations: columns of evaluations.csv ("env_steps", and "mean", "min", "max" of
         the returns, and "length"), (seeds, evaluations) each; empty without any.
@@ -107,6 +106,7 @@ def fit(
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
     interruption = Interruption()
+    describe: Callable[[], None] = lambda: None
     with contextlib.ExitStack() as stack:
         if folder is None:
             # Ctrl-C ends training at once, because there is nothing to save.
@@ -120,7 +120,7 @@ def fit(
                 **run_folder.expert_hash(config),
             }
             where = pathlib.Path(folder)
-            stack.enter_context(_opened(where, described, resume))
+            describe = stack.enter_context(_opened(where, described, resume))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
@@ -131,6 +131,7 @@ def fit(
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,
+            on_restored=describe,
         )
         metrics = _table(where / "metrics.csv", members.num_members)
         if folder is not None:
@@ -138,7 +139,7 @@ def fit(
             path = where / "policy.npz"
             policy_file.save(path, outcome.states, env, members.seeds, final)
         return FitResult(
-            jax.tree.map(jnp.asarray, outcome.states),
+            outcome.states,
             metrics,
             _table(where / "evaluations.csv", members.num_members),
         )
@@ -168,8 +169,10 @@ def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
 @contextlib.contextmanager
 def _opened(
     folder: pathlib.Path, described: Mapping[str, Any], resume: bool
-) -> Iterator[None]:
+) -> Iterator[Callable[[], None]]:
     """Create and lock a folder of `fit`, and write down what is trained in it.
+
+    It yields a function that writes it down anew, when training continues.
 
     Raises:
       ValueError: if it can't be written, is in use, or holds something else.
@@ -195,9 +198,12 @@ def _opened(
                     f"resume continues with {folder}, where {'; '.join(changes)}: "
                     "only total_steps may differ, and grow"
                 )
-        metrics_files.write_json(path, now)
+            run_folder.refuse_other_expert(before, now, folder)
+        write = lambda: metrics_files.write_json(path, now)
+        if not begun:
+            write()
         try:
-            yield
+            yield write
         except Interrupted as interrupted:
             interrupted.add_note("continue with the same arguments and resume=True")
             raise

@@ -187,7 +187,7 @@ def read_metrics(
       num_members: number of rows per iteration.
       required: columns that it must have besides "env_steps".
       unfinished: leave out an iteration at the end that is not whole, because training
-        may be writing it.
+        may be writing it. The result is empty if no iteration is whole yet.
 
     Raises:
       InputError: if the file is damaged, has no rows or lacks a column.
@@ -206,8 +206,11 @@ def read_metrics(
                     raise ValueError(f"row {number} has {len(row)} cells")
                 if number:
                     cells.extend(float(x) if x else math.nan for x in row[first:])
-        if unfinished and len(header) > first:
-            del cells[len(cells) - len(cells) % (num_members * (len(header) - first)) :]
+        width = num_members * (len(header) - first)
+        if unfinished and width > 0:
+            del cells[len(cells) // width * width :]
+        if unfinished and not cells:
+            return {}
         if not cells:
             raise ValueError("it has no rows")
         values = np.array(cells).reshape(-1, num_members, len(header) - first)

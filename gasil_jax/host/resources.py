@@ -68,8 +68,8 @@ def available(devices: Sequence[jax.Device]) -> int | None:
         free = [x["bytes_limit"] - x.get("bytes_in_use", 0) for x in every]
         return len(devices) * min(free)
     free = _free_in_control_groups()
-    # On another system the file is missing.
-    with contextlib.suppress(OSError):
+    # On another system the file or the line is missing.
+    with contextlib.suppress(OSError, LookupError):
         text = pathlib.Path("/proc/meminfo").read_text()
         free.append(1024 * int(text.split("MemAvailable:")[1].split()[0]))
     return min(free, default=None)
@@ -151,11 +151,14 @@ def check_memory(
     one, used = need(env, config), devices[:num_members]
     required, free = _padded(num_members, used) * one.memory, available(used)
     if free is not None and required > free:
+        # With more than one for each device, all devices have equally many.
+        fit = free // one.memory
+        fit -= fit % len(used) if fit > len(used) else 0
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
             f"{_in_words(required)} of memory, {_in_words(one.memory)} each with "
             f"num_envs {config.num_envs} and batch_steps {config.batch_steps}, and "
-            f"{_in_words(free)} are free: at most {free // one.memory} fit"
+            f"{_in_words(free)} are free: at most {fit} fit"
         )
 
 
@@ -227,9 +230,12 @@ def check_disk(
 
 
 def size_of_checkpoints(folder: pathlib.Path) -> int:
-    """Return the bytes of a folder's checkpoints, of which there may be none."""
+    """Return the bytes of a folder's checkpoints, of which there may be none.
+
+    Damaged ones do not count, because they are kept.
+    """
     size = 0
-    for path in folder.glob("checkpoints/**/*"):
+    for path in folder.glob("checkpoints/[0-9]*[0-9]/**/*"):
         # Another process may delete it meanwhile.
         with contextlib.suppress(OSError):
             size += path.stat().st_size if path.is_file() else 0

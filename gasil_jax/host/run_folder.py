@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import errno
 import fcntl
+import functools
 import hashlib
 import os
 import pathlib
@@ -55,12 +56,17 @@ def _refuse_without_checkpoints(out: pathlib.Path) -> None:
     """Refuse to replace the results of training whose checkpoints are gone."""
     # Of a run, or of each program of a sweep.
     for folder in (path.parent for path in out.rglob("metrics.csv")):
-        ended = any((folder / x).exists() for x in ("summary.json", "training.json"))
-        if ended and not any((folder / "checkpoints").glob("*")):
+        if has_results(folder) and not any((folder / "checkpoints").glob("*")):
             raise InputError(
                 f"out is {out}: training in {folder} has ended and its checkpoints are "
                 "gone, so that it can't continue: name another folder"
             )
+
+
+def has_results(folder: pathlib.Path) -> bool:
+    """Return whether training in the folder, of a run or a program, has ended."""
+    names = ("summary.json", "training.json", "policy.npz")
+    return any((folder / name).exists() for name in names)
 
 
 def create(out: pathlib.Path, *, option: str = "out") -> pathlib.Path:
@@ -102,6 +108,15 @@ def create_new(name: str) -> pathlib.Path:
             return folder
 
 
+@functools.cache
+def _tell_of_no_locks(folder: pathlib.Path, why: str) -> None:
+    """Print a note, once for each folder."""
+    command_line.note(
+        f"{folder} is on a file system without locks ({why}): make sure that no other "
+        "process writes to it"
+    )
+
+
 @contextlib.contextmanager
 def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
     """Lock the folder against other processes inside the `with` block.
@@ -124,10 +139,7 @@ def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-            command_line.note(
-                f"{folder} can't be locked ({error.strerror}): no other process may "
-                "write to it"
-            )
+            _tell_of_no_locks(folder, str(error.strerror))
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}")
         file.flush()
@@ -217,7 +229,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     path = folder / _CONFIG
     try:
         described = json_reader.read(path, _Described)
-    except OSError:
+    except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}: it must be the folder of a run") from None
     try:
         if "points" in described:
@@ -244,7 +256,7 @@ def check_seeds(seeds: int, first_seed: int) -> None:
         raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
 
 
-#: The field of `expert_hash`.
+#: The field of config.json and fit.json that holds what `expert_hash` returns.
 EXPERT_HASH = "expert_sha256"
 #: Options that may differ between a run and its continuation.
 _FREE = (
@@ -256,6 +268,8 @@ _FREE = (
     "log",
     # The points that the file lists are compared instead.
     "points_file",
+    # `refuse_other_expert` compares it.
+    EXPERT_HASH,
 )
 
 
@@ -290,6 +304,24 @@ def expert_hash(config: Config) -> dict[str, str]:
     for values in expert.load(config.expert):
         digest.update(values.tobytes())
     return {EXPERT_HASH: digest.hexdigest()}
+
+
+def refuse_other_expert(
+    before: Mapping[str, Any], now: Mapping[str, Any], folder: pathlib.Path
+) -> None:
+    """Raise `InputError` if the expert's trajectories are not those of a run.
+
+    Args:
+      before: content of the run's config.json or fit.json; of an older version it may
+        lack the hash.
+      now: the field "expert" of the config to continue with, and its `expert_hash`.
+      folder: folder of the run.
+    """
+    if EXPERT_HASH in before and before[EXPERT_HASH] != now.get(EXPERT_HASH):
+        raise InputError(
+            f"expert is {now['expert']!r}, whose trajectories are not those with which "
+            f"the run in {folder} began: give the same ones, or begin a new run"
+        )
 
 
 def flat(described: Mapping[str, Any]) -> dict[str, Any]:

@@ -102,9 +102,9 @@ def parse(
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if resumed is not None:
-        before, _ = _stored(kind, resumed)
-        options = command_line.parse(kind, arguments, program, before)
-        refuse_changes(options, resumed)
+        stored = _stored(kind, resumed)
+        options = command_line.parse(kind, arguments, program, stored[0])
+        _refuse_changes(options, resumed, stored)
         return options
     given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
     with command_line.input_checked():
@@ -137,18 +137,26 @@ def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
     return kind(**values), described
 
 
-def refuse_changes(options: Options, folder: pathlib.Path) -> None:
-    """Raise `InputError` if the run in a folder has settings that differ."""
-    before, described = _stored(type(options), folder)
-    name = run_folder.EXPERT_HASH
-    expert = {name: described[name]} if name in described else {}
-    with command_line.input_checked():
-        now = {**vars(options), **run_folder.expert_hash(options.config)}
-    if changed := run_folder.differences({**vars(before), **expert}, now):
+def _refuse_changes(
+    options: Options, folder: pathlib.Path, stored: tuple[Options, Mapping[str, Any]]
+) -> None:
+    """Raise `InputError` if a run was begun with other settings than these.
+
+    Args:
+      options: the options to continue with.
+      folder: folder of the run.
+      stored: what `_stored` returns for the folder.
+    """
+    before, described = stored
+    if changed := run_folder.differences(vars(before), vars(options)):
         raise InputError(
             f"resume continues with {folder}, where {'; '.join(changed)}: "
             "only total_steps may differ, and grow"
         )
+    with command_line.input_checked():
+        expert = run_folder.expert_hash(options.config)
+    now = {"expert": options.config.expert, **expert}
+    run_folder.refuse_other_expert(described, now, folder)
 
 
 def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
@@ -319,7 +327,7 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     with run_folder.lock(folder):
         if options.resume and run_folder.is_described(folder):
             # Another process may have written to it since the options were parsed.
-            refuse_changes(options, folder)
+            _refuse_changes(options, folder, _stored(type(options), folder))
         else:
             run_folder.refuse_used(folder)
         try:
@@ -351,15 +359,16 @@ def make_env(options: Options) -> Any:
             env = environments.make_env(options.env, **settings)
         training.check(env, options.config)
         if ":" in options.config.agent:
-            _trace(env, options.config)
+            with announced(options.env, "tracing the agent"):
+                _trace(env, options.config)
     return env
 
 
 def _trace(env: Any, config: Config) -> None:
-    """Trace two iterations of an agent of one's own, without running them.
+    """Trace the start and one iteration of an agent of one's own, without running them.
 
     Raises:
-      InputError: if that raises an error, or if the shapes of its state change.
+      InputError: if that raises an error, or if a shape or dtype in its state changes.
     """
     agent = f"agent {config.agent!r}"
     step = lambda state: training.iterate(env, config, state)[0]
@@ -367,18 +376,15 @@ def _trace(env: Any, config: Config) -> None:
         first = jax.eval_shape(lambda: training.init(env, config, jax.random.key(0)))
         then = jax.eval_shape(step, first)
     except Exception as error:
-        why = own_code.in_a_line(error, but=pathlib.Path(training.__file__).parent)
+        package = pathlib.Path(training.__file__).parent
+        why = own_code.in_a_line(error, package)
         raise InputError(f"{agent} can't be traced: {why}") from None
-    before, after = (
-        {jax.tree_util.keystr(x): (y.shape, str(y.dtype)) for x, y in leaves}
-        for leaves in map(
-            lambda state: jax.tree_util.tree_leaves_with_path(state.imitation),
-            (first, then),
-        )
-    )
-    for name in sorted(before.keys() | after.keys()):
-        if before.get(name) != after.get(name):
+    leaves = jax.tree_util.tree_leaves_with_path(first.imitation)
+    # A tree of another structure has raised an error above.
+    for (path, x), y in zip(leaves, jax.tree.leaves(then.imitation), strict=True):
+        before, after = own_code.described(x), own_code.described(y)
+        if before != after:
             raise InputError(
-                f"{agent} changes the shape or dtype of its state{name} from "
-                f"{before.get(name)} to {after.get(name)}: they must stay the same"
+                f"{agent}: state{jax.tree_util.keystr(path)} is {before} at the start "
+                f"and {after} after an iteration, must be alike"
             )

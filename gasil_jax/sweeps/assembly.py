@@ -123,6 +123,7 @@ def train(
     *,
     title: str,
     on_finished: Callable[[Job, Members, driver.Outcome], None],
+    on_restored: Callable[[], None] = lambda: None,
 ) -> None:
     """Train the unfinished jobs, one after the other.
 
@@ -132,6 +133,8 @@ def train(
       jobs: the jobs in order, including finished ones.
       title: title of the progress display.
       on_finished: called when a job has been trained to its end.
+      on_restored: called for each job when it is certain that its training can begin or
+        continue.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
@@ -172,6 +175,7 @@ def train(
                     interruption=interruption,
                     steps_before=steps_before,
                     trackers=following,
+                    on_restored=on_restored,
                 )
                 on_finished(job, members, outcome)
             steps_before += job.env_steps

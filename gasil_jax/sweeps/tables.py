@@ -69,7 +69,7 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
     """
     try:
         content = json_reader.read(program.folder(folder) / _TRAINING, _Training)
-    except (OSError, ValueError):
+    except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     ended = content["iterations"] == program.config.num_iterations
     return content if ended and content["members"] == len(program.members) else None

@@ -144,7 +144,7 @@ def test_a_run_does_not_continue_with_another_expert(expert, tmp_path, capsys):
     continued = ["--resume", "--out", str(out), "--total-steps", "4096"]
     np.savez(path, **others)
     assert main([*continued, "--env", "point_mass"]) == 2
-    assert "expert_sha256 was" in capsys.readouterr().err
+    assert "whose trajectories are not those with which" in capsys.readouterr().err
     shutil.copy(expert[1], path)
     assert main([*continued, "--env", "point_mass"]) == 0
 

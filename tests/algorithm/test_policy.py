@@ -98,7 +98,7 @@ def test_a_batch_of_states_is_no_policy(trained_point_mass):
 
 
 def test_only_the_zoos_policies_have_a_description(tmp_path):
-    with pytest.raises(ValueError, match="must be one of the zoo, zoo:NAME"):
+    with pytest.raises(ValueError, match="must be zoo:NAME, with NAME one of ant"):
         numpy_policy.about(str(tmp_path))
 
 

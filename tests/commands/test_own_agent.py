@@ -28,6 +28,10 @@ class Taken(gasil_jax.Hyperparameters):
     alpha: float = number(0.5, 0.0, 1.0)
 
 
+class Column(gasil_jax.Hyperparameters):
+    diverged: float = number(0.5, 0.0, 1.0)
+
+
 class AnOption(gasil_jax.Hyperparameters):
     seeds: float = number(0.5, 0.0, 1.0)
 
@@ -60,6 +64,7 @@ def grows(state, context, key):
 
 OWN = Imitation(no_state, reward, leave_policy, fields=(), hyperparameters=Own)
 TAKEN = OWN._replace(hyperparameters=Taken)
+COLUMN = OWN._replace(hyperparameters=Column)
 AN_OPTION = OWN._replace(hyperparameters=AnOption)
 BARE = OWN._replace(hyperparameters=Bare)
 MANY = OWN._replace(update_and_reward=rewards)
@@ -125,6 +130,7 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:reward", "is of type function: it must be an Imitation"),
         ("my_agents:TAKEN", "'alpha', a name that is taken"),
         ("my_agents:AN_OPTION", "'seeds', a name that is taken by an option"),
+        ("my_agents:COLUMN", "'diverged', a name that is taken"),
         ("my_agents:BARE", "'bare' without a range: .* gasil_jax.config.number"),
         ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
         ("my_agents:MANY", "'my_rewards' .* has shape .*: it must be one number"),
@@ -132,7 +138,10 @@ def test_every_command_takes_it(tmp_path, capsys):
             "my_agents:UNFINISHED",
             r"can't be traced: AttributeError: .*my_agents.py, li",
         ),
-        ("my_agents:GROWS", r"state\['count'\] from \(\(\), 'float32'\) to "),
+        (
+            "my_agents:GROWS",
+            r"state\['count'\] is float32\[\] at the start and float32\[3\] after",
+        ),
         ("leaves:OWN", "'leaves:OWN' can't be imported: SystemExit: 3"),
         ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
     ],

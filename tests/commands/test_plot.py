@@ -3,8 +3,10 @@
 import csv
 
 import numpy as np
+import pytest
 
 from gasil_jax import plot, run
+from gasil_jax.errors import InputError
 
 
 def test_runs_are_drawn(tmp_path, capsys):
@@ -55,6 +57,10 @@ def test_runs_are_drawn(tmp_path, capsys):
     for cut in (10, len(whole.splitlines()[-1]) + 10):
         path.write_bytes(whole[:-cut])
         assert plot.read(tmp_path / "ppo").returns.shape == (3, 7)
+    for lines in (0, 1, 2):
+        path.write_bytes(b"".join(whole.splitlines(keepends=True)[:lines]) + b"0,")
+        with pytest.raises(InputError, match="has no curves to draw yet"):
+            plot.read(tmp_path / "ppo")
     path.write_bytes(whole)
 
     # Where none ended in the last tenth, the last that did count, as in the summary.

@@ -244,7 +244,7 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("walker2d --agent ppo+bonus", "for agent 'ppo+bonus' on walker2d with dense"),
+        ("point_mass --agent ppo+bonus", "agent 'ppo+bonus' on point_mass with dense"),
         ("point_mass --agent ppo --reward-delay 2", "on point_mass with delayed"),
         ("brax:ant", "nothing for agent 'ppo+gasil' on brax:ant with dense rewards"),
         ("walker2d --agent ppo+bonus --preset paper", None),

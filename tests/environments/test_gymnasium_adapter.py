@@ -147,35 +147,44 @@ def test_a_limit_around_it_above_its_own_is_refused():
         env.reset()
 
 
-def _told_by_a_child(connection):
-    try:
-        gymnasium_adapter.GymnasiumEnv("point_mass")
-    except RuntimeError as error:
-        connection.send(str(error))
-    finally:
-        connection.close()
+SINGLE_AND_BATCH = pytest.mark.parametrize(
+    "make",
+    [
+        lambda: gymnasium_adapter.GymnasiumEnv("point_mass"),
+        lambda: gymnasium_adapter.GymnasiumVectorEnv("point_mass", 3),
+    ],
+)
+
+
+def _told_by_a_child(connection, uses):
+    for use in uses:
+        try:
+            use()
+        except RuntimeError as error:
+            connection.send(str(error))
+    connection.close()
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_a_forked_process_is_refused():
+@SINGLE_AND_BATCH
+def test_a_forked_process_is_refused(make):
     """JAX would wait there for ever."""
+    env = make()
+    env.reset()
+    uses = (make, env.reset, lambda: env.step(env.action_space.sample()))
     processes = multiprocessing.get_context("fork")
     ours, theirs = processes.Pipe()
-    child = processes.Process(target=_told_by_a_child, args=(theirs,))
+    child = processes.Process(target=_told_by_a_child, args=(theirs, uses))
     child.start()
-    assert ours.poll(60)
-    assert 'vector_kwargs={"context": "spawn"}' in ours.recv()
+    for _ in uses:
+        assert ours.poll(60)
+        assert 'vector_kwargs={"context": "spawn"}' in ours.recv()
     child.join(60)
 
 
-@pytest.mark.parametrize(
-    "env",
-    [
-        gymnasium_adapter.GymnasiumEnv("point_mass"),
-        gymnasium_adapter.GymnasiumVectorEnv("point_mass", 3),
-    ],
-)
-def test_a_wrong_use_is_told(env):
+@SINGLE_AND_BATCH
+def test_a_wrong_use_is_told(make):
+    env = make()
     with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
         env.step(env.action_space.sample())
     env.reset(seed=0)

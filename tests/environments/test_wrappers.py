@@ -165,9 +165,27 @@ def test_a_step_whose_physics_fails_ends_the_episode(value, field):
     np.testing.assert_array_equal(states.obs[:, 0], [1, 2, 2])
     assert not wrappers.truncated(states).any()
     # Others are as they were.
+    states.info.pop("unsound_start")
     _, plain = roll(wrappers.RewardDelay(Scripted(9), 2), 2)
     for same, other in zip(*map(jax.tree.leaves, (states, plain)), strict=True):
         np.testing.assert_array_equal(same[:2], other)
+
+
+class BadStart(Scripted):
+    """Its first observation is not finite."""
+
+    def reset(self, key):
+        state = super().reset(key)
+        return state.replace(obs=jnp.full_like(state.obs, jnp.nan))
+
+
+def test_an_episode_whose_first_observation_is_not_finite_ends_with_its_first_step():
+    env = wrappers.FaultyStepEnds(BadStart(9))
+    np.testing.assert_array_equal(env.reset(jax.random.key(0)).obs, [0, 0])
+    _, states = roll(env, 2)
+    np.testing.assert_array_equal(states.obs[:, 0], [0, 2])
+    np.testing.assert_array_equal(states.reward, [0, 2])
+    np.testing.assert_array_equal(states.done, [1, 0])
 
 
 def test_noise_is_fresh_gaussian_and_only_on_the_observation():

@@ -247,7 +247,9 @@ def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
 
     monkeypatch.setattr(run_folder.fcntl, "flock", flock)
     with run_folder.lock(tmp_path):
-        assert "can't be locked (No locks available)" in capsys.readouterr().err
+        assert "without locks (No locks available): make" in capsys.readouterr().err
+    with run_folder.lock(tmp_path):
+        assert capsys.readouterr().err == ""
 
 
 def test_ctrl_c_before_training_is_one_line(capsys):
@@ -261,7 +263,7 @@ def test_ctrl_c_before_training_is_one_line(capsys):
 def test_devices_without_effect_are_told(capsys):
     """JAX has been started by the tests, with two."""
     devices.use_devices(Settings(), 1, 4)
-    assert "devices is 1, which has no effect: JAX has" in capsys.readouterr().err
+    assert "devices is 1, which has no effect: JAX is" in capsys.readouterr().err
     devices.use_devices(Settings(), None, 1)
     devices.use_devices(Settings(), 2, 4)
     assert capsys.readouterr().err == ""
@@ -323,7 +325,8 @@ def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
 def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
     out = copy(whole, tmp_path)
     shutil.rmtree(out / "checkpoints")
-    before = {x: x.read_bytes() for x in out.iterdir() if x.suffix in (".csv", ".npz")}
+    kinds = (".csv", ".npz", ".json")
+    before = {x: x.read_bytes() for x in out.iterdir() if x.suffix in kinds}
     more = str((ITERATIONS + 5) * 128)
     arguments = ["--resume", "--out", str(out), "--total-steps", more]
     assert run.main(arguments) == 2
@@ -335,8 +338,11 @@ def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
     for name in checkpoints(out):
         delete_the_manifest(out / "checkpoints" / name)
     damaged = checkpoints(out)
-    assert run.main(["--resume", "--out", str(out)]) == 2
-    assert "no undamaged checkpoint" in capsys.readouterr().err.splitlines()[-1]
+    assert run.main(arguments) == 2
+    assert (
+        "no undamaged checkpoint to continue from ("
+        in capsys.readouterr().err.splitlines()[-1]
+    )
     assert all(path.read_bytes() == content for path, content in before.items())
     assert checkpoints(out) == damaged
     # Where it has not ended, its table is kept under another name.
@@ -475,13 +481,25 @@ def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_damaged(
 def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
     for i in range(3):
         checkpoint.write(tmp_path, i, {"x": np.zeros(3)}, {"score": None})
+    names = lambda: sorted(path.name for path in tmp_path.iterdir())
+    rename = pathlib.Path.rename
+
+    def fail(path, other):
+        if path.name == "00000001":
+            raise PermissionError
+        return rename(path, other)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pathlib.Path, "rename", fail)
+        checkpoint.prune(tmp_path, 1)
+    assert names() == ["00000001", "00000002"]
     with monkeypatch.context() as patched:
         patched.setattr(os, "unlink", mock.Mock(side_effect=PermissionError))
         checkpoint.prune(tmp_path, 1)
+    assert names() == ["00000001.partial", "00000002"]
     assert checkpoint.latest(tmp_path)[0].iteration == 2
-    checkpoint.prune(tmp_path, 1)
     checkpoint.delete_partial(tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["00000002"]
+    assert names() == ["00000002"]
 
 
 def test_the_best_and_the_newest_are_kept(tmp_path):
