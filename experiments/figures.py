@@ -89,7 +89,9 @@ class Curve:
         if self.search:
             config = self.search.config({})
         elif isinstance(self.base, str):
-            config = presets.preset(self.env, self.agent, self.base, self.reward_delay)
+            config = presets.preset(
+                self.env, self.agent, self.base, reward_delay=self.reward_delay
+            )
         config = config.replace(**{"total_steps": self.total_steps, **point})
         return tuple(
             Run(self.env, config, seed, self.reward_delay, self.obs_noise)
@@ -309,18 +311,20 @@ _PARTS = [
 ]
 #: The forms of the discriminator's bonus that don't pay for staying up.
 _LOGIT, _CENTERED = (
-    Arm(f"ppo+gasil, {form}", "ppo+gasil", {"bonus": form})
+    Arm(f"ppo+gasil ({form})", "ppo+gasil", {"bonus": form})
     for form in ("logit", "centered")
 )
-_SCALED = Arm("ppo, decomposed, scaled", "ppo")
-_INVERSELY_SCALED = "ppo, decomposed, scaled inversely"
+_SCALED = Arm("ppo (decomposed, scaled)", "ppo")
+_INVERSELY_SCALED = "ppo (decomposed, scaled inversely)"
 _OF_EACH_TASK = {
     env: Arm(_INVERSELY_SCALED, "ppo", {"initial_deviation": 2 / size})
     for env, size in presets.ACTION_SIZES.items()
 }
-_SCALED_ALONE = Arm("ppo, scaled", "ppo", {"decompose_rewards": False})
+_SCALED_ALONE = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
 _SCALED_LONG = Arm(
-    f"{_SCALED.name}, long history", "ppo", {"decomposition_history_episodes": 4}
+    "ppo (decomposed, scaled, long history)",
+    "ppo",
+    {"decomposition_history_episodes": 4},
 )
 #: The last is the whole episode.
 _DELAYS = (1, 5, DELAY, 100, 1000)
@@ -392,17 +396,17 @@ FIGURES: Mapping[str, Figure] = {
                 grid(TASKS, [_SCALED], (DELAY,), base="scaled"),
             ]
         ),
-        favourite="ppo, decomposed",
+        favourite="ppo (decomposed)",
     ),
     "single_setting": Figure(
         "Delayed rewards: one setting for all tasks beside others tuned on each",
         "",
         joined(
-            grid(TASKS, arms, (DELAY,), panel="{env}", base=base)
+            grid(TASKS, arms, (DELAY,), base=base)
             for arms, base in (
                 ([_SCALED, _SCALED_ALONE], "scaled"),
                 (
-                    [Arm("ppo, decomposed, best mean rank", "ppo")],
+                    [Arm("ppo (decomposed, best mean rank)", "ppo")],
                     functools.partial(SingleSetting, decompose_rewards=True),
                 ),
                 (_ADAPTIVE_WITH_AND_WITHOUT, "tuned"),
@@ -415,7 +419,7 @@ FIGURES: Mapping[str, Figure] = {
         "Delayed rewards: exploration by the dimension of an action",
         "",
         joined(
-            grid(tasks, [arm], (DELAY,), panel="{env}", base=base)
+            grid(tasks, [arm], (DELAY,), base=base)
             for tasks, arm, base in (
                 *(((env,), arm, "scaled") for env, arm in _OF_EACH_TASK.items()),
                 (TASKS, _SCALED, "scaled"),
@@ -431,7 +435,6 @@ FIGURES: Mapping[str, Figure] = {
             TASKS[:4],
             [_LOGIT, _CENTERED, "ppo+gasil", "ppo+bonus", "ppo"],
             (DELAY,),
-            panel="{env}",
             base=Search,
         ),
         favourite=_LOGIT.name,
@@ -493,7 +496,7 @@ FIGURES: Mapping[str, Figure] = {
         "Adaptive imitation, with each of its parts taken away",
         "",
         joined(
-            grid(tasks, arms, (DELAY,), panel="{env}")
+            grid(tasks, arms, (DELAY,))
             for tasks, arms in (
                 (TASKS[:4], _PARTS),
                 (("ant",), [_PARTS[i] for i in (0, 2, 6)]),

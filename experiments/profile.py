@@ -146,7 +146,9 @@ def run(options: Options) -> None:
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
     with command_line.input_checked():
         delay = options.settings.reward_delay
-        config = presets.preset(options.env, options.agent, options.preset, delay)
+        config = presets.preset(
+            options.env, options.agent, options.preset, reward_delay=delay
+        )
         env = gasil_envs.make(options.env, **dataclasses.asdict(options.settings))
         members = make_members(
             env, config, range(options.seeds), devices=jax.devices()[:1]

@@ -55,17 +55,17 @@ A final return is the mean return of the episodes that end in the last tenth of
 training, with the acting policy. Shown is the interquartile mean over seeds and, in
 brackets, its 95% interval, by the percentile bootstrap over seeds, which covers a
 little less than 95% with ten seeds. "Evaluated" is the interquartile mean of the last
-policy's returns with its mean actions, without noise, over the seeds that were
-evaluated: in brackets how many, if not all. Better and worse are verdicts on
+policy's returns with its mean actions, without noise; a number in brackets says how
+many seeds were evaluated, where not all were. Better and worse are verdicts on
 differences, by a permutation test and the bootstrap together (differences of
 differences: by the bootstrap alone), corrected by Holm's method for the {} comparisons
-of final returns on this page: where nothing differs, the probability of any verdict at
-all is at most 5%, or about 5% among differences of differences. Verdicts on evaluated
-returns are a family of their own. All verdicts are about these settings: the intervals
-leave out that another search might have chosen others. "Not clear" does not mean that
-two are equal. The probability of improvement is the probability that a random seed of
-the first curve has a higher return than a random seed of the second, where equal ones
-count half, averaged over the tasks."""
+of final returns on this page. If no two curves differed, the chance of even one
+"better" or "worse" would be at most 5% (about 5% for differences of differences).
+Verdicts on evaluated returns are a family of their own. All verdicts are about these
+settings: the intervals leave out that another search might have chosen others. "Not
+clear" does not mean that two are equal. The probability of improvement is the
+probability that a random seed of the first curve has a higher return than a random seed
+of the second, where equal ones count half, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -261,13 +261,15 @@ class Page:
             for key, results in self.results.items()
             if results.complete and len(results.evaluated) >= FEWEST_SEEDS
         }
-        return self._tally(scores, compare(scores, self.figure.compared()))
+        comparisons = compare(scores, self.figure.compared())
+        return self._tally(scores, comparisons, lacking="without enough evaluations")
 
     def _tally(
         self,
         scores: Scores,
         comparisons: Mapping[tuple[str, ...], Comparison],
         panels: Sequence[str] = (),
+        lacking: str = "not measured yet",
     ) -> str:
         lines, panels = [], panels or tuple(self.figure.panels)
         for other in self.figure.names(panels):
@@ -277,8 +279,8 @@ class Page:
             if complete:
                 verdicts = [comparisons[p, ours, other].verdict for p in complete]
                 probability = improvement(scores, complete, ours, other)
-                lacking = len(with_other) - len(complete)
-                more = f", {lacking} not measured yet" if lacking else ""
+                others = len(with_other) - len(complete)
+                more = f", {others} {lacking}" if others else ""
                 lines.append(
                     f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
                     f"{more}; probability of improvement {probability}."

@@ -37,10 +37,12 @@ _POINTS, SEEDS = 12, range(1000, 1002)
 _FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
 #: How a search chooses, in words.
 PROTOCOL = (
-    f"For every agent and task {_POINTS} points are drawn, each trained with "
-    f"{len(SEEDS)} seeds. Where the best of them has a value at an end of its grid, "
-    f"the next value beyond is tried too. The best {_FINALISTS} of all are trained "
-    f"with {len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen."
+    f"For every agent {_POINTS} points are drawn, the same on all tasks, and each is "
+    f"trained on each task with {len(SEEDS)} seeds. Where the best of them has a value "
+    "at an end of its grid, the next value beyond is tried too. The best "
+    f"{_FINALISTS} of all are trained with {len(FINALIST_SEEDS)} seeds in all, and the "
+    "best of these is chosen, each time by the mean return over the last fifth of "
+    "training."
 )
 #: Every agent's hyperparameters, and those of one or two.
 _SHARED: Space = {
@@ -235,7 +237,7 @@ def searches(env: str, reward_delay: int) -> dict[str, Search]:
     by_name = {agent: Search(env, agent, reward_delay) for agent in AGENTS}
     if reward_delay > 1:
         decomposed = Search(env, "ppo", reward_delay, decompose_rewards=True)
-        by_name["ppo, decomposed"] = decomposed
+        by_name["ppo (decomposed)"] = decomposed
     return by_name
 
 

@@ -99,7 +99,7 @@ def table() -> str:
         score = f"{about['mean']:,.0f} ± {about['deviation']:,.0f}"
         steps = f"{about['env_steps']:,}"
         # Older policies of adaptive imitation do not say so.
-        agent = about["agent"] + ", decomposed" * about.get("decompose_rewards", False)
+        agent = about["agent"] + " (decomposed)" * about.get("decompose_rewards", False)
         rows.append([f"`zoo:{name}`", agent, steps, score])
     head = ["policy", "trained with", "steps", "return in Gymnasium"]
     return report.markdown_table(head, rows)
@@ -115,6 +115,8 @@ def write_table() -> None:
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
     command_line.check_least(options, episodes=1)
+    if not options.runs:
+        raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:
         print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
     write_table()

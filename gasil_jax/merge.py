@@ -48,7 +48,10 @@ def _main(arguments: Sequence[str] | None) -> None:
             raise InputError("out is missing: several folders need --out")
         out = options.folders[0]
         if not shards.root(out).is_dir():
-            raise InputError(f"folder is {out}: it must hold shards, or need --out")
+            raise InputError(
+                f"folder is {out}, which holds no shards: name the sweep's folder, or "
+                "the folders of all its shards and --out"
+            )
     summary = merging.merge(options.folders, out)
     points = run_folder.read(out)["points"]
     print(*tables.report(points, summary), f"in {out}", sep="\n")

@@ -91,6 +91,11 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
       ValueError: if it is not a saved policy, or has no such seed.
     """
     path = _file(path)
+    if not path.exists():
+        raise ValueError(
+            f"{path} does not exist: it must be a saved policy, which a run has when "
+            "it is finished"
+        )
     try:
         arrays = npz.read(path)
         if missing := [name for name in _REQUIRED if name not in arrays]:

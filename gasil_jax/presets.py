@@ -8,8 +8,8 @@ needs another alpha. Where the stored search is complete, the row is what it cho
 other rows are from earlier searches. Adaptive imitation has one setting for all
 locomotion tasks. An agent without a row for a task starts from the defaults.
 
-"decomposed" holds what a search chose for PPO where it decomposes delayed rewards, or
-the best point so far where the search is not complete.
+"decomposed" holds what a search chose on each task for PPO that decomposes delayed
+rewards.
 
 "scaled" holds one setting for PPO on all locomotion tasks, whose step size and
 exploration follow the dimension of an action; it decomposes delayed rewards.
@@ -144,7 +144,9 @@ def check(name: str) -> None:
         raise ValueError(unknown("preset", name, names()))
 
 
-def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> Config:
+def preset(
+    env: str, agent: str, name: str = "tuned", *, reward_delay: int = 1
+) -> Config:
     """Return the config that runs of `agent` in `env` start from.
 
     Args:
@@ -155,10 +157,13 @@ def preset(env: str, agent: str, name: str = "tuned", reward_delay: int = 1) -> 
       reward_delay: the environment's reward delay, in steps.
 
     Raises:
-      ValueError: if the agent or the preset is unknown.
+      ValueError: if the environment, the agent or the preset is unknown.
     """
     check(name)
     find_agent(agent)
+    known = ("point_mass", *ACTION_SIZES)
+    if not isinstance(env, str) or (env not in known and ":" not in env):
+        raise ValueError(unknown("env", str(env), known, ("brax:NAME", "MODULE:NAME")))
     chosen = PRESETS[name]
     row = _row(chosen, env, agent, reward_delay)
     return Config(agent=agent).replace(**{**chosen.every, **row})

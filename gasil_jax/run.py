@@ -184,7 +184,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         )
     print(
         f"final return {'unknown' if mean is None else format(mean, '.1f')} "
-        f"(mean over {options.seeds} seeds), {evaluated}"
+        f"(mean over {options.seeds} seed{'s' * (options.seeds > 1)}), {evaluated}"
         f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}, "
         f"in {folder}"
     )

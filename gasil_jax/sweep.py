@@ -227,6 +227,21 @@ def _shard_folder(shard: shards.Shard, out: str | None) -> pathlib.Path:
     return shard.folder(pathlib.Path(out))
 
 
+def _refuse_other_sweep(
+    shard_folder: pathlib.Path, options: Options, points: Sequence[Point]
+) -> None:
+    """Raise `InputError` if another shard beside this one is of another sweep."""
+    now = {**vars(options), "points": tuple(points)}
+    for path in sorted(shard_folder.parent.glob("*-of-*")):
+        if path != shard_folder and run_folder.is_described(path):
+            # A shard may have been continued to more total_steps than this one yet.
+            before = run_folder.read(path)
+            before["config"] = before["config"].replace(
+                total_steps=options.config.total_steps
+            )
+            merging.refuse_different((path, before), (shard_folder, now))
+
+
 def _train_shard(
     arguments: Sequence[str] | None,
     shard: shards.Shard,
@@ -239,6 +254,7 @@ def _train_shard(
     options = run_options.parse(Options, arguments, _PROGRAM, resumed)
     options = dataclasses.replace(options, out=shard_folder)
     points, programs = _plan_without_launcher(options, resumed)
+    _refuse_other_sweep(shard_folder, options, points)
     programs = shards.share(programs, shard)
     trained = tables.Trained(shard_folder, programs)
     if resumed is not None and not trained.unfinished():

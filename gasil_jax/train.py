@@ -249,7 +249,7 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         (actor_critic, imitation), (state.actor_critic, state.imitation)
     )
     metrics: Metrics = {
-        "env_steps": state.iteration.astype(jnp.float32) * config.batch_steps,
+        "env_steps": (state.iteration + 1).astype(jnp.float32) * config.batch_steps,
         "learning_rate": jnp.asarray(hyperparameters.learning_rate),
         "skipped_updates": ~(healthy & rewards.healthy),
         **rollout_metrics(batch, buffer),
@@ -573,6 +573,8 @@ def check(env: Any, config: Config) -> None:
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
     validate(config)
     for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
         if (value := getattr(config, name)) not in allowed:

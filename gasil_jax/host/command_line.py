@@ -2,12 +2,13 @@
 
 import contextlib
 import dataclasses
+import difflib
 import errno
 import io
 import re
 import signal
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, TypeVar, get_origin, get_type_hints
 
 import tyro
@@ -106,7 +107,8 @@ def parse(
     Raises:
       InputError: if tyro rejects the command line; the message is one line.
     """
-    _check_flags(options, sys.argv[1:] if arguments is None else arguments)
+    given = sys.argv[1:] if arguments is None else arguments
+    _check_flags(dict(_flags(options, default)), given)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), _REGISTRY:
@@ -123,14 +125,24 @@ def parse(
         raise InputError(_in_one_line(printed.getvalue())) from None
 
 
-def _check_flags(options: Any, arguments: Sequence[str]) -> None:
-    """Refuse what tyro would take silently, or would refuse without naming the flag."""
-    kinds, given = dict(_flags(options)), set()
+def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
+    """Refuse what tyro would take silently or refuse in other words.
+
+    Args:
+      kinds: the types of all options, by name.
+      arguments: the command line.
+    """
+    given = set()
     for argument in arguments:
         flag, equals, value = argument.partition("=")
         if not flag.startswith("--"):
             continue
         name = flag.removeprefix("--").replace("-", "_")
+        if name not in ("help", "", *kinds) and name.removeprefix("no_") not in kinds:
+            flags = [f"--{x.replace('_', '-')}" for x in kinds]
+            near = difflib.get_close_matches(flag, flags, n=3, cutoff=0.7)
+            what = f"did you mean {' or '.join(near)}?" if near else "see --help"
+            raise InputError(f"option {flag} is unknown: {what}")
         if equals and kinds.get(name.removeprefix("no_")) is bool:
             raise InputError(f"{name} is {value!r}: it takes no value")
         # The last one would stand for all.
@@ -139,11 +151,18 @@ def _check_flags(options: Any, arguments: Sequence[str]) -> None:
         given.add(name)
 
 
-def _flags(kind: Any) -> Iterator[tuple[str, Any]]:
-    """Yield names and types of a dataclass' fields, nested dataclasses' included."""
+def _flags(kind: Any, default: Any = None) -> Iterator[tuple[str, Any]]:
+    """Yield names and types of a dataclass' fields, nested dataclasses' included.
+
+    Args:
+      kind: the class.
+      default: an instance; a nested value may be of a class derived from the declared.
+    """
     for name, hint in get_type_hints(kind).items():
         if dataclasses.is_dataclass(hint):
-            yield from _flags(hint)
+            nested = getattr(default, name, None)
+            own = type(nested) if dataclasses.is_dataclass(nested) else hint
+            yield from _flags(own, nested)
         else:
             yield name, hint
 
@@ -156,6 +175,10 @@ def _in_one_line(refusal: str) -> str:
     _title, *rest = [line for line in lines if line.strip("-")]
     message = " ".join(" ".join(rest).split())
     message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
+    if missing := re.match(
+        r"Missing from python -m [\w.]+(?: \w+)?: (--[\w-]+)", message
+    ):
+        return f"option {missing[1]} is missing: see --help"
     number = re.match(
         r"Error parsing --([\w-]+): (?:.*invalid literal for (int)|could not convert"
         r"|no type matching \{None\}\|FLOAT).*: '(.*)'$",

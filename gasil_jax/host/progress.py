@@ -45,24 +45,31 @@ def _line(title: str, text: str) -> None:
 class Progress:
     """Shows the share of the steps, the return, steps/s and the time left.
 
-    The return is a mean over seeds, with its standard deviation.
+    The return is a mean over members, with the standard deviation between them.
 
     Args:
       title: name of what is trained.
-      total_steps: environment steps over all seeds.
-      num_seeds: number of seeds; the steps that are shown are those of one seed.
+      total_steps: environment steps over all members.
+      num_members: number of members; the steps that are shown are those of one.
+      members: what the members are.
       shown: whether anything is shown at all.
     """
 
     def __init__(
-        self, title: str, total_steps: int, num_seeds: int = 1, *, shown: bool = True
+        self,
+        title: str,
+        total_steps: int,
+        num_members: int = 1,
+        *,
+        members: str = "seeds",
+        shown: bool = True,
     ):
         self._console = Console(stderr=True)
         self._title = title
         self._total = total_steps
-        self._num_seeds = num_seeds
-        seeds = f" x {num_seeds} seeds" if num_seeds > 1 else ""
-        self._amount = f"{total_steps // num_seeds:,} steps{seeds}"
+        self._num_members = num_members
+        times = f" x {num_members} {members}" if num_members > 1 else ""
+        self._amount = f"{total_steps // num_members:,} steps{times}"
         self._live = shown and self._console.is_terminal
         self._in_lines = shown and not self._live
         self._training_since = self._last_line = time.monotonic()
@@ -123,13 +130,14 @@ class Progress:
         """Show progress.
 
         Args:
-          steps: environment steps so far, over all seeds.
-          returns: (seeds, iterations) of the last chunk, NaN where no episode ended.
+          steps: environment steps so far, over all members.
+          returns: (members, iterations) of the last chunk, NaN where no episode ended.
         """
-        per_seed = [row[np.isfinite(row)] for row in returns]
-        per_seed = [row.mean() for row in per_seed if row.size]
-        if per_seed:
-            self._return = f"{np.mean(per_seed):.1f} ± {np.std(per_seed):.1f}"
+        each = [row[np.isfinite(row)] for row in returns]
+        each = [row.mean() for row in each if row.size]
+        if each:
+            deviation = f" ± {np.std(each):.1f}" if len(returns) > 1 else ""
+            self._return = f"{np.mean(each):.1f}{deviation}"
         now = time.monotonic()
         speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
         # The last batch may go beyond what was asked for.
@@ -143,5 +151,5 @@ class Progress:
         due = now - self._last_line > _SECONDS_BETWEEN_LINES or steps >= self._total
         if self._in_lines and due:
             self._last_line = now
-            done = f"{steps // self._num_seeds:,}/{self._amount}"
+            done = f"{steps // self._num_members:,}/{self._amount}"
             _line(self._title, f"{done}, {status}")

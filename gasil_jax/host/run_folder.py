@@ -177,7 +177,7 @@ def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
         message = (
             f"{option} is {folder}, which is not empty: name a new or an empty folder"
         )
-        if is_described(folder):
+        if is_described(folder) and option == "out":
             message += ", or continue the run in it with --resume"
         raise InputError(message)
 
@@ -219,6 +219,17 @@ class _Described(TypedDict, total=False):
     shards: int | None
 
 
+def _what_else(folder: pathlib.Path) -> str:
+    """Return what a folder without config.json is, for an error message."""
+    if not folder.exists():
+        return ", which does not exist: it must be the folder of a run"
+    if (folder / "fit.json").is_file():
+        return ", which gasil_jax.fit has written: gasil_jax.load_policy takes it"
+    if (folder / "shards").is_dir():
+        return f", which holds shards: first run python -m gasil_jax.merge {folder}"
+    return ": it must be the folder of a run"
+
+
 def read(folder: pathlib.Path) -> dict[str, Any]:
     """Return the content of config.json, "config" and "settings" as dataclasses.
 
@@ -230,7 +241,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     try:
         described = json_reader.read(path, _Described)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"run is {folder}: it must be the folder of a run") from None
+        raise InputError(f"run is {folder}{_what_else(folder)}") from None
     try:
         if "points" in described:
             for name in ("share_counts", "shard"):

@@ -109,7 +109,10 @@ def parse(
     given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
     with command_line.input_checked():
         config = presets.preset(
-            given.env, given.config.agent, given.preset, given.settings.reward_delay
+            given.env,
+            given.config.agent,
+            given.preset,
+            reward_delay=given.settings.reward_delay,
         )
     default = kind(env=given.env, config=config)
     return command_line.parse(kind, arguments, program, default)
@@ -130,6 +133,11 @@ def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
     names = {f.name for f in fields}
     missing = names - set(newer) - set(described)
     others = {"out", "points", run_folder.EXPERT_HASH}
+    if ("points" in described) != ("grid" in names):
+        what, program = ("sweep", "sweep") if "points" in described else ("run", "run")
+        raise InputError(
+            f"out is {folder}, a {what}: continue it with python -m gasil_jax.{program}"
+        )
     if missing or set(described) - names - others:
         raise InputError(f"out is {folder}, which another program has written")
     stored = newer | described
@@ -150,8 +158,9 @@ def _refuse_changes(
     before, described = stored
     if changed := run_folder.differences(vars(before), vars(options)):
         raise InputError(
-            f"resume continues with {folder}, where {'; '.join(changed)}: "
-            "only total_steps may differ, and grow"
+            f"resume continues the run in {folder}, where {'; '.join(changed)}: only "
+            "total_steps may change, and grow, and checkpoint_every, "
+            "keep_checkpoints, devices and log"
         )
     with command_line.input_checked():
         expert = run_folder.expert_hash(options.config)
@@ -264,7 +273,10 @@ def tell_without_effect(options: Options, num_members: int) -> None:
             f"{name} is {value}, which has no effect: {options.env} has none"
         )
     default = presets.preset(
-        options.env, config.agent, options.preset, settings.reward_delay
+        options.env,
+        config.agent,
+        options.preset,
+        reward_delay=settings.reward_delay,
     )
     now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
     for name, reason in sorted(unused_fields(config).items()):
@@ -284,7 +296,8 @@ def tell_if_untuned(options: Options) -> None:
         rewards = "delayed" if delay > 1 else "dense"
         command_line.note(
             f"preset {options.preset!r} has nothing for agent {agent!r} on "
-            f"{options.env} with {rewards} rewards: what is not given is the default"
+            f"{options.env} with {rewards} rewards: each setting that is not given has "
+            "its default"
         )
 
 

@@ -146,10 +146,11 @@ def train(
     )
     num_members = sum(len(job.program.members) for job in jobs)
     total_steps = options.config.total_steps * num_members
+    kind = "seeds" if num_members == options.seeds else "members"
     steps_before = 0
     with (
         Interruption() as interruption,
-        Progress(title, total_steps, num_members) as progress,
+        Progress(title, total_steps, num_members, members=kind) as progress,
     ):
         for job in jobs:
             if not job.finished:

@@ -23,10 +23,16 @@ def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
     return {name: x for name, x in described.items() if name != "shard"}
 
 
-def _refuse_different(
+def refuse_different(
     first: tuple[pathlib.Path, Mapping[str, Any]],
     other: tuple[pathlib.Path, Mapping[str, Any]],
 ) -> None:
+    """Raise `InputError` if two shards are not of the same sweep.
+
+    Args:
+      first: folder of a shard and the content of its config.json.
+      other: the same of the other one.
+    """
     before, now = _comparable(first[1]), _comparable(other[1])
     # total_steps may not grow here.
     changed = run_folder.differences(before, now)
@@ -49,7 +55,7 @@ def _read_all(folders: Sequence[pathlib.Path]) -> dict[pathlib.Path, dict[str, A
     every = {path: _read(path) for folder in folders for path in _shard_folders(folder)}
     (first, described), *others = every.items()
     for other in others:
-        _refuse_different((first, described), other)
+        refuse_different((first, described), other)
     folder_of: dict[shards.Shard, pathlib.Path] = {}
     for path, content in every.items():
         shard = shards.parse(content["shard"])
@@ -80,7 +86,7 @@ def _refuse_used(
         earlier = run_folder.read(out)
         # The shards may have been continued to more total_steps since.
         if run_folder.differences(_comparable(earlier), _comparable(shard[1])):
-            _refuse_different((out, earlier), shard)
+            refuse_different((out, earlier), shard)
         used = (out / "programs").is_dir()
     else:
         used = any(path.name not in ("shards", ".lock") for path in out.iterdir())

@@ -69,7 +69,7 @@ def find(
     if "points" in described:
         return _of_sweep(folder, described, _checked(folder, described, point))
     if point is not None:
-        raise InputError(f"point is {point}: {folder} is of a run, which has none")
+        raise InputError(f"point is {point}: {folder} is a run, which has no points")
     config, first = described["config"], described["first_seed"]
     seeds = range(first, first + described["seeds"])
     # A run is a sweep of one point, in one program.
@@ -191,7 +191,7 @@ class Policies(NamedTuple):
 
 
 def load_policies(
-    folder: pathlib.Path,
+    folder: str | pathlib.Path,
     which: str = "last",
     point: int | None = None,
     seed: int | None = None,
@@ -208,7 +208,7 @@ def load_policies(
       InputError: as `load` does, or if the zoo has no such policy.
     """
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        env, config, seeds, states = load(folder, which, point, seed)
+        env, config, seeds, states = load(pathlib.Path(folder), which, point, seed)
         every = jax.device_get(policy.weights(states, env))
         shared = {name: every.pop(name) for name in ("low", "high")}
         weights = [member(every, i) | shared for i in range(len(seeds))]

@@ -82,7 +82,7 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
     _, _, _, folder = saved
     with pytest.raises(ValueError, match=r"seed is 9: .* has 5, 6, 7"):
         gasil_jax.load_policy(folder, 9)
-    with pytest.raises(ValueError, match="is not a saved policy"):
+    with pytest.raises(ValueError, match="does not exist: it must be a saved policy"):
         gasil_jax.load_policy(tmp_path)
     whole = (folder / "policy.npz").read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"\x80\x04N."):

@@ -21,7 +21,7 @@ def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
     rows = presets.PRESETS[name][reward_delay > 1]
     for (env, agent), overrides in rows.items():
         assert env in gasil_envs.names() and agent in gasil_jax.agents()
-        config = gasil_jax.preset(env, agent, name, reward_delay)
+        config = gasil_jax.preset(env, agent, name, reward_delay=reward_delay)
         validate(config)
         assert overrides and config != Config(agent=agent)
 
@@ -33,7 +33,7 @@ def test_the_tuned_rows_are_what_the_searches_chose(env, reward_delay):
     for agent in AGENTS:
         search = Search(env, agent, reward_delay)
         if agent != ADAPTIVE and (point := search.chosen(store)) is not None:
-            tuned = gasil_jax.preset(env, agent, "tuned", reward_delay)
+            tuned = gasil_jax.preset(env, agent, reward_delay=reward_delay)
             assert tuned == search.config(point)
 
 
@@ -91,3 +91,5 @@ def test_an_unknown_preset_is_refused(capsys):
         gasil_jax.preset("hopper", "ppo", "tunde")
     with pytest.raises(ValueError, match=r"did you mean 'ppo\+gasil'"):
         gasil_jax.preset("hopper", "ppo+gasill")
+    with pytest.raises(ValueError, match="env 'walker' is unknown: did you mean 'walk"):
+        gasil_jax.preset("walker", "ppo")

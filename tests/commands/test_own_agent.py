@@ -161,7 +161,7 @@ def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
         (run, "--my-weight 2", "my_weight is 2.0: it must be 0 or more and at most 1"),
         (run, "--my-weight much", "my_weight is 'much': it must be a number"),
         (run, "--my-wieght 0.2", "--my-weight"),
-        (run, "--agent ppo --my-weight 0.2", "Unrecognized options: --my-weight"),
+        (run, "--agent ppo --my-weight 0.2", "option --my-weight is unknown"),
         (sweep, "--grid my_weight=0.1,2", "my_weight is 2.0: it must be 0 or more"),
         (sweep, "--grid my_wieght=0.1", "did you mean 'my_weight'?"),
         (sweep, "--agent ppo --grid my_weight=0.1", "'my_weight' can't vary"),

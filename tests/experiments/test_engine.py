@@ -248,7 +248,7 @@ def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
         name: curve.runs(Store(tmp_path))[0].config.decompose_rewards
         for _, name, curve in figure.curves()
     }
-    assert decomposed["ppo, decomposed"] and not decomposed["ppo"]
+    assert decomposed["ppo (decomposed)"] and not decomposed["ppo"]
 
 
 def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, capsys):
@@ -272,7 +272,7 @@ def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, caps
         (("matrix", "--devices", "0"), "devices is 0"),
         (("matrix", "--quick", "--results", "x"), "results is x: --quick writes below"),
         (("merge", "/proc/none"), "folder is /proc/none: it must have TASK.npz"),
-        (("report", "--help-me"), "Unrecognized options: --help-me"),
+        (("report", "--help-me"), "option --help-me is unknown: see --help"),
         (("benchmark", "--tables", "speed"), "tables has 'speed': allowed physics"),
         (("benchmark", "--repeats", "0"), "repeats is 0: it must be 1 or more"),
         (

@@ -119,8 +119,8 @@ def test_a_figure_over_delays_is_a_row():
 def test_the_inversely_scaled_setting_is_the_preset_with_other_exploration(tmp_path):
     panels = FIGURES["exploration"].panels
     for env, size in (("swimmer", 2), ("humanoid", 17)):
-        curve = panels[env]["ppo, decomposed, scaled inversely"]
+        curve = panels[f"{env}-delayed"]["ppo (decomposed, scaled inversely)"]
         config = curve.runs(Store(tmp_path))[0].config
-        scaled = presets.preset(env, "ppo", "scaled", 20)
+        scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
         assert config == scaled.replace(initial_deviation=2 / size)
         assert config.decompose_rewards and config != scaled

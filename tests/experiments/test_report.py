@@ -217,7 +217,7 @@ def test_the_last_policies_evaluations_are_compared_on_their_own(tmp_path):
             store.add({run: record})
     page = Page("matrix", store, figure=FIGURE)
     assert page.value("tally").startswith("- ours against other: better on 1 of 1, ")
-    words = "- ours against other: worse on 1 of 1, 1 not measured yet; "
+    words = "- ours against other: worse on 1 of 1, 1 without enough evaluations; "
     assert page.value("evaluated").startswith(words)
     assert "| one | ours | 6 | 202 [201, 204] | 7.5 |" in page.table()
     assert "| one | other | 6 | 102 [101, 104] | 52.0 (5) | 100 [" in page.table()

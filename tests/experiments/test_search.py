@@ -87,7 +87,7 @@ def test_delayed_rewards_are_decomposed_for_two_curves():
         for name, one in search.searches("hopper", delay).items()
         if one.config({}).decompose_rewards
     }
-    assert decomposed == {(20, "ppo+gasil-adaptive"), (20, "ppo, decomposed")}
+    assert decomposed == {(20, "ppo+gasil-adaptive"), (20, "ppo (decomposed)")}
 
 
 def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):

@@ -55,7 +55,7 @@ def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "hopper ppo: training"
     assert lines[1] == (
-        "hopper ppo: 2,000/2,000 steps, return 3.0 ± 0.0, 100 steps/s, 0:00:00 left"
+        "hopper ppo: 2,000/2,000 steps, return 3.0, 100 steps/s, 0:00:00 left"
     )
 
 

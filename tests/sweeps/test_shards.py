@@ -155,7 +155,7 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
 
     out = tmp_path / "out"
     assert "folders is empty" in refused()
-    assert "must hold shards" in refused(out)
+    assert "which holds no shards" in refused(out)
     first, _ = train(out, "1/3")
     train(out, "3/3")
     assert "missing: shards 2/3" in refused(out)
@@ -263,8 +263,13 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
         assert job.program.members == program.members
         assert f"gasil_jax.sweep --resume --out {folder}" in capsys.readouterr().err
     assert not jobs_to_train
-    # A cluster that runs a job again may do so before the job has begun.
+    # With other settings than those of the first it is no part of the same sweep.
     begin = [*more, "--shard", "2/2", "--resume", "--seeds", "3"]
+    assert sweep.main(begin) == 2
+    error = capsys.readouterr().err
+    assert "2-of-2 is of another sweep than" in error and "num_envs was 4" in error
+    # A cluster that runs a job again may do so before the job has begun.
+    begin += ["--out", str(tmp_path / "other")]
     assert sweep.main(begin) == 128 + signal.SIGTERM
     assert sum(len(job.program.members) for job in jobs_to_train) == 6
 
