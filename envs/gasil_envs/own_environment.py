@@ -78,6 +78,19 @@ def _check_action_range(name: str, env: Env) -> None:
         )
 
 
+def _refuse_other(name: str, function: str, returned: Any) -> None:
+    """Raise `_NoState` for what lacks the fields of Brax's ``State``."""
+    if not all(hasattr(returned, x) for x in ("obs", "reward", "done", "info")):
+        raise _NoState(
+            f"env {name!r}: its {function} returns a {type(returned).__name__}, must "
+            "return a brax.envs.State"
+        )
+
+
+class _NoState(ValueError):
+    """An environment's function returns something else than a state."""
+
+
 def _check_states(name: str, env: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
     # Training wraps the environment, which adds fields that need not match.
@@ -85,9 +98,13 @@ def _check_states(name: str, env: Env) -> None:
     action = jnp.zeros(env.action_size)
     try:
         bare = jax.eval_shape(env.reset, jax.random.key(0))
+        _refuse_other(name, "reset", bare)
         stepped = jax.eval_shape(env.step, bare, action)
+        _refuse_other(name, "step", stepped)
         first = jax.eval_shape(limited.reset, jax.random.key(0))
         then = jax.eval_shape(limited.step, first, action)
+    except _NoState:
+        raise
     except Exception as error:
         raise ValueError(
             f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
@@ -101,11 +118,12 @@ def _check_states(name: str, env: Env) -> None:
         }
         for field, value in (fields | of_info).items():
             shape = (env.observation_size,) if field == "obs" else ()
+            of = f", as observation_size is {env.observation_size}"
             given = getattr(value, "shape", type(value).__name__)
             if given != shape:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} has the shape {given}, "
-                    f"must have {shape}"
+                    f"must have {shape}{of if field == 'obs' else ''}"
                 )
             # The wrappers take a truncation that is a bool, too.
             if field in fields and value.dtype != jnp.float32:

@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import errno
 import io
+import itertools
 import re
 import signal
 import sys
@@ -43,9 +44,13 @@ def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
         return None
 
     def from_words(words: list[str]) -> Schedule:
-        numbers = [float(word) for word in words]
+        pairs = "STEPS FACTOR pairs, separated by spaces"
+        try:
+            numbers = [float(word) for word in words]
+        except ValueError:
+            raise ValueError(f"{' '.join(words)!r}: it must be {pairs}") from None
         if len(numbers) % 2:
-            raise ValueError(f"{len(words)} numbers: they must be STEPS FACTOR pairs")
+            raise ValueError(f"{len(words)} numbers: it must be {pairs}")
         return tuple(zip(numbers[::2], numbers[1::2]))
 
     return PrimitiveConstructorSpec(
@@ -133,7 +138,7 @@ def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
       arguments: the command line.
     """
     given = set()
-    for argument in arguments:
+    for argument, following in itertools.zip_longest(arguments, arguments[1:]):
         flag, equals, value = argument.partition("=")
         if not flag.startswith("--"):
             continue
@@ -145,6 +150,11 @@ def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
             raise InputError(f"option {flag} is unknown: {what}")
         if equals and kinds.get(name.removeprefix("no_")) is bool:
             raise InputError(f"{name} is {value!r}: it takes no value")
+        if kinds.get(name) is bool and str(following).lower() in ("true", "false"):
+            raise InputError(
+                f"{name} is {following!r}: it takes no value, {flag} turns it on and "
+                f"--no-{flag.removeprefix('--')} off"
+            )
         # The last one would stand for all.
         if get_origin(kinds.get(name)) is tuple and name in given:
             raise InputError(f"{name} is given twice: put all values after one {flag}")
@@ -179,13 +189,20 @@ def _in_one_line(refusal: str) -> str:
         r"Missing from python -m [\w.]+(?: \w+)?: (--[\w-]+)", message
     ):
         return f"option {missing[1]} is missing: see --help"
+    if unparsed := re.match(
+        r"Error parsing --([\w-]+): Could not find valid parse .*\['(.*)'\]", message
+    ):
+        # A narrow frame breaks a line behind a comma.
+        name, value = unparsed[1].replace("-", "_"), unparsed[2].replace(", ", ",")
+        return f"{name} is {value!r}: it must be whole numbers, separated by spaces"
     number = re.match(
         r"Error parsing --([\w-]+): (?:.*invalid literal for (int)|could not convert"
         r"|no type matching \{None\}\|FLOAT).*: '(.*)'$",
         message,
     )
     if number is None:
-        return message
+        underscored = lambda match: f"{match[1].replace('-', '_')} is "
+        return re.sub(r"^Error parsing --([\w-]+): ", underscored, message)
     name, whole, value = number.groups()
     kind = "a whole number" if whole else "a number"
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"

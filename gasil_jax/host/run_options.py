@@ -195,14 +195,21 @@ def resumed_folder(arguments: Sequence[str] | None) -> pathlib.Path | None:
     """Return the folder of the run that --resume continues, or None if there is none.
 
     Raises:
-      InputError: if --resume is given without --out.
+      InputError: if --resume is given without --out, or without --env where no run is.
     """
     given = _first_arguments(arguments)
     if given is None or not given.resume:
         return None
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
-    return given.out if run_folder.is_described(given.out) else None
+    if run_folder.is_described(given.out):
+        return given.out
+    if given.env is None:
+        raise InputError(
+            f"out is {given.out}, which holds no run to continue: to begin one there, "
+            "give --env"
+        )
+    return None
 
 
 def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
@@ -213,6 +220,7 @@ def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | No
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
     parser.add_argument("--agent", nargs="?")
+    parser.add_argument("--env", nargs="?")
     try:
         return parser.parse_known_args(arguments)[0]
     except argparse.ArgumentError:

@@ -152,7 +152,28 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env hopper --reward-delay 0", "reward_delay is 0"),
         ("--env hopper --obs-noise -1", "obs_noise is -1"),
         ("--env hopper --out /proc/nowhere/run", "can't be written"),
-        ("--env hopper --total-step 5", "--total-steps"),
+        (
+            "--env hopper --total-step 5",
+            "option --total-step is unknown: did you mean --total-steps",
+        ),
+        ("--env hopper --xyz 5", "option --xyz is unknown: see --help"),
+        (
+            "--env hopper --normalize-rewards False",
+            "--normalize-rewards turns it on and --no-normalize-rewards off",
+        ),
+        (
+            "--env hopper --hidden-sizes 64,64",
+            "hidden_sizes is '64,64': it must be whole numbers, separated by spaces",
+        ),
+        (
+            "--env hopper --alpha-schedule 2e6,0,3e6,1",
+            "alpha_schedule is '2e6,0,3e6,1': it must be STEPS FACTOR pairs, separated",
+        ),
+        (
+            "--env hopper --alpha-schedule 1 2 3",
+            "alpha_schedule is 3 numbers: it must be STEPS FACTOR pairs",
+        ),
+        ("--resume --out nosuch", "out is nosuch, which holds no run to continue: to"),
         ("--env hopper --resume=3", "resume is '3': it takes no value"),
         ("--env hopper --log wandb --log tensorboard", "log is given twice: put all"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
@@ -165,7 +186,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env os:getcwd", "'os:getcwd' is no environment: it has no reset"),
         ("--env os:getcwd --physics mujoco", "os:getcwd has its own"),
         ("--env point_mass --max-episode-steps 51", "environment's own limit is 50"),
-        ("", "--env"),
+        ("", "option --env is missing: see --help"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):

@@ -283,6 +283,12 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
         (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
         (_OWN.replace("obs=a", "obs={'x': a}"), r"step has the shape dict, .* \(2,\)"),
         (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
+        (
+            _OWN.replace(
+                "return state.", "return a, reward, False, {}\n        state."
+            ),
+            "its step returns a tuple, must return a brax.envs.State",
+        ),
         (_OWN.replace("zeros(2)", "zeros(2, int)"), "obs of its reset is int32, must"),
         (
             _OWN.replace("reward=reward", "reward=reward > 0"),
