@@ -30,11 +30,13 @@ from experiments.comparisons import (
 from experiments.figures import FIGURES, Curve, Figure, name_of
 from experiments.search import (
     AGENTS,
+    BEYOND,
     CELLS,
     DELAY,
     FINALIST_SEEDS,
     PROTOCOL,
     SEEDS,
+    SPACES,
     TASKS,
     importance,
     mean_ranks,
@@ -168,7 +170,7 @@ class Page:
 
     SLOTS = (
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
-        *("protocol", "searches", "importance", "ranks", "published"),
+        *("protocol", "grids", "searches", "importance", "ranks", "published"),
     )
 
     def __init__(
@@ -319,6 +321,17 @@ class Page:
         env = next(iter(self.figure.panels[panel].values())).env
         dense = self.scores[name_of(env), unit]
         return self.scores[panel, name] / float(interquartile_mean(dense))
+
+    def grids(self) -> str:
+        """Return a table of what the searches draw from and the values beyond."""
+        rows = []
+        for name, beyond in BEYOND.items():
+            agents = [agent for agent in AGENTS if name in SPACES[agent]]
+            words = lambda values: ", ".join(f"{x:g}" for x in values if x is not None)
+            grid = words(SPACES[agents[0]][name])
+            who = "all" if len(agents) == len(AGENTS) else ", ".join(agents)
+            rows.append([name, grid, words(beyond), who])
+        return markdown_table(["hyperparameter", "grid", "beyond", "agents"], rows)
 
     def protocol(self) -> str:
         """Return how a search chooses its point, in words."""

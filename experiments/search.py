@@ -74,7 +74,7 @@ SPACES: Mapping[str, Space] = {
 AGENTS = tuple(SPACES)
 #: The next value below and above each grid, or None if none is tried. The buffer's size
 #: has a figure of its own.
-_BEYOND: Mapping[str, tuple[Any, Any]] = {
+BEYOND: Mapping[str, tuple[Any, Any]] = {
     "learning_rate": (3e-5, 1.2e-3),
     "gae_lambda": (0.9, None),
     "gamma": (0.98, 0.998),
@@ -109,7 +109,7 @@ def draw(agent: str) -> tuple[Point, ...]:
 def beyond(agent: str, point: Point) -> Iterator[Point]:
     """Yield, for each value at an end of its grid, the point with the value beyond."""
     for name, values in SPACES[agent].items():
-        for end, further in zip((values[0], values[-1]), _BEYOND[name], strict=True):
+        for end, further in zip((values[0], values[-1]), BEYOND[name], strict=True):
             if point[name] == end and further is not None:
                 yield {**point, name: further}
 
