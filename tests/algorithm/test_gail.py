@@ -12,6 +12,7 @@ import pytest
 from minari.data_collector import EpisodeBuffer
 
 import gasil_jax
+from gasil_jax.host import run_options
 from gasil_jax.imitation import expert as expert_module
 from gasil_jax.run import main
 
@@ -137,16 +138,19 @@ def test_a_run_does_not_continue_with_another_expert(expert, tmp_path, capsys):
     path, out = tmp_path / "own.npz", tmp_path / "out"
     shutil.copy(expert[1], path)
     command = ["--env", "point_mass", "--agent", "gail", "--expert", str(path)]
-    command += ["--total-steps", "2048", "--hidden-sizes", "4", "--out", str(out)]
+    command += ["--total-steps", "128", "--batch-steps", "128", "--num-envs", "4"]
+    command += ["--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "4"]
+    command += ["--discriminator-hidden-sizes", "4", "--out", str(out)]
     assert main(command) == 0
     with np.load(path) as arrays:
         others = {name: -arrays[name] for name in arrays}
-    continued = ["--resume", "--out", str(out), "--total-steps", "4096"]
+    continued = ["--resume", "--out", str(out), "--total-steps", "256"]
     np.savez(path, **others)
     assert main([*continued, "--env", "point_mass"]) == 2
     assert "whose trajectories are not those with which" in capsys.readouterr().err
     shutil.copy(expert[1], path)
-    assert main([*continued, "--env", "point_mass"]) == 0
+    options = run_options.parse(run_options.Options, continued, "gasil_jax.run", out)
+    assert options.config.total_steps == 256
 
 
 @pytest.mark.parametrize(
