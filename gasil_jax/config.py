@@ -386,7 +386,7 @@ def validate(config: Config) -> None:
 
 
 def validate_hyperparameters(config: Config, hyperparameters: Hyperparameters) -> None:
-    """Check that the numbers of one run are allowed, as far as they are known.
+    """Check that the numbers of one run are allowed, but for values that are traced.
 
     Args:
       config: the config of the run, whose counts are upper limits.

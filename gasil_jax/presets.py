@@ -161,9 +161,9 @@ def preset(
     """
     check(name)
     find_agent(agent)
-    known = ("point_mass", *ACTION_SIZES)
-    if not isinstance(env, str) or (env not in known and ":" not in env):
-        raise ValueError(unknown("env", str(env), known, ("brax:NAME", "MODULE:NAME")))
+    ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
+    if not isinstance(env, str) or (env not in ours and ":" not in env):
+        raise ValueError(unknown("env", str(env), ours, others))
     chosen = PRESETS[name]
     row = _row(chosen, env, agent, reward_delay)
     return Config(agent=agent).replace(**{**chosen.every, **row})

@@ -28,18 +28,18 @@ def find(kind: str, name: str) -> Any:
     raise ValueError(f"{kind} {name!r} can't be imported: {why}")
 
 
-def in_a_line(error: BaseException, package: pathlib.Path | None = None) -> str:
+def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
     """Return the message of an error, with its type and place if they are the user's.
 
     Args:
       error: the error.
-      package: folder of another package whose code is not the user's.
+      *packages: folders of other packages, whose code is not the user's.
     """
     message = str(error).partition("\n")[0]
     typed = f"{type(error).__name__}: {message}"
     if isinstance(error, SyntaxError):
         return typed  # It names file and line already.
-    others = (*_NOT_THE_USERS, package or _NOT_THE_USERS[0])
+    others = (*_NOT_THE_USERS, *packages)
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         path = pathlib.Path(frame.filename)
         if not any(path.is_relative_to(x) for x in others) and path.is_file():

@@ -78,37 +78,35 @@ def _check_action_range(name: str, env: Env) -> None:
         )
 
 
-def _refuse_other(name: str, function: str, returned: Any) -> None:
-    """Raise `_NoState` for what lacks the fields of Brax's ``State``."""
-    if not all(hasattr(returned, x) for x in ("obs", "reward", "done", "info")):
-        raise _NoState(
-            f"env {name!r}: its {function} returns a {type(returned).__name__}, must "
+def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
+    """Return the shapes of the state that an environment's function returns.
+
+    Raises:
+      ValueError: if it can't be traced, or returns something else than a state.
+    """
+    try:
+        state = jax.eval_shape(getattr(env, function), *arguments)
+    except Exception as error:
+        raise ValueError(
+            f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
+        ) from None
+    if not all(hasattr(state, x) for x in ("obs", "reward", "done", "info")):
+        raise ValueError(
+            f"env {name!r}: its {function} returns a {type(state).__name__}, must "
             "return a brax.envs.State"
         )
-
-
-class _NoState(ValueError):
-    """An environment's function returns something else than a state."""
+    return state
 
 
 def _check_states(name: str, env: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
     # Training wraps the environment, which adds fields that need not match.
     limited = wrappers.EpisodeLimit(env, 1)
-    action = jnp.zeros(env.action_size)
-    try:
-        bare = jax.eval_shape(env.reset, jax.random.key(0))
-        _refuse_other(name, "reset", bare)
-        stepped = jax.eval_shape(env.step, bare, action)
-        _refuse_other(name, "step", stepped)
-        first = jax.eval_shape(limited.reset, jax.random.key(0))
-        then = jax.eval_shape(limited.step, first, action)
-    except _NoState:
-        raise
-    except Exception as error:
-        raise ValueError(
-            f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
-        ) from None
+    key, action = jax.random.key(0), jnp.zeros(env.action_size)
+    bare = _traced(name, env, "reset", key)
+    stepped = _traced(name, env, "step", bare, action)
+    first = _traced(name, limited, "reset", key)
+    then = _traced(name, limited, "step", first, action)
     for state, where in ((bare, "reset"), (stepped, "step")):
         fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
         of_info = {

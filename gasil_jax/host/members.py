@@ -241,9 +241,10 @@ def make_members(
       ValueError: if the config or a hyperparameter is not allowed.
     """
     train.check(env, config)
+    # The config's own are checked with it.
+    for one in hyperparameters or ():
+        validate_hyperparameters(config, one)
     if hyperparameters is None:
         hyperparameters = [config.hyperparameters] * len(seeds)
-    for one in hyperparameters:
-        validate_hyperparameters(config, one)
     devices = list(devices or jax.devices())[: len(seeds)]
     return Members(env, config, seeds, hyperparameters, devices)

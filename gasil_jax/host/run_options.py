@@ -134,9 +134,10 @@ def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
     missing = names - set(newer) - set(described)
     others = {"out", "points", run_folder.EXPERT_HASH}
     if ("points" in described) != ("grid" in names):
-        what, program = ("sweep", "sweep") if "points" in described else ("run", "run")
+        command = "sweep" if "points" in described else "run"
         raise InputError(
-            f"out is {folder}, a {what}: continue it with python -m gasil_jax.{program}"
+            f"out is {folder}, a {command}: continue it with python -m "
+            f"gasil_jax.{command}"
         )
     if missing or set(described) - names - others:
         raise InputError(f"out is {folder}, which another program has written")
