@@ -21,17 +21,9 @@ from gasil_jax.host import run_options
 native.reserve_threads(2)
 
 
-# Modules whose programs are compiled as for users: agents learn, physics is compared
-# with MuJoCo, XLA's numbers and memory are checked. Elsewhere compiling would take most
-# of the time, and most optimizations are turned off.
-_COMPILED_AS_FOR_USERS = {
-    "test_agents",
-    "test_determinism",
-    "test_environments",
-    "test_gail",
-    "test_jax",
-    "test_resources",
-}
+# Compiling takes most of the time, so most of XLA's optimizations are turned off. Tests
+# with this mark check XLA's numbers or its memory, and are compiled as for users.
+_AS_FOR_USERS = "compiled_as_for_users"
 # Modules with tests that take long by themselves.
 _LONG = {
     "test_examples",
@@ -77,12 +69,22 @@ def _generate_code_quickly():
 _generate_code_quickly()
 
 
+def pytest_configure(config):
+    """Say what our mark means, so that pytest knows it."""
+    text = f"{_AS_FOR_USERS}: compile with all of XLA's optimizations"
+    config.addinivalue_line("markers", text)
+
+
+def _is_optimized(item):
+    return item.get_closest_marker(_AS_FOR_USERS) is not None
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
     """Set how far programs are optimized, here and in the processes a test starts."""
     import jax
 
-    plainly = item.module.__name__ not in _COMPILED_AS_FOR_USERS
+    plainly = not _is_optimized(item)
     before = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(plainly))
     quick = plainly and _KNOWS_EMITTERS
@@ -103,7 +105,7 @@ def pytest_collection_modifyitems(items):
     """
     items.sort(
         key=lambda item: (
-            item.module.__name__ not in _COMPILED_AS_FOR_USERS,
+            not _is_optimized(item),
             item.module.__name__ not in _LONG,
         )
     )

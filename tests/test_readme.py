@@ -50,6 +50,8 @@ NOT_RUN = {
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
     "python -m gasil_jax.merge": "tests/sweeps/test_shards.py merges shards",
+    "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
+    "python -m gasil_jax.sweep --env my_tasks:Line": "a test below trains it",
 }
 
 
@@ -216,8 +218,11 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_ta
     rest = [line for line in lines if line not in training]
     ran = []
     for number, line in enumerate([*training, *rest]):
-        # Made small, some commands are the same.
-        if (toy := as_toy(line, finished, untrained_hopper, tmp_path)) in ran:
+        # Made small, some commands are the same, and so are sweeps over other values.
+        toy = as_toy(line, finished, untrained_hopper, tmp_path)
+        if toy[0] is sweep:
+            toy = (sweep, {word for word in toy[1] if word.startswith("--")})
+        if toy in ran:
             continue
         ran.append(toy)
         folder = tmp_path / str(number)

@@ -55,9 +55,13 @@ def test_a_scripted_expert_is_imitated(expert):
     config = gasil_jax.Config(
         agent="gail",
         expert=path,
-        total_steps=60 * 2048,
+        total_steps=32 * 2048,
+        num_epochs=5,
         hyperparameters=gasil_jax.Hyperparameters(
-            alpha=1.0, discriminator_updates=20, discriminator_learning_rate=3e-4
+            learning_rate=6e-4,
+            alpha=1.0,
+            discriminator_updates=20,
+            discriminator_learning_rate=3e-4,
         ),
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))

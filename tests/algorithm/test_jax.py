@@ -1,5 +1,7 @@
 """The installed JAX computes correct numbers."""
 
+import contextlib
+
 import jax
 import jax.numpy as jnp
 import jaxlib
@@ -10,6 +12,7 @@ import gasil_jax
 from gasil_jax import compatibility, policy
 
 
+@pytest.mark.compiled_as_for_users
 def test_batched_reduction_is_right_on_cpu():
     """jax issue 39103: jaxlib 0.10.2 gives 1065369600 here."""
     rows = jnp.ones((32_769, 2), jnp.float32).at[:, 1].set(0.0)
@@ -18,6 +21,7 @@ def test_batched_reduction_is_right_on_cpu():
     assert bool(jnp.all(squares == 128.0**2))
 
 
+@pytest.mark.compiled_as_for_users
 def test_many_batched_orthogonal_matrices_do_not_deadlock():
     """Under jaxlib 0.10.1 several batched QR factorizations hang on CPU."""
     from gasil_jax.networks import orthogonal
@@ -64,6 +68,7 @@ def assert_close(compiled, eager):
     )
 
 
+@pytest.mark.compiled_as_for_users
 def test_a_compiled_iteration_equals_an_eager_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
     env = gasil_jax.make_env("point_mass", reward_delay=2)
@@ -72,9 +77,20 @@ def test_a_compiled_iteration_equals_an_eager_one():
     state, _ = jax.jit(iterate)(init(jax.random.key(0)))
     assert int(state.good_trajectories.size) == 3
     compiled = jax.jit(iterate)(state)
-    with jax.disable_jit():
+    # Eagerly each operation is compiled by itself, where nothing can be optimized.
+    with jax.disable_jit(), without_optimizations():
         eager = iterate(state)
     assert_close(compiled, eager)
+
+
+@contextlib.contextmanager
+def without_optimizations():
+    """As tests are compiled that have no mark; see conftest.py."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
+        jax.config.update("jax_disable_most_optimizations", True)
+        yield
+        jax.config.update("jax_disable_most_optimizations", False)
 
 
 def products(jaxpr):

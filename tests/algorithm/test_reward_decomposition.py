@@ -302,9 +302,11 @@ def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
     env = gasil_jax.make_env("point_mass", reward_delay=50)
     config = gasil_jax.Config(
         agent="ppo",
-        total_steps=24 * 2048,
+        total_steps=20 * 2048,
+        num_epochs=5,
         decomposition_minibatch_size=16,
         decomposition_hidden_sizes=(32,),
+        hyperparameters=gasil_jax.Hyperparameters(learning_rate=6e-4),
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
 

@@ -15,9 +15,16 @@ from gasil_envs import locomotion, point_mass
 from gasil_envs.physics.interface import PhysicsState
 
 BATCH = 200
-# One worker for each environment, so that it is compiled once.
+# One worker for each environment, so that it is compiled once; and one of them, because
+# that takes long, as for users.
 EACH_NAME = [
-    pytest.param(name, marks=pytest.mark.xdist_group(name))
+    pytest.param(
+        name,
+        marks=[
+            pytest.mark.xdist_group(name),
+            *([pytest.mark.compiled_as_for_users] if name == "hopper" else []),
+        ],
+    )
     for name in gasil_envs.names()
 ]
 

@@ -41,8 +41,8 @@ def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
         assert curve.runs(store) == ()
         while missing := store.missing(curve.search.requested(store)):
             assert curve.runs(store) == ()
-            for run in missing:
-                store.add({run: Record(*[np.ones(10)] * 3, {"physics": "mjx"})})
+            record = Record(*[np.ones(10)] * 3, {"physics": "mjx"})
+            store.add(dict.fromkeys(missing, record))
         (first,) = curve.search.runs(search.draw(curve.agent)[:1])
         runs = curve.runs(store)
         assert [run.seed for run in runs] == list(range(20))

@@ -11,6 +11,7 @@ from gasil_jax.host import resources
 from gasil_jax.host.members import make_members
 
 
+@pytest.mark.compiled_as_for_users
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
