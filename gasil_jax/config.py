@@ -92,153 +92,172 @@ class Hyperparameters(struct.PyTreeNode):
 
     An agent with numbers of its own derives a class from this one, declares them with
     `number` and names the class in its `Imitation`.
+
+    Attributes:
+      learning_rate: Adam's step size for policy and value.
+      learning_rate_decay: fraction of the learning rate that is lost, linearly, by the
+        end of training: 1 anneals it to 0, and 0 keeps it constant.
+      gamma: discount factor.
+      gae_lambda: the lambda of generalized advantage estimation.
+      clip_epsilon: PPO's clip range of the probability ratio.
+      entropy_coefficient: weight of the policy's entropy (the paper's lambda).
+      value_coefficient: weight of the value's squared error. It hardly matters, because
+        the value has its own network, gradient clip and Adam.
+      max_grad_norm: largest global norm of a gradient; the policy's and the value's
+        gradients are clipped separately.
+      initial_deviation: standard deviation of the untrained policy's actions.
+      alpha: scale of the discriminator's reward (paper, section 4.3).
+      discriminator_learning_rate: Adam's step size for the discriminator.
+      discriminator_updates: gradient steps of the discriminator in an iteration.
+      discriminator_entropy_coefficient: weight of the entropy of the discriminator's
+        output.
+      buffer_steps: capacity of the good-trajectory buffer, in steps.
+      imitation_weight: largest share of imitation in the policy's advantage, in
+        ppo+gasil-adaptive.
+      decomposition_learning_rate: Adam's step size for the network that decomposes
+        rewards.
+      behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
+      sil_coefficient: weight of the loss of PPO+SIL.
+      sil_value_coefficient: weight of the value's loss within PPO+SIL's loss.
     """
 
     learning_rate: float = number(3e-4, 0.0, excludes_low=True)
-    """Adam's step size for policy and value."""
     learning_rate_decay: float = number(1.0, 0.0, 1.0)
-    """Fraction of the learning rate that is lost, linearly, by the end of training: 1
-    anneals it to 0, and 0 keeps it constant."""
     gamma: float = number(0.99, 0.0, 1.0)
-    """Discount factor."""
     gae_lambda: float = number(0.95, 0.0, 1.0)
-    """The lambda of generalized advantage estimation."""
     clip_epsilon: float = number(0.2, 0.0, excludes_low=True)
-    """PPO's clip range of the probability ratio."""
     entropy_coefficient: float = number(0.0, 0.0)
-    """Weight of the policy's entropy (the paper's lambda)."""
     value_coefficient: float = number(1.0, 0.0)
-    """Weight of the value's squared error. It hardly matters, because the value has its
-    own network, gradient clip and Adam."""
     max_grad_norm: float = number(0.5, 0.0, excludes_low=True)
-    """Largest global norm of a gradient; the policy's and the value's gradients are
-    clipped separately."""
     initial_deviation: float = number(1.0, 0.0, excludes_low=True)
-    """Standard deviation of the untrained policy's actions."""
     alpha: float = number(0.1, 0.0)
-    """Scale of the discriminator's reward (paper, section 4.3)."""
     discriminator_learning_rate: float = number(1e-4, 0.0, excludes_low=True)
-    """Adam's step size for the discriminator."""
     discriminator_updates: int = _count(5)
-    """Gradient steps of the discriminator in an iteration."""
     discriminator_entropy_coefficient: float = number(1e-3, 0.0)
-    """Weight of the entropy of the discriminator's output."""
     buffer_steps: int = _count(1000)
-    """Capacity of the good-trajectory buffer, in steps."""
     imitation_weight: float = number(0.7, 0.0, 1.0)
-    """Largest share of imitation in the policy's advantage, in ppo+gasil-adaptive."""
     decomposition_learning_rate: float = number(1e-3, 0.0, excludes_low=True)
-    """Adam's step size for the network that decomposes rewards."""
     behavior_cloning_coefficient: float = number(0.1, 0.0)
-    """Weight of the cloning loss of PPO+BC."""
     sil_coefficient: float = number(0.1, 0.0)
-    """Weight of the loss of PPO+SIL."""
     sil_value_coefficient: float = number(0.01, 0.0)
-    """Weight of the value's loss within PPO+SIL's loss."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """The settings that change array shapes, loop counts or the program; hashable."""
+    """The settings that change array shapes, loop counts or the program; hashable.
+
+    Attributes:
+      agent: name of the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil,
+        ppo+gasil-adaptive, ppo+bonus, gail, or MODULE:NAME of your own.
+      total_steps: environment steps per seed, rounded up to whole batches.
+      num_envs: number of environments that each seed steps in parallel.
+      batch_steps: environment steps in an iteration, summed over all environments (the
+        paper's horizon).
+      num_epochs: passes of PPO over a batch.
+      minibatch_size: steps in one gradient step of PPO.
+      hidden_sizes: widths of the tanh layers, in the policy and in the value.
+      bonus: form of the discriminator's reward: softplus (-log D, the paper's), logit,
+        dail or centered.
+      imitation_rule: what the share of imitation in the policy's advantage follows, in
+        the agent ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for
+        neither.
+      discriminator_minibatch_size: steps of the policy, and equally many good steps, in
+        one gradient step of the discriminator.
+      discriminator_hidden_sizes: widths of the discriminator's tanh layers.
+      behavior_cloning_updates: gradient steps on PPO+BC's cloning loss in an iteration.
+      behavior_cloning_minibatch_size: good steps in one gradient step on PPO+BC's
+        cloning loss.
+      sil_updates: gradient steps on PPO+SIL's loss in an iteration.
+      sil_minibatch_size: replayed steps in one gradient step on PPO+SIL's loss.
+      sil_buffer_steps: capacity of PPO+SIL's replay buffer, in steps.
+      discriminator_gradient_penalty: weight of the penalty on the discriminator's
+        gradient with respect to its input, which is pulled to norm 1 between good pairs
+        and the policy's (as in WGAN-GP).
+      discriminator_normalizes_actions: whether the discriminator sees actions in units
+        of the batch's mean and standard deviation; otherwise as they are.
+      buffer_episodes: number of episodes that the good-trajectory buffer keeps at most,
+        beside its capacity in steps; None for any number.
+      buffer_discounts: whether the good-trajectory buffer ranks episodes by their
+        discounted return, as the paper does; otherwise by the undiscounted one.
+      sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
+        return of their episode and s its standard deviation over the buffer; otherwise
+        uniformly.
+      learning_rate_schedule: factor that multiplies the learning rate, over environment
+        steps: STEPS FACTOR pairs, linear between them (from Python also any Optax
+        schedule).
+      clip_epsilon_schedule: factor that multiplies PPO's clip range, given in the same
+        way.
+      alpha_schedule: factor that multiplies alpha, given in the same way. The paper's
+        rule for Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is 2e6 0
+        3e6 1 on the command line and ((2e6, 0), (3e6, 1)) in Python.
+      normalize_rewards: whether to divide PPO's rewards by the standard deviation of
+        their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
+        that unit, not in the environment's. It has no effect on the agents gasil and
+        gail, which do not use the environment's reward.
+      decompose_rewards: whether PPO sees, instead of a reward that arrives late, a
+        reward for each step that a network learns from the sums that are paid (see
+        reward_decomposition).
+      decomposition_updates: gradient steps in an iteration of the network that
+        decomposes rewards.
+      decomposition_minibatch_size: windows between two payouts in one gradient step of
+        the network that decomposes rewards.
+      decomposition_window_steps: steps of each window in one gradient step of the
+        network that decomposes rewards: all steps of a window that has no more,
+        otherwise this many, drawn at random.
+      decomposition_history_episodes: length of the history that windows are drawn from,
+        in episodes of the largest length; a batch comes on top. If rewards come only at
+        the end of an episode, 1 leaves few windows.
+      decomposition_hidden_sizes: widths of the tanh layers of the network that
+        decomposes rewards.
+      stagger_episodes: whether each environment's first episode begins at a random age,
+        so that a batch holds steps from all parts of an episode. Otherwise all begin at
+        age 0, and where episodes never end early a batch is one thin slice of them.
+      expert: expert that GAIL imitates: an .npz file with arrays "observation" and
+        "action", or minari:NAME for a Minari data set.
+      max_episode_steps: number of steps after which an episode is truncated; None takes
+        the environment's own limit, or 1000 if it has none.
+      hyperparameters: numbers that `make_train` also takes as traced arguments. They do
+        not change the compiled program, except for buffer_steps and
+        discriminator_updates.
+    """
 
     agent: str = "ppo+gasil"
-    """Name of the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
-    ppo+bonus, gail, or MODULE:NAME of your own."""
     total_steps: int = _count(1_000_000)
-    """Environment steps per seed, rounded up to whole batches."""
     num_envs: int = _count(16)
-    """Number of environments that each seed steps in parallel."""
     batch_steps: int = _count(2048)
-    """Environment steps in an iteration, summed over all environments (the paper's
-    horizon)."""
     num_epochs: int = _count(10)
-    """Passes of PPO over a batch."""
     minibatch_size: int = _count(64)
-    """Steps in one gradient step of PPO."""
     hidden_sizes: tuple[int, ...] = _count((64, 64))
-    """Widths of the tanh layers, in the policy and in the value."""
     bonus: str = "softplus"
-    """Form of the discriminator's reward: softplus (-log D, the paper's), logit, dail
-    or centered."""
     imitation_rule: str = "both"
-    """What the share of imitation in the policy's advantage follows, in the agent
-    ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for neither."""
     discriminator_minibatch_size: int = _count(128)
-    """Steps of the policy, and equally many good steps, in one gradient step of the
-    discriminator."""
     discriminator_hidden_sizes: tuple[int, ...] = _count((100, 100))
-    """Widths of the discriminator's tanh layers."""
     behavior_cloning_updates: int = _count(10)
-    """Gradient steps on PPO+BC's cloning loss in an iteration."""
     behavior_cloning_minibatch_size: int = _count(64)
-    """Good steps in one gradient step on PPO+BC's cloning loss."""
     sil_updates: int = _count(10)
-    """Gradient steps on PPO+SIL's loss in an iteration."""
     sil_minibatch_size: int = _count(512)
-    """Replayed steps in one gradient step on PPO+SIL's loss."""
     sil_buffer_steps: int = _count(50_000)
-    """Capacity of PPO+SIL's replay buffer, in steps."""
     discriminator_gradient_penalty: float = number(0.0, 0.0)
-    """Weight of the penalty on the discriminator's gradient with respect to its input,
-    which is pulled to norm 1 between good pairs and the policy's (as in WGAN-GP)."""
     discriminator_normalizes_actions: bool = False
-    """Whether the discriminator sees actions in units of the batch's mean and standard
-    deviation; otherwise as they are."""
     buffer_episodes: int | None = _count(None)
-    """Number of episodes that the good-trajectory buffer keeps at most, beside its
-    capacity in steps; None for any number."""
     buffer_discounts: bool = True
-    """Whether the good-trajectory buffer ranks episodes by their discounted return, as
-    the paper does; otherwise by the undiscounted one."""
     sample_by_return: bool = False
-    """Whether good steps are drawn with weights exp(R / s), with R the return of their
-    episode and s its standard deviation over the buffer; otherwise uniformly."""
     learning_rate_schedule: Schedule = ()
-    """Factor that multiplies the learning rate, over environment steps: STEPS FACTOR
-    pairs, linear between them (from Python also any Optax schedule)."""
     clip_epsilon_schedule: Schedule = ()
-    """Factor that multiplies PPO's clip range, given in the same way."""
     alpha_schedule: Schedule = ()
-    """Factor that multiplies alpha, given in the same way. The paper's rule for
-    Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is 2e6 0 3e6 1 on the
-    command line and ((2e6, 0), (3e6, 1)) in Python."""
     normalize_rewards: bool = False
-    """Whether to divide PPO's rewards by the standard deviation of their running
-    discounted sum (as in OpenAI baselines' ppo2). Alpha is then in that unit, not in
-    the environment's. It has no effect on the agents gasil and gail, which do not use
-    the environment's reward."""
     decompose_rewards: bool = False
-    """Whether PPO sees, instead of a reward that arrives late, a reward for each step
-    that a network learns from the sums that are paid (see reward_decomposition)."""
     decomposition_updates: int = _count(20)
-    """Gradient steps in an iteration of the network that decomposes rewards."""
     decomposition_minibatch_size: int = _count(64)
-    """Windows between two payouts in one gradient step of the network that decomposes
-    rewards."""
     decomposition_window_steps: int = _count(32)
-    """Steps of each window in one gradient step of the network that decomposes rewards:
-    all steps of a window that has no more, otherwise this many, drawn at random."""
     decomposition_history_episodes: int = _count(1)
-    """Length of the history that windows are drawn from, in episodes of the largest
-    length; a batch comes on top. If rewards come only at the end of an episode, 1
-    leaves few windows."""
     decomposition_hidden_sizes: tuple[int, ...] = _count((100, 100))
-    """Widths of the tanh layers of the network that decomposes rewards."""
     stagger_episodes: bool = True
-    """Whether each environment's first episode begins at a random age, so that a batch
-    holds steps from all parts of an episode. Otherwise all begin at age 0, and where
-    episodes never end early a batch is one thin slice of them."""
     expert: str | None = None
-    """Expert that GAIL imitates: an .npz file with arrays "observation" and "action",
-    or minari:NAME for a Minari data set."""
     max_episode_steps: int | None = _count(None)
-    """Number of steps after which an episode is truncated; None takes the environment's
-    own limit, or 1000 if it has none."""
     hyperparameters: Hyperparameters = dataclasses.field(
         default_factory=Hyperparameters
     )
-    """Numbers that `make_train` also takes as traced arguments. They do not change the
-    compiled program, except for buffer_steps and discriminator_updates."""
 
     def __post_init__(self) -> None:
         """Give the hyperparameters the class that the agent declares."""

@@ -1,8 +1,11 @@
 """The command line: a run from end to end, and refusals before anything compiles."""
 
 import csv
+import dataclasses
+import itertools
 import json
 import math
+import re
 import resource
 import subprocess
 import sys
@@ -64,6 +67,25 @@ def finished(tmp_path_factory):
     result = run(*SMALL, "--out", "out", cwd=folder)
     assert result.returncode == 0, result.stderr
     return result, folder / "out"
+
+
+def test_the_help_explains_every_option_in_whole_lines(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    # There may be a frame.
+    lines = [line.replace("│", " ").rstrip() for line in shown.splitlines()]
+    is_text = lambda line: line.startswith(" " * 7)
+    for line, following in itertools.pairwise(lines):
+        if re.match(" +--[a-z]", line):
+            assert is_text(following), line
+        elif is_text(line) and is_text(following):
+            # The next word did not fit into 80 columns, two of them blank.
+            assert len(line) + 1 + len(following.split()[0]) > 78, line
+    for field in dataclasses.fields(gasil_jax.Config):
+        if field.name != "hyperparameters":
+            assert f" --{field.name.replace('_', '-')}" in "\n".join(lines)
 
 
 def test_a_run_from_end_to_end(finished):
