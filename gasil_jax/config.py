@@ -332,10 +332,12 @@ def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
       agent: the agent's name, see `registry.find`.
 
     Raises:
-      ValueError: if there is no such agent, or if a number of its own is not declared
-        with `number` or has a name that is taken.
+      ValueError: if there is no such agent, if a number of its own is not declared
+        with `number` or has a name that is taken, or if it says that it uses a field
+        that does not exist.
     """
-    kind = registry.find(agent).hyperparameters
+    imitation = registry.find(agent)
+    kind = imitation.hyperparameters
     if not (isinstance(kind, type) and issubclass(kind, Hyperparameters)):
         raise ValueError(
             f"agent {agent!r} has hyperparameters {kind!r}: they must be a class that "
@@ -354,6 +356,12 @@ def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
                     f"agent {agent!r} has a hyperparameter {name!r} without a range: "
                     "it must be declared with gasil_jax.config.number"
                 )
+    for name in imitation.fields or ():
+        if name not in (*_names(Config), *_names(kind)):
+            raise ValueError(
+                f"agent {agent!r} says that it uses {name!r}: it must be the name of a "
+                "field of Config or of the agent's hyperparameters"
+            )
     return kind
 
 

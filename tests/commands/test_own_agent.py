@@ -67,6 +67,7 @@ TAKEN = OWN._replace(hyperparameters=Taken)
 COLUMN = OWN._replace(hyperparameters=Column)
 AN_OPTION = OWN._replace(hyperparameters=AnOption)
 BARE = OWN._replace(hyperparameters=Bare)
+MISSPELT = OWN._replace(fields=("alhpa",))
 MANY = OWN._replace(update_and_reward=rewards)
 UNFINISHED = OWN._replace(update_and_reward=unfinished)
 GROWS = OWN._replace(init=start, update_and_reward=grows)
@@ -132,6 +133,7 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:AN_OPTION", "'seeds', a name that is taken by an option"),
         ("my_agents:COLUMN", "'diverged', a name that is taken"),
         ("my_agents:BARE", "'bare' without a range: .* gasil_jax.config.number"),
+        ("my_agents:MISSPELT", "says that it uses 'alhpa': it must be the name"),
         ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
         ("my_agents:MANY", "'my_rewards' .* has shape .*: it must be one number"),
         (
