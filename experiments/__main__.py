@@ -176,12 +176,17 @@ class CoverageOptions:
     """Print how much of the plan of all agents and tasks is stored.
 
     The exit status is 1 while runs are missing.
+
+    Attributes:
+      results: folder of the results that are counted.
     """
+
+    results: _Results = RESULTS
 
 
 def _coverage(options: CoverageOptions) -> int:
     curves = [curve for *_, curve in FIGURES["matrix"].curves()]
-    rows = coverage(Store(RESULTS / "runs"), curves)
+    rows = coverage(Store(options.results / "runs"), curves)
     print("task               agent                   search    seeds")
     for x in rows:
         task = f"{name_of(x.search.env, x.search.reward_delay):18} {x.name:20}"

@@ -134,7 +134,7 @@ def test_what_matters_is_told(tmp_path):
     assert "| 100% |" in row
 
 
-def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
+def test_holes_of_the_plan_are_told(tmp_path, capsys):
     store, one = Store(tmp_path / "runs"), Search("hopper", "ppo", 20)
     drawn = one.points(store)
     fill(store, one, drawn, range(len(drawn)))
@@ -146,8 +146,7 @@ def test_holes_of_the_plan_are_told(tmp_path, monkeypatch, capsys):
     assert mine.searched == 2 * len(drawn) < mine.to_search
     assert (mine.trained, mine.to_train) == (0, 20) and not mine.complete
     assert (other.searched, other.to_train) == (0, 10)
-    monkeypatch.setattr(__main__, "RESULTS", tmp_path)
-    assert __main__.main(["coverage"]) == 1
+    assert __main__.main(["coverage", "--results", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     line = next(x for x in printed.splitlines() if x.startswith("hopper-delayed"))
     words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 20"
