@@ -288,18 +288,28 @@ def test_every_arm_has_a_color(page, tmp_path, count):
     assert len(set(colors)) == len(colors) == count + 1
 
 
+@pytest.fixture(scope="module")
+def published():
+    """The summary of the stored runs, whose pages compare them once."""
+    return summary.Summary(STORE)
+
+
+@pytest.fixture(scope="module")
+def nothing_measured(tmp_path_factory):
+    return summary.Summary(Store(tmp_path_factory.mktemp("empty")))
+
+
 @pytest.mark.parametrize("name", FIGURES)
-def test_a_published_page_is_what_the_stored_runs_say(name):
-    assert (RESULTS / f"{name}.md").read_text() == Page(name, STORE).text()
+def test_a_published_page_is_what_the_stored_runs_say(name, published):
+    assert (RESULTS / f"{name}.md").read_text() == published.pages[name].text()
 
 
-def test_the_summary_and_the_readme_are_what_the_stored_runs_say():
-    made = summary.Summary(STORE)
-    assert (RESULTS / "README.md").read_text() == made.text()
+def test_the_summary_and_the_readme_are_what_the_stored_runs_say(published):
+    assert (RESULTS / "README.md").read_text() == published.text()
     text = summary.README.read_text()
-    assert report.fill_blocks(text, made.value) == text
+    assert report.fill_blocks(text, published.value) == text
     assert text.count("<!-- begin ") == text.count("<!-- end -->") > 0
-    assert presets.TUNED.read_text() == made.tuned()
+    assert presets.TUNED.read_text() == published.tuned()
 
 
 def test_seeds_in_words():
@@ -307,8 +317,8 @@ def test_seeds_in_words():
     assert report._ranges([3]) == "3"
 
 
-def test_a_block_is_made_anew(tmp_path):
-    made = summary.Summary(Store(tmp_path))
+def test_a_block_is_made_anew(nothing_measured):
+    made = nothing_measured
     text = "before\n<!-- begin claims -->\nold\n<!-- end -->\nafter"
     filled = report.fill_blocks(text, made.value)
     assert filled == text.replace("old\n", f"\n{made.claims()}\n\n")
@@ -333,14 +343,17 @@ def test_a_block_is_made_anew(tmp_path):
         ),
     ],
 )
-def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words, tmp_path):
-    made = summary.Summary(Store(tmp_path))
+def test_a_claim_is_only_judged_when_its_cases_decide(
+    verdicts, words, nothing_measured, monkeypatch
+):
+    made = nothing_measured
     keys = [("panel", "ppo+gasil", f"other {i}") for i in range(3)]
     of = {"better": (1.0, 0.0), "worse": (-1.0, 0.0), "not clear": (1.0, 1.0)}
-    made.pages["matrix"].comparisons = {
+    results = {
         key: comparisons.Comparison(of[verdict][0], 0.0, 0.0, of[verdict][1])
         for key, verdict in zip(keys, verdicts, strict=False)
     }
+    monkeypatch.setattr(made.pages["matrix"], "comparisons", results)
     cases = {f"{i}": [(key, "better")] for i, key in enumerate(keys)}
     claim = summary.Claim("It is ahead on most", "matrix", cases, needed=2)
     assert made.verdict(claim) == words
