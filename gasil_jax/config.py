@@ -6,6 +6,7 @@ on which the paper's code was built. Each field is declared with its allowed ran
 
 import contextlib
 import dataclasses
+import functools
 import inspect
 import math
 import numbers
@@ -320,6 +321,7 @@ _COLUMNS = frozenset(
 )
 
 
+@functools.cache
 def _names(kind: type) -> tuple[str, ...]:
     """Return the names of a dataclass' fields."""
     return tuple(field.name for field in dataclasses.fields(kind))
