@@ -6,7 +6,6 @@ on which the paper's code was built. Each field is declared with its allowed ran
 
 import contextlib
 import dataclasses
-import functools
 import inspect
 import math
 import numbers
@@ -321,7 +320,6 @@ _COLUMNS = frozenset(
 )
 
 
-@functools.cache
 def _names(kind: type) -> tuple[str, ...]:
     """Return the names of a dataclass' fields."""
     return tuple(field.name for field in dataclasses.fields(kind))
@@ -359,7 +357,7 @@ def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
                     "it must be declared with gasil_jax.config.number"
                 )
     for name in imitation.fields or ():
-        if name not in (*_names(Config), *_names(kind)):
+        if not hasattr(kind, name) and not hasattr(Config, name):
             raise ValueError(
                 f"agent {agent!r} says that it uses {name!r}: it must be the name of a "
                 "field of Config or of the agent's hyperparameters"

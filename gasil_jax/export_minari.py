@@ -153,6 +153,8 @@ def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
         )
         for index, episode in enumerate(complete)
     ]
+    # Another export may have taken the name since.
+    check_name(name)
     try:
         with warnings.catch_warnings():
             # Minari warns that the author and the environment are missing.

@@ -91,10 +91,11 @@ def episode(
     states, total = [jax.device_get(state.pipeline_state)], 0.0
     for step_key in jax.random.split(key, num_steps):
         state = step(state, step_key)
-        if not wrappers.is_sound(state.obs).all():
+        reward = state.info.get("true_reward", state.reward)
+        if not (wrappers.is_sound(state.obs).all() and wrappers.is_sound(reward)):
             break
         states.append(jax.device_get(state.pipeline_state))
-        total += float(state.info.get("true_reward", state.reward))
+        total += float(reward)
         if state.done > 0 or wrappers.truncated(state):
             break
     return states, total

@@ -232,6 +232,8 @@ def _refuse_other_sweep(
 ) -> None:
     """Raise `InputError` if another shard beside this one is of another sweep."""
     now = {**vars(options), "points": tuple(points)}
+    with command_line.input_checked():
+        now |= run_folder.expert_hash(options.config)
     for path in sorted(shard_folder.parent.glob("*-of-*")):
         if path != shard_folder and run_folder.is_described(path):
             # A shard may have been continued to more total_steps than this one yet.

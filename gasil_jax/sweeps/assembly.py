@@ -158,7 +158,9 @@ def train(
                     raise Interrupted(interruption.signal)
                 job.folder.mkdir(parents=True, exist_ok=True)
                 with progress.aside("starting the trackers"):
-                    described = run_folder.flat(vars(options))
+                    # A program of a sweep may have other values than the base.
+                    own = dataclasses.replace(options, config=job.program.config)
+                    described = run_folder.flat(vars(own))
                     following = trackers.make(options.log, job.folder, described)
                 members = make_members(
                     env,

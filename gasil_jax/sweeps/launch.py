@@ -134,6 +134,7 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
       jobs: the arguments of each job, by the job's name in messages. Folders in the
         arguments must be the same on every node.
       devices: number of CPU devices of a job and of CPUs that it reserves; default 1.
+        Where the cluster has GPUs, a job reserves one of them and one CPU instead.
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
@@ -152,7 +153,8 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if not any(node.get("CPU", 0) >= needs["num_cpus"] for node in nodes):
             raise InputError(
-                f"devices is {devices}: no node of the cluster has so many CPUs"
+                f"launcher is 'ray': no node of the cluster has {needs['num_cpus']} "
+                "CPUs, which each job reserves"
             )
         # JAX sets up its devices once per process, so each job needs its own. The
         # process ends with the job, so that the folder is free when the job runs again.

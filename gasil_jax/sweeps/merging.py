@@ -27,7 +27,7 @@ def refuse_different(
     first: tuple[pathlib.Path, Mapping[str, Any]],
     other: tuple[pathlib.Path, Mapping[str, Any]],
 ) -> None:
-    """Raise `InputError` if two shards are not of the same sweep.
+    """Raise `InputError` if two shards are not of the same sweep and the same expert.
 
     Args:
       first: folder of a shard and the content of its config.json.
@@ -41,6 +41,7 @@ def refuse_different(
         raise InputError(
             f"{other[0]} is of another sweep than {first[0]}: {'; '.join(changed)}"
         )
+    run_folder.refuse_other_expert(first[1], run_folder.flat(other[1]), first[0])
 
 
 def _read(folder: pathlib.Path) -> dict[str, Any]:
@@ -87,7 +88,8 @@ def _refuse_used(
         # The shards may have been continued to more total_steps since.
         if run_folder.differences(_comparable(earlier), _comparable(shard[1])):
             refuse_different((out, earlier), shard)
-        used = (out / "programs").is_dir()
+        # A single run has no points, and a sweep that was not merged has programs.
+        used = "points" not in earlier or (out / "programs").is_dir()
     else:
         used = any(path.name not in ("shards", ".lock") for path in out.iterdir())
     if used:

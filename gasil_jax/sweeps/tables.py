@@ -345,7 +345,8 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
         best = summary[title]
         if best is None:
             lines.append(
-                f"{title}: none, every point has a seed that diverged or never ended"
+                f"{title}: none, because every point has a seed that diverged or in "
+                "which no episode ended"
             )
             continue
         scores = summary["points"][best]
@@ -359,7 +360,8 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
 
 
 def _label(point: Point) -> str:
-    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+    changes = ", ".join(f"{name}={value:g}" for name, value in point.items())
+    return changes or "the sweep's own values"
 
 
 def _plot(
@@ -391,11 +393,11 @@ def _plot(
         color = "#D55E00" if row == best else "#0072B2"
         axes.plot(final[row].mean(), row, "|", color=color, markersize=14, mew=2)
     short = [{x: point[x] for x in point if x in varied} for point in points]
-    labels = [_label(point) or "the sweep's own values" for point in short]
+    labels = [_label(point) for point in short]
     axes.set_yticks(range(len(points)), labels, fontsize=8)
     if best is not None:
         axes.get_yticklabels()[best].set(color="#D55E00", weight="bold")
-    axes.set(xlabel=f"final return: {final.shape[1]} seeds, the bar is their mean")
+    axes.set(xlabel="final return of each seed; the bar is their mean")
     axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
     axes.invert_yaxis()
     figure.savefig(path, dpi=150)

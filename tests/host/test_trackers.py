@@ -7,7 +7,8 @@ import time
 import numpy as np
 import pytest
 
-from gasil_jax import run
+from gasil_jax import run, sweep
+from gasil_jax.errors import InputError
 from gasil_jax.host import progress, run_options, trackers
 from gasil_jax.sweeps import assembly
 
@@ -134,6 +135,19 @@ def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
     assert run.main([*SMALL, "--log", "wandb", *out]) == 2
     *_, message = capsys.readouterr().err.splitlines()
     assert "error: log is 'wandb', which can't start: No API key configured." in message
+
+
+def test_a_program_of_a_sweep_is_told_with_its_own_values(tmp_path, monkeypatch):
+    told = []
+
+    def make(names, folder, config):
+        told.append(config["num_epochs"])
+        raise InputError("enough")
+
+    monkeypatch.setattr(trackers, "make", make)
+    arguments = [*SMALL, "--grid", "num_epochs=2,3", "--out", str(tmp_path / "out")]
+    assert sweep.main(arguments) == 2
+    assert told == [2]
 
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):

@@ -1,5 +1,6 @@
 """Shards of a sweep hold each member once, and merge into the same tables."""
 
+import dataclasses
 import json
 import shutil
 import signal
@@ -190,7 +191,22 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "results.csv").touch()
     assert "holds something else" in refused(out, "--out", tmp_path / "thesis")
+    described = json.loads((first.folder / "config.json").read_text())
+    alone = {field.name for field in dataclasses.fields(run_options.Options)}
+    of_a_run = {name: x for name, x in described.items() if name in alone}
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "config.json").write_text(json.dumps(of_a_run))
+    assert "holds something else" in refused(out, "--out", tmp_path / "run")
     assert not (out / "results.csv").exists()
+    # On each host the expert's file may be another one.
+    kept = (second / "config.json").read_text()
+    for folder, digest in ((first.folder, "a"), (second, "b")):
+        content = json.loads((folder / "config.json").read_text())
+        content[run_folder.EXPERT_HASH] = digest
+        (folder / "config.json").write_text(json.dumps(content))
+    assert "whose trajectories are not those" in refused(out)
+    (first.folder / "config.json").write_text(json.dumps(described))
+    (second / "config.json").write_text(kept)
     assert merge.main([str(out)]) == 0
     train(out, "1/2")
     assert "shards of 2 and of 3" in refused(out)
