@@ -22,8 +22,8 @@ from matplotlib.figure import Figure
 import gasil_jax
 from experiments import plots
 from experiments.store import RESULTS
+from gasil_envs import pictures
 from gasil_jax import normalization, policy
-from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, output_file
 from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
@@ -126,7 +126,7 @@ def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> 
     """Draw an agent's policy, its buffer and, if it has one, its discriminator."""
     for panel in panels:
         none = np.zeros(len(env.unwrapped.objects), bool)
-        plotting.point_mass_layout(panel, env.unwrapped.layout, none)
+        pictures.point_mass_layout(panel, env.unwrapped.layout, none)
         panel.set(xticks=[], yticks=[])
     for path in policy_paths(env, state, jax.random.key(1)):
         panels[0].plot(*path.T, color="0.2", linewidth=0.7, alpha=0.6)
@@ -150,7 +150,7 @@ def run(options: Options) -> None:
     layout = env.unwrapped.layout
     figure = Figure(figsize=(4.0, 4.0), layout="constrained")
     axes = figure.subplots()
-    plotting.point_mass_layout(axes, layout, np.zeros(len(env.unwrapped.objects), bool))
+    pictures.point_mass_layout(axes, layout, np.zeros(len(env.unwrapped.objects), bool))
     x, y = layout.start
     axes.text(x, y, "start", ha="center", va="center", fontsize=9)
     plots.save_png(figure, options.out / "point_mass_layout.png", dpi=100)

@@ -150,7 +150,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     if options.out is not None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")
-    with announced("evaluate", f"scoring {len(seeds)} policies"):
+    with announced("evaluate", f"scoring policies: {len(seeds)}"):
         score = _score_in_gymnasium if options.gymnasium else _score
         scores = score(options, policies)
     print("seed  episodes      return        std  length")

@@ -101,8 +101,12 @@ def episode(
     return states, total
 
 
+#: About the largest number of frames/s of a film; states in between are left out.
+_FRAMES_PER_SECOND = 25.0
+
+
 def frames_of(
-    env: Any, states: Sequence[Any], size: tuple[int, int], fps: float = 25.0
+    env: Any, states: Sequence[Any], size: tuple[int, int]
 ) -> tuple[list[np.ndarray], float]:
     """Return pictures (height, width, 3) uint8 of physics states, and frames/s.
 
@@ -110,13 +114,12 @@ def frames_of(
       env: the environment.
       states: its physics states from an episode's start on.
       size: width and height of a picture in pixels.
-      fps: largest number of frames/s, about; states in between are left out.
 
     Raises:
       NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
     """
     with contextlib.closing(pictures.painter(env, size)) as painter:
-        every = max(1, round(1.0 / (fps * painter.seconds_per_step)))
+        every = max(1, round(1.0 / (_FRAMES_PER_SECOND * painter.seconds_per_step)))
         counts = range(1, len(states) + 1, every)
         frames = [painter.draw(states[:count]) for count in counts]
     return frames, 1.0 / (every * painter.seconds_per_step)

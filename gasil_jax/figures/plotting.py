@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from gasil_envs.pictures import point_mass_layout as point_mass_layout
 from gasil_jax.figures.statistics import (
     are_numbers,
     bootstrap_interval,

@@ -267,6 +267,11 @@ def check_seeds(seeds: int, first_seed: int) -> None:
         raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
 
 
+def seeds_of(described: Mapping[str, Any]) -> range:
+    """Return the absolute numbers of a run's or sweep's seeds, from its config.json."""
+    return range(described["first_seed"], described["first_seed"] + described["seeds"])
+
+
 #: The field of config.json and fit.json that holds what `expert_hash` returns.
 EXPERT_HASH = "expert_sha256"
 #: Options that may differ between a run and its continuation.

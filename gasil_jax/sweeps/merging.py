@@ -110,7 +110,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
     every = _read_all(folders)
     described = next(iter(every.values()))
     points = described["points"]
-    seeds = range(described["first_seed"], described["first_seed"] + described["seeds"])
+    seeds = run_folder.seeds_of(described)
     parts = [tables.Trained.described(*shard) for shard in every.items()]
     unfinished = [
         content["shard"]

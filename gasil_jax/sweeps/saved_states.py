@@ -70,8 +70,7 @@ def find(
         return _of_sweep(folder, described, _checked(folder, described, point))
     if point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    config, first = described["config"], described["first_seed"]
-    seeds = range(first, first + described["seeds"])
+    config, seeds = described["config"], run_folder.seeds_of(described)
     # A run is a sweep of one point, in one program.
     (program,) = shards.programs(config, [{}], seeds)
     return Saved(folder / "checkpoints", program, range(len(seeds)))

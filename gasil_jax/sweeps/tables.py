@@ -18,7 +18,7 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import importance
-from gasil_jax.host import json_reader, metrics_files, output_file
+from gasil_jax.host import json_reader, metrics_files, output_file, run_folder
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point, check_saved
 from gasil_jax.sweeps.shards import Program
@@ -95,8 +95,7 @@ class Trained:
           InputError: if its points can't be trained.
         """
         check_saved(content["points"], content["config"], folder / "config.json")
-        first = content["first_seed"]
-        seeds = range(first, first + content["seeds"])
+        seeds = run_folder.seeds_of(content)
         programs = shards.programs(
             content["config"], content["points"], seeds, content["share_counts"]
         )
