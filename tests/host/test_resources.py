@@ -11,11 +11,13 @@ from gasil_jax.host import resources
 from gasil_jax.host.members import make_members
 
 
-@pytest.mark.compiled_as_for_users
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
-        ("ppo+gasil", {"num_envs": 64, "batch_steps": 8192}),
+        pytest.param(
+            *("ppo+gasil", {"num_envs": 64, "batch_steps": 8192}),
+            marks=pytest.mark.compiled_as_for_users,
+        ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
     ],
 )
