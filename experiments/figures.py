@@ -74,7 +74,7 @@ class Curve:
         return None
 
     def point(self, searched: Store) -> Point | None:
-        """Return what differs from the appendix's or the preset's values.
+        """Return what differs from the default or the preset's values.
 
         It is None if the curve's search is not complete in the store `searched`.
         """

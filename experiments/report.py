@@ -406,7 +406,7 @@ class Page:
         return markdown_table(columns, rows)
 
     def settings(self) -> str:
-        """Return what each curve was trained with, beyond the appendix's values."""
+        """Return what each curve was trained with, beyond the default values."""
         rows = []
         for names, results in self.results.items():
             config = next(iter(results.records)).config

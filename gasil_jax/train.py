@@ -210,7 +210,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     )
     # Update the good trajectory buffer.
     history, buffer = remember(config, state, batch, hyperparameters)
-    # The buffer ranks and keeps the environment's own rewards; PPO maximizes these.
+    # The buffer ranks episodes by the environment's own rewards. The agent makes what
+    # PPO maximizes from these, which may be decomposed and normalized.
     rewards, reward_metrics = learner_rewards(
         env,
         config,
