@@ -312,7 +312,7 @@ def tell_if_untuned(options: Options) -> None:
 
 def seeds_of(options: Options) -> range:
     """Return the seeds' absolute numbers; every point of a sweep has the same ones."""
-    return range(options.first_seed, options.first_seed + options.seeds)
+    return run_folder.seeds_of(vars(options))
 
 
 def evaluation_schedule(options: Options) -> EvaluationSchedule | None:

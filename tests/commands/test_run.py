@@ -85,7 +85,7 @@ def test_the_help_explains_every_option_in_whole_lines(monkeypatch, capsys):
             assert len(line) + 1 + len(following.split()[0]) > 78, line
     for field in dataclasses.fields(gasil_jax.Config):
         if field.name != "hyperparameters":
-            assert f" --{field.name.replace('_', '-')}" in "\n".join(lines)
+            assert f" --{field.name.replace('_', '-')}" in shown
 
 
 def test_a_run_from_end_to_end(finished):
