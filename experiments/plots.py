@@ -1,9 +1,10 @@
 """Plots of figures: learning curves, or final returns over a setting."""
 
 import io
+import itertools
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -77,8 +78,16 @@ def _colors(figure: Figure) -> dict[str, Any]:
     if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
         shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
         return dict(zip(names, shades, strict=True))
+    return _with_free_colors(names)
+
+
+def _with_free_colors(names: Iterable[str]) -> dict[str, Any]:
+    """Return each agent's own color, and for other names the colors that are left."""
+    names = list(names)
     color_of = {name: _COLOR_OF[name] for name in names if name in _COLOR_OF}
-    free = (x for x in plotting.COLORS if x not in color_of.values())
+    free = itertools.cycle(
+        [x for x in plotting.COLORS if x not in color_of.values()] or ["gray"]
+    )
     return {name: color_of.get(name) or next(free) for name in names}
 
 
@@ -107,6 +116,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> Non
 def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
     """Draw final returns over a setting: a line for the curves that differ in it."""
     curves = figure.panels[panel]
+    color_of = _with_free_colors({curve.agent: None for *_, curve in figure.curves()})
     lines: dict[str, dict[Any, str]] = {}
     for name in curves:
         line, value = figure.point_of(panel, name)
@@ -128,7 +138,7 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
             np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
             middle,
             [middle - low, high - middle],
-            color=_COLOR_OF[agent],
+            color=color_of[agent],
             linestyle=style,
             **{"marker": "o", "markersize": 3, "capsize": 2},
             label=line,

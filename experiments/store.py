@@ -94,8 +94,9 @@ class Record:
 
     Attributes:
       env_steps: environment steps at the end of each part.
-      episode_return: mean return of the episodes that ended in the part; NaN if none.
-      episode_length: mean length of these episodes; NaN if it was not recorded.
+      episode_return: mean, over the part's iterations, of the mean return of the
+        episodes that ended in the iteration; NaN if none did in any.
+      episode_length: the same of their lengths; NaN if it was not recorded.
       provenance: physics, device, versions, the commit of the code, and whether the
         checkout was clean.
       evaluation_steps: environment steps before each evaluation, (evaluations,).

@@ -179,7 +179,7 @@ def ended_episodes(
     Args:
       history: the history after `record` of that batch.
       ended: bool (time, N), whether the episode ended with this step.
-      return_: float32 (time, N), the episode's discounted return up to this step.
+      return_: float32 (time, N), the episode's return up to this step, as it is ranked.
       length: int32 (time, N), the episode's number of steps up to this one.
     """
     chex.assert_equal_shape([ended, return_, length])

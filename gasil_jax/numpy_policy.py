@@ -66,8 +66,8 @@ def about(name: str) -> dict[str, Any]:
       name: one of `zoo()`, as "zoo:NAME".
 
     Returns:
-      "env", "reward_delay", "agent", "seed" and "env_steps" of its training; "mean",
-      "deviation" and "episodes" of its returns in Gymnasium.
+      "env", "reward_delay", "agent", "decompose_rewards", "seed" and "env_steps" of its
+      training; "mean", "deviation" and "episodes" of its returns in Gymnasium.
 
     Raises:
       ValueError: if there is no such policy.
@@ -78,6 +78,23 @@ def about(name: str) -> dict[str, Any]:
             f"{', '.join(zoo())}"
         )
     return json.loads(str(npz.read(_file(name))["about"]))
+
+
+def _check(arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise `ValueError` unless these can be the arrays of a saved policy."""
+    kernels = sum(name.startswith("kernel_") for name in arrays)
+    biases = (f"bias_{i}" for i in range(kernels))
+    if missing := [name for name in (*_REQUIRED, *biases) if name not in arrays]:
+        raise ValueError(f"{missing[0]} is missing")
+    count = arrays["seeds"].size
+    for name, value in arrays.items():
+        if name == "about":
+            continue
+        if value.dtype.kind not in "iuf":
+            raise ValueError(f"{name} holds no numbers")
+        per_seed = name not in ("low", "high")
+        if value.ndim == 0 or (per_seed and value.shape[0] != count) or not count:
+            raise ValueError(f"{name} has the shape {value.shape} for {count} seeds")
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
@@ -98,8 +115,7 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
         )
     try:
         arrays = npz.read(path)
-        if missing := [name for name in _REQUIRED if name not in arrays]:
-            raise ValueError(f"{missing[0]} is missing")
+        _check(arrays)
     except ValueError as error:
         raise ValueError(f"{path} is not a saved policy ({error})") from None
     seeds = arrays.pop("seeds").tolist()

@@ -190,7 +190,7 @@ def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
 def goodness_of_fit(
     predicted: jax.Array, actual: jax.Array, valid: jax.Array
 ) -> Metrics:
-    """Return how well windows are explained; NaN where there are fewer than two.
+    """Return how well windows are explained.
 
     Args:
       predicted: float32 (T, N), mean of the network's rewards over a window.
@@ -198,15 +198,18 @@ def goodness_of_fit(
       valid: bool (T, N), where a window counts.
 
     Returns:
-      "decomposition_fit", the share of the variance that is explained (R2), and
+      "decomposition_fit", the share of the variance that is explained (R2), NaN if
+      fewer than two windows count or all of them pay the same, and
       "decomposition_error", the root of the mean squared error of a step, both ().
     """
     count = jnp.sum(valid)
     mean = lambda x: jnp.sum(jnp.where(valid, x, 0.0)) / count
     error = mean((predicted - actual) ** 2)
     variance = mean((actual - mean(actual)) ** 2)
+    # Less is the rounding of equal payouts.
+    varies = (count > 1) & (variance > 1e-10 * mean(actual**2))
     return {
-        "decomposition_fit": jnp.where(count > 1, 1.0 - error / variance, jnp.nan),
+        "decomposition_fit": jnp.where(varies, 1.0 - error / variance, jnp.nan),
         "decomposition_error": jnp.sqrt(error),
     }
 

@@ -15,6 +15,9 @@ from flax import struct
 
 from gasil_jax import normalization
 
+# Normalized rewards are clipped to plus and minus this number.
+_CLIP = 10.0
+
 
 class RewardNormalizer(struct.PyTreeNode):
     """The running sums and their moments, from which the scale is computed.
@@ -67,8 +70,6 @@ def scale(normalizer: RewardNormalizer) -> jax.Array:
     return deviation[0]
 
 
-def normalize(
-    normalizer: RewardNormalizer, reward: jax.Array, clip: float = 10.0
-) -> jax.Array:
-    """Return rewards of any shape divided by `scale` and clipped to +-`clip`."""
-    return jnp.clip(reward / scale(normalizer), -clip, clip)
+def normalize(normalizer: RewardNormalizer, reward: jax.Array) -> jax.Array:
+    """Return rewards of any shape divided by `scale` and clipped to +-10."""
+    return jnp.clip(reward / scale(normalizer), -_CLIP, _CLIP)

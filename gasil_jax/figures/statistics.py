@@ -32,33 +32,26 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
 
 
 def bootstrap_interval(
-    scores: np.ndarray,
-    *,
-    confidence: float = 0.95,
-    resamples: int = 2000,
-    seed: int = 0,
+    scores: np.ndarray, resamples: int = 2000
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the percentile bootstrap interval of the interquartile mean over seeds.
+    """Return the 95% percentile bootstrap interval of the interquartile mean.
 
     Args:
       scores: (seeds, ...). Seeds are drawn with replacement, the same ones for all
         trailing entries; each trailing entry has its own interval.
-      confidence: share of the resampled means inside the interval.
-      resamples: number of resamples.
-      seed: seed of the draws.
+      resamples: number of resamples; their draws are the same in every call.
 
     Returns:
       The low and high ends of the intervals, (...) each.
     """
     count = scores.shape[0]
-    drawn = np.random.default_rng(seed).integers(count, size=(resamples, count))
+    drawn = np.random.default_rng(0).integers(count, size=(resamples, count))
     flat = scores.reshape(count, -1)
     # One column at a time, because all at once need `resamples` times the memory.
     means = np.stack(
         [interquartile_mean(column[drawn], axis=1) for column in flat.T], axis=1
     )
-    tail = 50.0 * (1.0 - confidence)
-    low, high = np.percentile(means, [tail, 100.0 - tail], axis=0)
+    low, high = np.percentile(means, [2.5, 97.5], axis=0)
     return low.reshape(scores.shape[1:]), high.reshape(scores.shape[1:])
 
 

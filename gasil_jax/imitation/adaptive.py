@@ -11,8 +11,9 @@ The weight w is `imitation_weight` times two factors between 0 and 1:
 
 - the agreement max(0, corr(A_r, A_b)) over the batch: imitate as far as what imitation
   favours is also what the reward favours;
-- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean discounted returns of
-  the buffer and of the policy's latest episodes: imitate as far as the past was better.
+- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean returns, discounted as
+  the buffer ranks them, of the buffer and of the policy's latest episodes: imitate as
+  far as the past was better.
 
 `Config.imitation_rule` names the factors that are used. While the buffer is empty, w
 is 0.
@@ -52,8 +53,8 @@ class Adaptive(struct.PyTreeNode):
       discriminator: D.
       bonus_normalizer: normalizes the bonus, so that its value has targets of the same
         scale as that of a normalized reward.
-      policy_return: float32 (), moving mean of the discounted returns of the policy's
-        latest episodes; 0 before the first.
+      policy_return: float32 (), moving mean of the returns of the policy's latest
+        episodes, discounted as the buffer ranks them; 0 before the first.
       has_episodes: bool (), whether there was one.
     """
 
@@ -77,7 +78,7 @@ def _init(
 def follow_return(
     policy_return: jax.Array, has_episodes: jax.Array, batch: Rollout
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of discounted returns with a batch's episodes in it.
+    """Return the moving mean of the policy's returns with a batch's episodes in it.
 
     Args:
       policy_return: float32 (), the mean before the batch.

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import normalization, numpy_policy, policy
+from gasil_jax import normalization, npz, numpy_policy, policy
 from gasil_jax.host import policy_file
 from gasil_jax.networks import Policy
 
@@ -88,6 +88,16 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
     for content in (b"", whole[: len(whole) // 2], b"\x80\x04N."):
         (tmp_path / "policy.npz").write_bytes(content)
         with pytest.raises(ValueError, match="is not a saved policy"):
+            gasil_jax.load_policy(tmp_path)
+    arrays = npz.read(folder / "policy.npz")
+    for changes, reason in (
+        ({"seeds": np.int32(5)}, "seeds has the shape"),
+        ({"log_std": arrays["log_std"][:2]}, "log_std has the shape"),
+        ({"final_return": np.array(["a", "b", "c"])}, "final_return holds no numbers"),
+        ({"kernel_7": arrays["kernel_0"]}, "bias_3 is missing"),
+    ):
+        np.savez(tmp_path / "policy.npz", **{**arrays, **changes})
+        with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
             gasil_jax.load_policy(tmp_path)
 
 

@@ -230,8 +230,13 @@ def test_fit_is_r_squared_of_the_windows_that_count():
     np.testing.assert_allclose(
         metrics["decomposition_error"], np.sqrt(np.mean((p - a) ** 2)), rtol=1e-4
     )
-    none = reward_decomposition.goodness_of_fit(predicted, actual, np.zeros_like(valid))
-    assert np.isnan(none["decomposition_fit"])
+    for paid, counts in (
+        (actual, np.zeros_like(valid)),
+        (np.full_like(actual, -1.3), valid),
+        (np.zeros_like(actual), valid),
+    ):
+        unknown = reward_decomposition.goodness_of_fit(predicted, paid, counts)
+        assert np.isnan(unknown["decomposition_fit"])
 
 
 def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():

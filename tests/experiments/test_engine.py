@@ -14,7 +14,7 @@ import gasil_jax
 from experiments import __main__, engine
 from experiments.engine import Program, Setup
 from experiments.figures import FIGURES, Curve, Figure
-from experiments.store import Run, Store
+from experiments.store import RESULTS, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
@@ -252,7 +252,9 @@ def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
 
 
 def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, capsys):
-    out = ["--runs", f"{tmp_path}", "--list"]
+    # The default folder of results, given as a relative path, is no other folder.
+    results = ["--results", os.path.relpath(RESULTS)]
+    out = ["--runs", f"{tmp_path}", "--list", *results]
     arguments = ["matrix", "--quick", "--only", "hopper-delayed", "hopper-delayed ppo"]
     assert __main__.main([*arguments, *out]) == 0
     assert "matrix: 24 runs are missing" in capsys.readouterr().out
