@@ -49,8 +49,9 @@ class Options:
       list: only print the missing runs.
       only: panels and searches to train; default all. A panel without its searches
         trains only what complete searches chose.
-      part: I/N: train only the I-th of N parts of the runs. Other processes or machines
-        train the others, and `merge` adds another machine's results.
+      shard: train only this part of the runs, NUMBER/COUNT with numbers from 1 on.
+        Other processes or machines train the others, and `merge` adds another
+        machine's results.
       results: folder of the pages and, below runs/, of the stored runs. Runs that are
         stored there are not trained again.
       setup: how runs are trained.
@@ -59,7 +60,7 @@ class Options:
     quick: bool = False
     list: bool = False
     only: tuple[str, ...] = ()
-    part: str = "1/1"
+    shard: str = "1/1"
     results: _Results = RESULTS
     setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=engine.Setup
@@ -114,7 +115,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then write its page."""
     setup, results, figure = options.setup, options.results, FIGURES[name]
-    part = shards.parse(options.part, "part")
+    shard = shards.parse(options.shard)
     command_line.check_least(setup, devices=1, evaluate_episodes=0)
     published = results.resolve() == RESULTS.resolve()
     if options.quick and not published:
@@ -136,7 +137,7 @@ def _train(name: str, options: Options) -> None:
     while True:
         stored, searched = stores()
         requested = chosen.requested(searched)
-        missing = stored.missing(engine.part_of(requested, part))
+        missing = stored.missing(engine.share(requested, shard))
         print(f"{name}: {len(missing)} runs are missing", flush=True)
         if options.list or not missing:
             break

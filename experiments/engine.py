@@ -142,12 +142,12 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     return [Program(ordered(group), setup) for group in groups.values()]
 
 
-def part_of(runs: Iterable[Run], part: shards.Shard) -> list[Run]:
-    """Return the runs of a part, the same on each machine.
+def share(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
+    """Return the runs of a shard, the same on each machine.
 
-    A run's key alone decides, so that no run changes its part when others join.
+    A run's key alone decides, so that no run changes its shard when others join.
     """
-    return [x for x in runs if int(x.key, 16) % part.count == part.number - 1]
+    return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
 
 
 def train(program: Program) -> dict[Run, Record]:

@@ -98,27 +98,18 @@ def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
     environment steps, with evaluations dashed; the middle one final returns, with a dot
     for each seed; the right one the share of seeds above each final return.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     envs = list(dict.fromkeys(run.env for run in runs))
-    figure, grid = plt.subplots(
-        len(envs),
-        3,
-        figsize=(13.0, 0.4 + 3.8 * len(envs)),
-        layout="constrained",
-        width_ratios=(3, 2, 2),
-        squeeze=False,
-    )
+    figure = Figure(figsize=(13.0, 0.4 + 3.8 * len(envs)), layout="constrained")
+    grid = figure.subplots(len(envs), 3, width_ratios=(3, 2, 2), squeeze=False)
     for row, env in zip(grid, envs, strict=True):
         _draw_row(row, [run for run in runs if run.env == env])
         for axes in row:
             axes.set_title(env)
     more = "; dots: the final return of each seed"
     plotting.write_caption(figure, [len(run.final) for run in runs], more)
-    plotting.save(figure, path, dpi=150)
+    figure.savefig(path, dpi=150)
 
 
 def _draw_row(row: Any, runs: Sequence[Curves]) -> None:

@@ -30,7 +30,7 @@ from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
-from gasil_jax.sweeps.points import Point, make_points
+from gasil_jax.sweeps.points import Point, kinds, make_points
 from gasil_jax.sweeps.shards import Program
 
 _PROGRAM = "gasil_jax.sweep"
@@ -150,24 +150,47 @@ def _placement(
     return parser.parse_known_args(arguments)
 
 
-def plan(options: Options) -> tuple[list[dict[str, Any]], list[Program]]:
-    """Return all points and programs of a sweep, checked.
+def _points(options: Options, resumed: pathlib.Path | None) -> list[dict[str, Any]]:
+    """Return the points, which a sweep to continue has in its config.json as well.
 
-    Raises:
-      InputError: if a value is not allowed; the message names the value and the range.
+    Those of config.json are taken if the file that listed the points is gone.
     """
-    run_options.check(options)
-    points = make_points(
+    if resumed is not None and options.points_file is not None:
+        before = run_folder.read(resumed)
+        file = options.points_file
+        if file == before["points_file"] and not pathlib.Path(file).exists():
+            return list(before["points"])
+    return make_points(
         options.grid,
         options.random,
         options.points_file,
         options.first_seed,
         options.config.agent,
     )
+
+
+def plan(
+    options: Options, resumed: pathlib.Path | None = None
+) -> tuple[list[dict[str, Any]], list[Program]]:
+    """Return all points and programs of a sweep, checked.
+
+    Args:
+      options: the options.
+      resumed: the folder of the sweep or shard that is continued, if any.
+
+    Raises:
+      InputError: if a value is not allowed; the message names the value and the range.
+    """
+    run_options.check(options)
+    points = _points(options, resumed)
     unused = run_options.unused_fields(options.config)
     for point in points:
         if name := next((name for name in point if name in unused), None):
-            raise InputError(f"{name} can't vary: {unused[name]}")
+            others = [x for x in kinds(options.config.agent) if x not in unused]
+            raise InputError(
+                f"{name} can't vary: {unused[name]}; it must be one of "
+                f"{', '.join(others)}"
+            )
         config = options.config.replace(**point)
         run_options.check(dataclasses.replace(options, config=config))
     programs = shards.programs(
@@ -196,7 +219,7 @@ def check_points(points: Sequence[Point], resumed: pathlib.Path | None) -> None:
 def _plan_without_launcher(
     options: Options, resumed: pathlib.Path | None
 ) -> tuple[list[dict[str, Any]], list[Program]]:
-    points, programs = plan(options)
+    points, programs = plan(options, resumed)
     check_points(points, resumed)
     if options.shards is not None:
         raise InputError(

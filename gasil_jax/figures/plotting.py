@@ -105,15 +105,6 @@ def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None
     figure.supxlabel(text, fontsize="small", color="0.3")
 
 
-def save(figure: Any, path: pathlib.Path, dpi: int) -> None:
-    """Write a figure in the format of the path's suffix and close the figure."""
-    import matplotlib.pyplot as plt
-
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=dpi)
-    plt.close(figure)
-
-
 def learning_curve(
     path: pathlib.Path,
     env_steps: np.ndarray,
@@ -132,13 +123,11 @@ def learning_curve(
       evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
         evaluations) each; None if there are none.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     steps, returns = binned_returns(env_steps, episode_return)
-    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.subplots()
     axes.plot(steps / 1e6, returns.T, color="0.75", linewidth=0.8)
     draw_returns(axes, steps, returns, evaluations, color=COLORS[0])
     if evaluations is not None:
@@ -148,7 +137,40 @@ def learning_curve(
         axes.text(0.5, 0.5, "not every seed has ended an episode", **where)
     axes.set_title(title)
     write_caption(figure, [len(returns)], "; grey: each seed")
-    save(figure, path, dpi=150)
+    figure.savefig(path, dpi=150)
+
+
+def final_returns(
+    path: pathlib.Path,
+    labels: Sequence[str],
+    returns: np.ndarray,
+    best: int | None,
+) -> None:
+    """Save every seed's final return and their mean, in a row for each point.
+
+    Args:
+      path: the image file.
+      labels: the name of each point.
+      returns: (points, seeds).
+      best: index of the best point by mean, which is marked; None if there is none.
+    """
+    from matplotlib.figure import Figure
+
+    # Matplotlib refuses pictures of more than 2**16 pixels.
+    size = (8.0, min(1.4 + 0.35 * len(labels), 400.0))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots()
+    for row, seeds in enumerate(returns):
+        axes.plot(seeds, [row] * len(seeds), "o", color="0.7", markersize=4)
+        color = COLORS[1] if row == best else COLORS[0]
+        axes.plot(seeds.mean(), row, "|", color=color, markersize=14, mew=2)
+    axes.set_yticks(range(len(labels)), labels, fontsize=8)
+    if best is not None:
+        axes.get_yticklabels()[best].set(color=COLORS[1], weight="bold")
+    axes.set(xlabel="final return of each seed; the bar is their mean")
+    axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
+    axes.invert_yaxis()
+    figure.savefig(path, dpi=150)
 
 
 def marginals(
@@ -170,21 +192,13 @@ def marginals(
       best: index of the point that is marked as the best; None for none.
       left_out: number of points without a return, which are not among these.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
+    from matplotlib.figure import Figure
 
     columns = min(len(values), 3)
     rows = -(-len(values) // columns)
-    figure, grid = plt.subplots(
-        rows,
-        columns,
-        figsize=(0.8 + 3.6 * columns, 1.4 + 2.8 * rows),
-        layout="constrained",
-        sharey=True,
-        squeeze=False,
-    )
+    size = (0.8 + 3.6 * columns, 1.4 + 2.8 * rows)
+    figure = Figure(figsize=size, layout="constrained")
+    grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, name in zip(grid.flat, values):
         _draw_marginal(axes, values[name], returns, best)
         share = importance[name]
@@ -208,7 +222,7 @@ def marginals(
         text += "because a seed has no return"
     text = textwrap.fill(text, 10 + 50 * columns)
     figure.supxlabel(text, fontsize="small", color="0.3")
-    save(figure, path, dpi=150)
+    figure.savefig(path, dpi=150)
 
 
 def _draw_marginal(

@@ -10,9 +10,12 @@ from gasil_jax.errors import InputError
 
 def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
     """Return the error message for an option's folder or file that can't be written."""
+    return f"{option} is {path}, which can't be written: {_reason(error)}"
+
+
+def _reason(error: OSError) -> str:
     # Errors that libraries raise may have no `strerror`, and several lines.
-    why = error.strerror or str(error).partition("\n")[0]
-    return f"{option} is {path}, which can't be written: {why}"
+    return error.strerror or str(error).partition("\n")[0]
 
 
 def check(path: pathlib.Path, endings: Sequence[str]) -> None:
@@ -58,7 +61,7 @@ def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
         yield partial
         partial.rename(path)
     except OSError as error:
-        raise OSError(unwritable(path, error)) from error
+        raise OSError(f"{path} can't be written: {_reason(error)}") from error
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

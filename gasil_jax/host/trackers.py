@@ -53,7 +53,7 @@ class _WeightsAndBiases:
         try:
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
-                name=folder.name,
+                name=_run_name(folder),
                 dir=str(folder),
                 id=_identifier(folder / "wandb-id"),
                 resume="allow",
@@ -71,6 +71,16 @@ class _WeightsAndBiases:
 
     def close(self) -> None:
         self._run.finish()
+
+
+def _run_name(folder: pathlib.Path) -> str:
+    """Return the run's name, SWEEP-SHARD-PROGRAM for a program's folder in a sweep."""
+    folder = folder.absolute()
+    names = [folder.name]
+    while folder.parent.name in ("shards", "programs"):
+        folder = folder.parent.parent
+        names.insert(0, folder.name)
+    return "-".join(names)
 
 
 def _identifier(path: pathlib.Path) -> str:
@@ -117,7 +127,8 @@ def make(
 
     Args:
       names: names in `TRACKERS`.
-      folder: folder of the run, whose name becomes the run's name.
+      folder: folder of the run, or of a program of a sweep; the name of the run is made
+        from it.
       config: settings to show with the run.
 
     Raises:

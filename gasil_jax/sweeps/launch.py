@@ -33,10 +33,17 @@ def check(name: str) -> None:
         _ray_package()
 
 
-def _refuse_failed(failed: Mapping[str, str]) -> None:
-    """Raise `ChildProcessError` with the failed jobs and reasons, if there are any."""
+def _refuse_failed(failed: Mapping[str, str], num_jobs: int) -> None:
+    """Raise an error with the failed jobs and their reasons, if there are any.
+
+    Raises:
+      ChildProcessError: if jobs have failed.
+      InputError: if all jobs refused their input.
+    """
     if failed:
         jobs = ", ".join(f"{name} ({why})" for name, why in failed.items())
+        if list(failed.values()) == [f"status {_BAD_INPUT}"] * num_jobs:
+            raise InputError(f"{jobs} refused what they were given, see above")
         raise ChildProcessError(
             f"{jobs} failed; the others are done. Continue with the same command and "
             "--resume"
@@ -53,6 +60,7 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
+      InputError: if all jobs refused their input.
       Interrupted: if a signal was received; it was passed on to the running job.
     """
     failed = {}
@@ -63,7 +71,7 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
                 break
         if status:
             failed[name] = f"status {status}"
-    _refuse_failed(failed)
+    _refuse_failed(failed, len(jobs))
 
 
 def _run_process(command: Sequence[str]) -> int:
@@ -138,7 +146,7 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
-      InputError: if no node has that many CPUs.
+      InputError: if no node has that many CPUs, or if all jobs refused their input.
       Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     ray = _ray_package()
@@ -175,7 +183,7 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
             else:
                 if status:
                     failed[name] = f"status {status}"
-    _refuse_failed(failed)
+    _refuse_failed(failed, len(jobs))
 
 
 def _wait(ray: Any, references: list[Any]) -> None:

@@ -139,17 +139,6 @@ def _unknown_name(name: str, allowed: Iterable[str]) -> str:
     return f"{name!r} can't vary: {did_you_mean(name, tuple(allowed))}"
 
 
-def _refuse_unused(names: Iterable[str], agent: str) -> None:
-    idle = unused(agent)
-    for name in names:
-        if name in idle:
-            others = [x for x in kinds(agent) if x not in idle]
-            raise InputError(
-                f"{name} can't vary: agent {agent!r} does not use it; it must be one "
-                f"of {', '.join(others)}"
-            )
-
-
 def make_points(
     grid: Sequence[str],
     random: int | None,
@@ -165,8 +154,8 @@ def make_points(
         `PAPER_RANGES`; None takes the whole grid.
       points_file: a file that lists the points, instead of grid and random.
       seed: seed of the draws.
-      agent: the agent of the sweep. Names that it does not use are refused in the
-        grid and the file, and left out of `PAPER_RANGES`.
+      agent: the agent of the sweep. Names that it does not use are left out of
+        `PAPER_RANGES`.
 
     Raises:
       InputError: if nothing varies, or if something that is named can't.
@@ -174,11 +163,8 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file stands in place of grid and random")
-        points = read_points(pathlib.Path(points_file), agent)
-        _refuse_unused((name for point in points for name in point), agent)
-        return points
+        return read_points(pathlib.Path(points_file), agent)
     values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, agent)
-    _refuse_unused(values, agent)
     if random is None:
         if not values:
             raise InputError(

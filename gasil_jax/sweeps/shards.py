@@ -159,12 +159,11 @@ def refuse_used(out: pathlib.Path, resume: bool) -> None:
         run_folder.refuse_used(out)
 
 
-def parse(text: str, name: str = "shard") -> Shard:
+def parse(text: str) -> Shard:
     """Return the shard that a text such as "3/8" names.
 
     Args:
       text: NUMBER/COUNT.
-      name: name of the option, for the error message.
 
     Raises:
       InputError: if the text has another form.
@@ -173,7 +172,7 @@ def parse(text: str, name: str = "shard") -> Shard:
     shard = Shard(*map(int, match.groups())) if match else None
     if shard is None or shard.number > shard.count:
         raise InputError(
-            f"{name} is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
+            f"shard is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
         )
     return shard
 

@@ -253,7 +253,7 @@ def write(
     metrics_files.write_json(folder / "summary.json", summary)
     chosen = summary["best_by_mean"]
     with output_file.whole(folder / "sweep.png") as partial:
-        _plot(partial, points, final, chosen)
+        plotting.final_returns(partial, _labels(points), final, chosen)
     if varied:
         with output_file.whole(folder / "hyperparameters.png") as partial:
             plotting.marginals(
@@ -358,46 +358,13 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
     return lines + ([f"importance: {', '.join(shown)}"] if shown else [])
 
 
+def _labels(points: Sequence[Point]) -> list[str]:
+    """Return a name for each point, of the values in which the points differ."""
+    names = {name for point in points for name in point}
+    varied = {x for x in names if len({point.get(x) for point in points}) > 1}
+    return [_label({x: point[x] for x in point if x in varied}) for point in points]
+
+
 def _label(point: Point) -> str:
     changes = ", ".join(f"{name}={value:g}" for name, value in point.items())
     return changes or "the sweep's own values"
-
-
-def _plot(
-    path: pathlib.Path,
-    points: Sequence[Point],
-    final: np.ndarray,
-    best: int | None,
-) -> None:
-    """Plot every seed's final return and their mean, in a row for each point.
-
-    Args:
-      path: the image file.
-      points: all points.
-      final: (points, seeds).
-      best: index of the best point by mean, which is marked; None if there is none.
-    """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    names = {name for point in points for name in point}
-    varied = {x for x in names if len({point.get(x) for point in points}) > 1}
-    # Matplotlib refuses pictures of more than 2**16 pixels.
-    size = (8.0, min(1.4 + 0.35 * len(points), 400.0))
-    figure, axes = plt.subplots(figsize=size, layout="constrained")
-    for row in range(len(points)):
-        axes.plot(final[row], [row] * len(final[row]), "o", color="0.7", markersize=4)
-        color = "#D55E00" if row == best else "#0072B2"
-        axes.plot(final[row].mean(), row, "|", color=color, markersize=14, mew=2)
-    short = [{x: point[x] for x in point if x in varied} for point in points]
-    labels = [_label(point) for point in short]
-    axes.set_yticks(range(len(points)), labels, fontsize=8)
-    if best is not None:
-        axes.get_yticklabels()[best].set(color="#D55E00", weight="bold")
-    axes.set(xlabel="final return of each seed; the bar is their mean")
-    axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
-    axes.invert_yaxis()
-    figure.savefig(path, dpi=150)
-    plt.close(figure)

@@ -76,16 +76,16 @@ def test_runs_with_other_counts_share_a_program_on_request():
     assert set(shared.runs) == {few, many}
 
 
-def test_parts_are_all_runs_once_and_none_moves_when_others_join():
+def test_shards_are_all_runs_once_and_none_moves_when_others_join():
     runs = [run(seed) for seed in range(60)]
-    parts = [engine.part_of(runs, Shard(number, 3)) for number in (1, 2, 3)]
-    assert sorted(x.seed for part in parts for x in part) == list(range(60))
-    assert all(10 < len(part) < 30 for part in parts)
-    for number, part in enumerate(parts, start=1):
-        assert engine.part_of(runs[:40], Shard(number, 3)) == [
-            x for x in part if x.seed < 40
+    shards = [engine.share(runs, Shard(number, 3)) for number in (1, 2, 3)]
+    assert sorted(x.seed for shard in shards for x in shard) == list(range(60))
+    assert all(10 < len(shard) < 30 for shard in shards)
+    for number, shard in enumerate(shards, start=1):
+        assert engine.share(runs[:40], Shard(number, 3)) == [
+            x for x in shard if x.seed < 40
         ]
-    assert engine.part_of(runs, Shard(1, 1)) == runs
+    assert engine.share(runs, Shard(1, 1)) == runs
 
 
 def test_a_record_is_what_make_train_gives(trained):
@@ -211,14 +211,14 @@ def toy(monkeypatch):
     return figure
 
 
-def test_a_figure_is_trained_from_end_to_end_and_in_parts(toy, tmp_path, capsys):
+def test_a_figure_is_trained_from_end_to_end_and_in_shards(toy, tmp_path, capsys):
     note = __main__.Page("matrix", Store(tmp_path), figure=toy).note
     assert note == "{{table}}"
     missing = []
-    for part in ("1/2", "2/2"):
+    for shard in ("1/2", "2/2"):
         folders = ("--runs", str(tmp_path / "runs"), "--evaluate-episodes", "0")
-        results = tmp_path / part[0]
-        arguments = ("matrix", *folders, "--results", str(results), "--part", part)
+        results = tmp_path / shard[0]
+        arguments = ("matrix", *folders, "--results", str(results), "--shard", shard)
         assert __main__.main([*arguments, "--devices", "1"]) == 0
         stored = Store(results / "runs")
         missing.append(set(stored.missing(toy.requested(stored))))
@@ -270,7 +270,7 @@ def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, caps
             ("matrix", "--only", "hoper"),
             "only 'hoper' is unknown: did you mean 'hopper'",
         ),
-        (("matrix", "--part", "3/2"), "part is '3/2'"),
+        (("matrix", "--shard", "3/2"), "shard is '3/2'"),
         (("matrix", "--devices", "0"), "devices is 0"),
         (("matrix", "--quick", "--results", "x"), "results is x: --quick writes below"),
         (("merge", "/proc/none"), "folder is /proc/none: it must have TASK.npz"),

@@ -25,7 +25,9 @@ def test_parts_are_means_where_every_seed_has_ended_an_episode():
 @pytest.fixture
 def figures(monkeypatch):
     kept = []
-    monkeypatch.setattr(plotting, "save", lambda figure, *_, **__: kept.append(figure))
+    monkeypatch.setattr(
+        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
+    )
     return kept
 
 
@@ -113,16 +115,11 @@ def test_too_few_points_have_no_importance(figures, tmp_path):
     )
 
 
-def test_a_sweeps_labels_are_what_varies(monkeypatch, tmp_path):
-    import matplotlib.figure
-
-    kept = []
-    monkeypatch.setattr(
-        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
-    )
+def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
     points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0)]
-    tables._plot(tmp_path / "x.png", points, np.array([[1.0, 2.0], [3.0, 4.0]]), 1)
-    labels = kept[0].axes[0].get_yticklabels()
+    names, returns = tables._labels(points), np.array([[1.0, 2.0], [3.0, 4.0]])
+    plotting.final_returns(tmp_path / "x.png", names, returns, 1)
+    labels = figures[0].axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == ["alpha=0.1", "alpha=1"]
     assert [label.get_weight() for label in labels] == ["normal", "bold"]
 
@@ -131,6 +128,6 @@ def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     kept = []
     pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", pixels)
-    points = [{"alpha": float(i)} for i in range(1300)]
-    tables._plot(tmp_path / "x.png", points, np.zeros((1300, 1)), None)
+    names = [f"alpha={i}" for i in range(1300)]
+    plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), None)
     assert kept[0] < 2**16

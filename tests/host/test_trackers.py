@@ -124,6 +124,15 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
+def test_a_run_of_a_sweep_has_the_sweeps_name(tmp_path):
+    for folder, name in (
+        (("alpha",), "alpha"),
+        (("alpha", "programs", "2"), "alpha-2"),
+        (("alpha", "shards", "3-of-8", "programs", "0"), "alpha-3-of-8-0"),
+    ):
+        assert trackers._run_name(tmp_path.joinpath(*folder)) == name
+
+
 def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
     wandb = pytest.importorskip("wandb")
 

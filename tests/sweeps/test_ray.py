@@ -88,5 +88,5 @@ def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
     (out / "shards").mkdir(parents=True)
     (out / "shards" / "1-of-1").touch()
     arguments = [*SMALL, "--grid", "alpha=1", "--launcher", "ray", "--shards", "1"]
-    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 1
-    assert "shard 1/1 (status 2) failed" in capsys.readouterr().err
+    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 2
+    assert "shard 1/1 (status 2) refused" in capsys.readouterr().err

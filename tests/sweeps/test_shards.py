@@ -356,6 +356,9 @@ def test_a_launched_job_runs_again_after_its_process_died(program, tmp_path):
         launch.run_locally(program, jobs, None)
     ran = {name: len(list(folder.iterdir())) for name, folder in folders.items()}
     assert ran == {"killed": 3, "refused": 1, "fine": 1}
+    # Nothing is left to continue.
+    with pytest.raises(InputError, match=r"^refused \(status 2\) refused what they"):
+        launch.run_locally(program, {"refused": jobs["refused"]}, None)
 
 
 def test_a_signal_reaches_the_job_and_ends_the_launch(program, tmp_path):

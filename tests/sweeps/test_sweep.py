@@ -303,6 +303,13 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(tmp_path, capsys):
     options = run_options.parse(sweep.Options, [*arguments, str(copy)], "x", out)
     assert sweep.plan(options)[0] == points
     sweep.check_points(points, out)
+    # Its config.json has the points as well.
+    first.unlink()
+    options = run_options.parse(sweep.Options, [*SMALL, "--resume"], "x", out)
+    assert sweep.plan(options, out)[0] == points
+    other.unlink()
+    assert sweep.main([*arguments, str(other)]) == 2
+    assert "c.json, which can't be read" in capsys.readouterr().err
 
 
 def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
