@@ -158,7 +158,7 @@ def shard_of(call):
     assert call[:2] == ["-m", "gasil_jax.sweep"]
     arguments = call[2:]
     options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
-    shard = shards.parse(options.shard, "shard")
+    shard = shards.parse(options.shard)
     return shard.number, shard.count, str(options.out), options.resume
 
 
