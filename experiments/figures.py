@@ -14,6 +14,7 @@ The second is drawn over the delay with ``over=("reward_delay", "delay")``.
 import dataclasses
 import functools
 import itertools
+import math
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -315,10 +316,14 @@ _LOGIT, _CENTERED = (
     for form in ("logit", "centered")
 )
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
-_INVERSELY_SCALED = "ppo (decomposed, scaled inversely)"
-_OF_EACH_TASK = {
-    env: Arm(_INVERSELY_SCALED, "ppo", {"initial_deviation": 2 / size})
-    for env, size in presets.ACTION_SIZES.items()
+#: Changes of the preset `scaled` by the dimension of an action, by the arms' names.
+_BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
+    "scaled inversely": lambda size: {"initial_deviation": 2 / size},
+    "lambda by dimension": lambda size: {"gae_lambda": 1 - math.sqrt(size) / 40},
+    "lambda and gamma by dimension": lambda size: {
+        "gae_lambda": max(0.9, 1 - size / 80),
+        "gamma": max(0.99, 1 - size / 800),
+    },
 }
 _SCALED_ALONE = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
 _SCALED_LONG = Arm(
@@ -415,18 +420,25 @@ FIGURES: Mapping[str, Figure] = {
         ),
         favourite=_SCALED.name,
     ),
-    "exploration": Figure(
-        "Delayed rewards: exploration by the dimension of an action",
+    "action_dimension": Figure(
+        "Delayed rewards: settings that follow the dimension of an action",
         "",
         joined(
-            grid(tasks, [arm], (DELAY,), base=base)
-            for tasks, arm, base in (
-                *(((env,), arm, "scaled") for env, arm in _OF_EACH_TASK.items()),
-                (TASKS, _SCALED, "scaled"),
-                (TASKS, Arm("ppo", "ppo"), Search),
-            )
+            [
+                grid(TASKS, [_SCALED], (DELAY,), base="scaled"),
+                *(
+                    grid(
+                        (env,),
+                        [Arm(x, "ppo", of(size)) for x, of in _BY_DIMENSION.items()],
+                        (DELAY,),
+                        base="scaled",
+                    )
+                    for env, size in presets.ACTION_SIZES.items()
+                ),
+                grid(TASKS, ["ppo"], (DELAY,), base=Search),
+            ]
         ),
-        favourite=_INVERSELY_SCALED,
+        favourite=_SCALED.name,
     ),
     "bonus_forms": Figure(
         "Delayed rewards: PPO+GASIL without pay for staying up",

@@ -58,7 +58,10 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
     }
     if count > 1 and len(handle_of) > 3:
         # So many names would hide the curves.
-        below: Any = {"loc": "outside lower center", "ncols": 4, "fontsize": 8}
+        # At this size a letter is about 0.07 inches wide.
+        width = 0.5 + 0.07 * max(map(len, handle_of))
+        fitting = max(1, min(4, int(size[0] / width)))
+        below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
         picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
     else:
         for axes, (_, names) in zip(grid.flat, shown, strict=False):

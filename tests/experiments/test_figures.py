@@ -116,11 +116,22 @@ def test_a_figure_over_delays_is_a_row():
     assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]
 
 
-def test_the_inversely_scaled_setting_is_the_preset_with_other_exploration(tmp_path):
-    panels = FIGURES["exploration"].panels
-    for env, size in (("swimmer", 2), ("humanoid", 17)):
-        curve = panels[f"{env}-delayed"]["ppo (decomposed, scaled inversely)"]
-        config = curve.runs(Store(tmp_path))[0].config
+def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path):
+    panels = FIGURES["action_dimension"].panels
+    for env, inverse, own, both in (
+        ("swimmer", 1.0, 1 - 2**0.5 / 40, (0.975, 0.9975)),
+        ("humanoid", 2 / 17, 1 - 17**0.5 / 40, (0.9, 0.99)),
+    ):
         scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
-        assert config == scaled.replace(initial_deviation=2 / size)
-        assert config.decompose_rewards and config != scaled
+        configs = [
+            curve.runs(Store(tmp_path))[0].config
+            for name, curve in panels[f"{env}-delayed"].items()
+            if name != "ppo"
+        ]
+        assert scaled.decompose_rewards
+        assert configs == [
+            scaled,
+            scaled.replace(initial_deviation=inverse),
+            scaled.replace(gae_lambda=own),
+            scaled.replace(gae_lambda=both[0], gamma=both[1]),
+        ]
