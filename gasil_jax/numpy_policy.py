@@ -77,14 +77,16 @@ def about(name: str) -> dict[str, Any]:
             f"name is {name!r}: it must be zoo:NAME, with NAME one of "
             f"{', '.join(zoo())}"
         )
-    return json.loads(str(npz.read(_file(name))["about"]))
+    stored = json.loads(str(npz.read(_file(name))["about"]))
+    # Files from before rewards could be decomposed don't say it.
+    return {"decompose_rewards": False, **stored}
 
 
 def _check(arrays: Mapping[str, np.ndarray]) -> None:
     """Raise `ValueError` unless these can be the arrays of a saved policy."""
-    kernels = sum(name.startswith("kernel_") for name in arrays)
-    biases = (f"bias_{i}" for i in range(kernels))
-    if missing := [name for name in (*_REQUIRED, *biases) if name not in arrays]:
+    num_layers = sum(name.startswith("kernel_") for name in arrays)
+    layers = [f"{kind}_{i}" for i in range(num_layers) for kind in ("kernel", "bias")]
+    if missing := [name for name in (*_REQUIRED, *layers) if name not in arrays]:
         raise ValueError(f"{missing[0]} is missing")
     count = arrays["seeds"].size
     for name, value in arrays.items():

@@ -30,7 +30,7 @@ from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
-from gasil_jax.sweeps.points import Point, kinds, make_points
+from gasil_jax.sweeps.points import Point, check_saved, kinds, make_points
 from gasil_jax.sweeps.shards import Program
 
 _PROGRAM = "gasil_jax.sweep"
@@ -153,13 +153,16 @@ def _placement(
 def _points(options: Options, resumed: pathlib.Path | None) -> list[dict[str, Any]]:
     """Return the points, which a sweep to continue has in its config.json as well.
 
-    Those of config.json are taken if the file that listed the points is gone.
+    Those of config.json are taken if the file that listed the points is gone. A
+    launcher, and a shard that has not begun, need the file.
     """
     if resumed is not None and options.points_file is not None:
         before = run_folder.read(resumed)
         file = options.points_file
-        if file == before["points_file"] and not pathlib.Path(file).exists():
-            return list(before["points"])
+        if file == before.get("points_file") and not pathlib.Path(file).exists():
+            points = list(before["points"])
+            check_saved(points, before["config"], resumed / "config.json")
+            return points
     return make_points(
         options.grid,
         options.random,
@@ -188,8 +191,7 @@ def plan(
         if name := next((name for name in point if name in unused), None):
             others = [x for x in kinds(options.config.agent) if x not in unused]
             raise InputError(
-                f"{name} can't vary: {unused[name]}; it must be one of "
-                f"{', '.join(others)}"
+                f"{name} can't vary: {unused[name]}. Allowed are {', '.join(others)}"
             )
         config = options.config.replace(**point)
         run_options.check(dataclasses.replace(options, config=config))

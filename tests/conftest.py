@@ -115,6 +115,18 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.xdist_group(item.module.__name__))
 
 
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that are saved in a test, instead of the files."""
+    import matplotlib.figure
+
+    kept = []
+    monkeypatch.setattr(
+        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
+    )
+    return kept
+
+
 @pytest.fixture(scope="session")
 def untrained_hopper(tmp_path_factory):
     """The folder of a run on hopper with a first checkpoint: no training compiles."""

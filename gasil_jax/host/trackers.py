@@ -77,7 +77,9 @@ def _run_name(folder: pathlib.Path) -> str:
     """Return the run's name, SWEEP-SHARD-PROGRAM for a program's folder in a sweep."""
     folder = folder.absolute()
     names = [folder.name]
-    while folder.parent.name in ("shards", "programs"):
+    while (folder.parent.name == "programs" and folder.name.isdigit()) or (
+        folder.parent.name == "shards" and "-of-" in folder.name
+    ):
         folder = folder.parent.parent
         names.insert(0, folder.name)
     return "-".join(names)

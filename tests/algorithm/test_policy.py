@@ -94,7 +94,7 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
         ({"seeds": np.int32(5)}, "seeds has the shape"),
         ({"log_std": arrays["log_std"][:2]}, "log_std has the shape"),
         ({"final_return": np.array(["a", "b", "c"])}, "final_return holds no numbers"),
-        ({"kernel_7": arrays["kernel_0"]}, "bias_3 is missing"),
+        ({"kernel_7": arrays["kernel_0"]}, "kernel_3 is missing"),
     ):
         np.savez(tmp_path / "policy.npz", **{**arrays, **changes})
         with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):

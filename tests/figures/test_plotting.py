@@ -2,7 +2,6 @@
 
 import matplotlib.figure
 import numpy as np
-import pytest
 
 from gasil_jax import plot
 from gasil_jax.figures import plotting, statistics
@@ -20,15 +19,6 @@ def test_parts_are_means_where_every_seed_has_ended_an_episode():
     np.testing.assert_array_equal(means[1], 1.0)
     ends, means = plotting.binned_returns(steps, np.full((2, 100), np.nan))
     assert ends.shape == (0,) and means.shape == (2, 0)
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    kept = []
-    monkeypatch.setattr(
-        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
-    )
-    return kept
 
 
 def made_up(env, label, num_seeds, scale):

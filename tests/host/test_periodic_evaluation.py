@@ -255,14 +255,10 @@ def test_the_tracker_is_given_the_scores(evaluated):
         assert scalars == pytest.approx(expected[step], rel=1e-5, abs=1e-6)
 
 
-def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, monkeypatch):
+def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
     out, _ = evaluated
     curves = plot.read(out)
     assert curves.evaluations["mean"].shape == (3, 5)
-    figures = []
-    monkeypatch.setattr(
-        plotting, "save", lambda figure, *_, **__: figures.append(figure)
-    )
     plot.draw([curves], tmp_path / "x.png")
     plotting.learning_curve(
         tmp_path / "y.png",
@@ -273,6 +269,7 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, monkeypatch):
     )
     scores = curves.evaluations["mean"]
     middle = statistics.interquartile_mean(scores, axis=0)
+    assert len(figures) == 2
     for figure in figures:
         lines = figure.axes[0].get_lines()
         (dashed,) = (line for line in lines if line.get_linestyle() == "--")

@@ -127,6 +127,7 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
 def test_a_run_of_a_sweep_has_the_sweeps_name(tmp_path):
     for folder, name in (
         (("alpha",), "alpha"),
+        (("programs", "alpha"), "alpha"),
         (("alpha", "programs", "2"), "alpha-2"),
         (("alpha", "shards", "3-of-8", "programs", "0"), "alpha-3-of-8-0"),
     ):

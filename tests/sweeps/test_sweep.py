@@ -164,7 +164,7 @@ def test_points_from_a_file(tmp_path):
         ("--grid alhpa=1", "did you mean 'alpha'"),
         (
             "--agent ppo --grid alpha=1",
-            "agent 'ppo' does not use it; it must be one of learn",
+            "agent 'ppo' does not use it. Allowed are learn",
         ),
         ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not use it"),
         (
@@ -306,7 +306,7 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(tmp_path, capsys):
     # Its config.json has the points as well.
     first.unlink()
     options = run_options.parse(sweep.Options, [*SMALL, "--resume"], "x", out)
-    assert sweep.plan(options, out)[0] == points
+    assert sweep._plan_without_launcher(options, out)[0] == points
     other.unlink()
     assert sweep.main([*arguments, str(other)]) == 2
     assert "c.json, which can't be read" in capsys.readouterr().err
