@@ -205,9 +205,10 @@ def goodness_of_fit(
     count = jnp.sum(valid)
     mean = lambda x: jnp.sum(jnp.where(valid, x, 0.0)) / count
     error = mean((predicted - actual) ** 2)
-    variance = mean((actual - mean(actual)) ** 2)
+    middle = mean(actual)
+    variance = mean((actual - middle) ** 2)
     # Less is the rounding of equal payouts.
-    varies = (count > 1) & (variance > 1e-10 * mean(actual**2))
+    varies = (count > 1) & (variance > 1e-10 * middle**2)
     return {
         "decomposition_fit": jnp.where(varies, 1.0 - error / variance, jnp.nan),
         "decomposition_error": jnp.sqrt(error),
