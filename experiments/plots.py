@@ -4,7 +4,7 @@ import io
 import itertools
 import math
 import pathlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -84,9 +84,8 @@ def _colors(figure: Figure) -> dict[str, Any]:
     return _with_free_colors(names)
 
 
-def _with_free_colors(names: Iterable[str]) -> dict[str, Any]:
+def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
     """Return each agent's own color, and for other names the colors that are left."""
-    names = list(names)
     color_of = {name: _COLOR_OF[name] for name in names if name in _COLOR_OF}
     free = itertools.cycle(
         [x for x in plotting.COLORS if x not in color_of.values()] or ["gray"]
@@ -119,7 +118,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> Non
 def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
     """Draw final returns over a setting: a line for the curves that differ in it."""
     curves = figure.panels[panel]
-    color_of = _with_free_colors({curve.agent: None for *_, curve in figure.curves()})
+    color_of = _with_free_colors(dict.fromkeys(x.agent for *_, x in figure.curves()))
     lines: dict[str, dict[Any, str]] = {}
     for name in curves:
         line, value = figure.point_of(panel, name)
