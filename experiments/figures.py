@@ -317,19 +317,26 @@ _LOGIT, _CENTERED = (
 )
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
 #: Changes of the preset `scaled` by the dimension of an action, by the arms' names.
+_LAMBDA: Point = {"gae_lambda": 0.95}
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
-    "scaled inversely": lambda size: {"initial_deviation": 2 / size},
-    "lambda by dimension": lambda size: {"gae_lambda": 1 - math.sqrt(size) / 40},
-    "lambda and gamma by dimension": lambda size: {
+    "lambda 0.95": lambda size: _LAMBDA,
+    "deviation scaled inversely, lambda 0.95": lambda size: {
+        **_LAMBDA,
+        "initial_deviation": 2 / size,
+    },
+    "lambda and gamma scaled linearly": lambda size: {
         "gae_lambda": max(0.9, 1 - size / 80),
         "gamma": max(0.99, 1 - size / 800),
     },
 }
-_SCALED_ALONE = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
-_SCALED_LONG = Arm(
-    "ppo (decomposed, scaled, long history)",
+_LAMBDA_WITH_AND_WITHOUT = (
+    Arm("ppo (decomposed, scaled, lambda 0.95)", "ppo", _LAMBDA),
+    Arm("ppo (scaled, lambda 0.95)", "ppo", {**_LAMBDA, "decompose_rewards": False}),
+)
+_LONG_HISTORY = Arm(
+    "ppo (decomposed, scaled, lambda 0.95, long history)",
     "ppo",
-    {"decomposition_history_episodes": 4},
+    {**_LAMBDA, "decomposition_history_episodes": 4},
 )
 #: The last is the whole episode.
 _DELAYS = (1, 5, DELAY, 100, 1000)
@@ -409,7 +416,7 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), base=base)
             for arms, base in (
-                ([_SCALED, _SCALED_ALONE], "scaled"),
+                ([_SCALED, *_LAMBDA_WITH_AND_WITHOUT], "scaled"),
                 (
                     [Arm("ppo (decomposed, best mean rank)", "ppo")],
                     functools.partial(SingleSetting, decompose_rewards=True),
@@ -496,12 +503,12 @@ FIGURES: Mapping[str, Figure] = {
             for tasks, arms, delays, base, seeds in (
                 (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
                 (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
-                (TASKS[:3], [_SCALED], _DELAYS, "scaled", 10),
+                (TASKS[:3], _LAMBDA_WITH_AND_WITHOUT[:1], _DELAYS, "scaled", 10),
                 # The others' episodes are shorter at first.
-                (("halfcheetah",), [_SCALED_LONG], _DELAYS[-1:], "scaled", 10),
+                (("halfcheetah",), [_LONG_HISTORY], _DELAYS[-1:], "scaled", 10),
             )
         ),
-        favourite=_SCALED.name,
+        favourite=_LAMBDA_WITH_AND_WITHOUT[0].name,
         over=("reward_delay", "delay"),
     ),
     "adaptive_ablation": Figure(

@@ -53,6 +53,8 @@ def test_scaled_rows_follow_the_number_of_actions(env):
         row = gasil_jax.preset(env, "ppo", "scaled", reward_delay=delay)
         assert row.hyperparameters.learning_rate * actions == pytest.approx(1.5e-3)
         assert row.hyperparameters.initial_deviation**2 * actions == pytest.approx(1.0)
+        fall = 1 - row.hyperparameters.gae_lambda
+        assert (40 * fall) ** 2 == pytest.approx(actions)
         assert row.decompose_rewards == (delay > 1)
 
 
