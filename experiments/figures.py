@@ -340,6 +340,9 @@ _LONG_HISTORY = Arm(
 )
 #: The last is the whole episode.
 _DELAYS = (1, 5, DELAY, 100, 1000)
+_NOT_CLIPPED = [
+    Arm(f"{agent} (rewards not clipped)", agent, {"reward_clip": 1e9}) for agent in PAIR
+]
 _ADAPTIVE_WITH_AND_WITHOUT = (
     Arm(ADAPTIVE, ADAPTIVE),
     Arm(f"{ADAPTIVE} without imitation", ADAPTIVE, {"imitation_weight": 0.0}),
@@ -502,6 +505,7 @@ FIGURES: Mapping[str, Figure] = {
             )
             for tasks, arms, delays, base, seeds in (
                 (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
+                (TASKS[:3], _NOT_CLIPPED, _DELAYS[3:], _usual_delay, 10),
                 (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
                 (TASKS[:3], _LAMBDA_WITH_AND_WITHOUT[:1], _DELAYS, "scaled", 10),
                 # The others' episodes are shorter at first.

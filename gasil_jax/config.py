@@ -106,6 +106,9 @@ class Hyperparameters(struct.PyTreeNode):
       max_grad_norm: largest global norm of a gradient; the policy's and the value's
         gradients are clipped separately.
       initial_deviation: standard deviation of the untrained policy's actions.
+      reward_clip: largest absolute value of a normalized reward (see normalize_rewards,
+        without which it has no effect). Where an episode pays once, at its end, the
+        default makes most of the payments equal: take 1e9, which clips nothing.
       alpha: scale of the discriminator's reward (paper, section 4.3).
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_updates: gradient steps of the discriminator in an iteration.
@@ -130,6 +133,7 @@ class Hyperparameters(struct.PyTreeNode):
     value_coefficient: float = number(1.0, 0.0)
     max_grad_norm: float = number(0.5, 0.0, excludes_low=True)
     initial_deviation: float = number(1.0, 0.0, excludes_low=True)
+    reward_clip: float = number(10.0, 0.0, excludes_low=True)
     alpha: float = number(0.1, 0.0)
     discriminator_learning_rate: float = number(1e-4, 0.0, excludes_low=True)
     discriminator_updates: int = _count(5)

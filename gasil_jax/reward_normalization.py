@@ -15,8 +15,8 @@ from flax import struct
 
 from gasil_jax import normalization
 
-# Normalized rewards are clipped to plus and minus this number.
-_CLIP = 10.0
+#: Baselines clip normalized rewards to plus and minus this number.
+CLIP = 10.0
 
 
 class RewardNormalizer(struct.PyTreeNode):
@@ -70,6 +70,24 @@ def scale(normalizer: RewardNormalizer) -> jax.Array:
     return deviation[0]
 
 
-def normalize(normalizer: RewardNormalizer, reward: jax.Array) -> jax.Array:
-    """Return rewards of any shape divided by `scale` and clipped to +-10."""
-    return jnp.clip(reward / scale(normalizer), -_CLIP, _CLIP)
+def normalize(
+    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float = CLIP
+) -> jax.Array:
+    """Return rewards of any shape divided by `scale` and clipped to +-`clip`.
+
+    Where an episode of n steps pays once, its sums are 0 but for the last, so that
+    `scale` is about the payment divided by sqrt(n): above some 100 steps a clip at 10
+    makes many payments equal, and near 1000 almost all.
+    """
+    return jnp.clip(reward / scale(normalizer), -clip, clip)
+
+
+def clipped(
+    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float = CLIP
+) -> jax.Array:
+    """Return the share of rewards other than 0 that `normalize` clips, ().
+
+    It is NaN if all rewards are 0.
+    """
+    beyond = jnp.abs(reward) > clip * scale(normalizer)
+    return jnp.sum(beyond) / jnp.sum(reward != 0.0)

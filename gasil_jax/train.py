@@ -414,10 +414,12 @@ def learner_rewards(
         normalizer = reward_normalization.update(
             state.reward_normalizer, batch.reward, batch.ended, hyperparameters.gamma
         )
-        reward = reward_normalization.normalize(normalizer, batch.reward)
+        clip = hyperparameters.reward_clip
         scale = reward_normalization.scale(normalizer)
+        clipped = reward_normalization.clipped(normalizer, batch.reward, clip)
+        reward = reward_normalization.normalize(normalizer, batch.reward, clip)
         batch = batch.replace(reward=reward)
-        metrics = {**metrics, "reward_scale": scale}
+        metrics = {**metrics, "reward_scale": scale, "clipped_rewards": clipped}
     rewards = Rewards(batch, history, scale, decomposition, normalizer, healthy)
     return rewards, metrics
 

@@ -258,9 +258,11 @@ def unused_fields(config: Config) -> dict[str, str]:
     """Return the names of the fields that have no effect, each with the reason."""
     reason = f"agent {config.agent!r} does not use it"
     fields = dict.fromkeys(unused(config.agent), reason)
+    if not config.normalize_rewards:
+        fields["reward_clip"] = "normalize_rewards is off"
     names = [x for x in run_folder.flat(vars(config)) if x.startswith("decomposition_")]
     if not find_agent(config.agent).uses_reward:
-        names += ["normalize_rewards", "decompose_rewards"]
+        names += ["normalize_rewards", "reward_clip", "decompose_rewards"]
         reason = f"agent {config.agent!r} does not use the environment's reward"
         fields |= dict.fromkeys(names, reason)
     elif not config.decompose_rewards:

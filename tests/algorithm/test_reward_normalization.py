@@ -38,6 +38,33 @@ def test_batches_give_the_scale_of_all_steps():
     np.testing.assert_allclose(normalized, [30.0 / expected, -10.0], rtol=1e-4)
 
 
+def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
+    rng = np.random.default_rng(0)
+    share = {}
+    for length in (20, 1000):
+        reward = np.zeros((2 * length, 4), np.float32)
+        reward[length - 1 :: length] = payments = rng.uniform(500, 3000, (2, 4))
+        normalizer = reward_normalization.update(
+            reward_normalization.init(4),
+            jnp.asarray(reward),
+            jnp.asarray(reward > 0),
+            0.99,
+        )
+        scale = plain_scale(reward, reward > 0, 0.99)
+        expected = np.mean(payments / scale > 10.0)
+        share[length] = reward_normalization.clipped(normalizer, jnp.asarray(reward))
+        np.testing.assert_allclose(share[length], expected)
+        for clip in (10.0, 1e9):
+            np.testing.assert_allclose(
+                reward_normalization.normalize(normalizer, jnp.asarray(reward), clip),
+                np.minimum(reward / scale, clip),
+                rtol=1e-4,
+            )
+    assert share[20] == 0.0 and share[1000] > 0.5
+    nothing = jnp.zeros((5, 4))
+    assert np.isnan(reward_normalization.clipped(normalizer, nothing))
+
+
 def test_no_reward_stays_none():
     nothing = jnp.zeros((5, 2))
     normalizer = reward_normalization.update(
@@ -52,3 +79,4 @@ def test_without_normalization_there_is_no_scale():
         train = gasil_jax.make_train(env, config.replace(normalize_rewards=normalize))
         _, metrics = jax.eval_shape(train, jax.random.key(0))
         assert ("reward_scale" in metrics) == normalize
+        assert ("clipped_rewards" in metrics) == normalize
