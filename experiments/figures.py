@@ -14,7 +14,6 @@ The second is drawn over the delay with ``over=("reward_delay", "delay")``.
 import dataclasses
 import functools
 import itertools
-import math
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
