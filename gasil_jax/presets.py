@@ -30,6 +30,8 @@ from gasil_jax.config import Config
 from gasil_jax.errors import unknown
 from gasil_jax.imitation import find_agent
 
+#: The preset that runs start from if none is named.
+DEFAULT = "tuned"
 Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
 Rows = Mapping[tuple[str, str], Overrides]
@@ -131,8 +133,9 @@ PRESETS: Mapping[str, Preset] = {
             },
         },
         {},
-        # The paper's horizon is 2,048 steps of one environment.
-        every={"num_envs": 1},
+        # The paper's horizon is 2,048 steps of one environment, which has no others to
+        # be out of step with.
+        every={"num_envs": 1, "stagger_episodes": False},
     ),
 }
 
@@ -149,28 +152,51 @@ def check(name: str) -> None:
 
 
 def preset(
-    env: str, agent: str, name: str = "tuned", *, reward_delay: int = 1
+    env: str, agent: str, name: str = DEFAULT, *, reward_delay: int = 1
 ) -> Config:
     """Return the config that runs of `agent` in `env` start from.
 
     Args:
-      env: name of the environment. One without a row gets the defaults and the
-        preset's overrides for all tasks.
+      env: name of the environment.
       agent: name of the agent, or MODULE:NAME of one of your own.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
 
+    Returns:
+      The defaults, changed by what the preset has for all tasks and by its row. With
+      "tuned" they may be the defaults alone.
+
     Raises:
-      ValueError: if the environment, the agent or the preset is unknown.
+      ValueError: if the environment, the agent or the preset is unknown, or if a preset
+        other than "tuned" has nothing for the agent on the task.
     """
     check(name)
     find_agent(agent)
     ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", str(env), ours, others))
+    if name != DEFAULT and not has_overrides(env, agent, name, reward_delay):
+        rows = PRESETS[name].delayed if reward_delay > 1 else PRESETS[name].dense
+        raise ValueError(
+            f"preset {name!r} has nothing for agent {agent!r} on {env} with "
+            f"{_kind(reward_delay)} rewards: it has {_listed(rows)}"
+        )
     chosen = PRESETS[name]
     row = _row(chosen, env, agent, reward_delay)
     return Config(agent=agent).replace(**{**chosen.every, **row})
+
+
+def _kind(reward_delay: int) -> str:
+    return "delayed" if reward_delay > 1 else "dense"
+
+
+def _listed(rows: Rows) -> str:
+    """Return the agents and environments of rows in words."""
+    by_agent: dict[str, list[str]] = {}
+    for env, agent in rows:
+        by_agent.setdefault(agent, []).append(env)
+    words = [f"{agent} on {', '.join(envs)}" for agent, envs in by_agent.items()]
+    return "; ".join(words) or "no rows for such rewards"
 
 
 def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> bool:

@@ -111,11 +111,11 @@ def init(
         batch then holds one thin slice of the episode (Staggered Environment Resets,
         arXiv 2511.21011).
     """
-    state = jax.vmap(env.reset)(jax.random.split(key, num_envs))
+    keys = jax.random.split(key, num_envs + 1)
+    reset_keys, age_key = keys[:-1], keys[-1]
+    state = jax.vmap(env.reset)(reset_keys)
     starting_age = jnp.zeros(num_envs, jnp.int32)
     if age_limit is not None:
-        # No environment is reset with the last of these keys.
-        age_key = jax.random.split(key, num_envs + 1)[-1]
         starting_age = jax.random.randint(age_key, (num_envs,), 0, age_limit)
     # Each field needs its own array: a shared one could not be donated.
     return EnvironmentStates(

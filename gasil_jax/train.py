@@ -170,8 +170,10 @@ def _init_actor_critic(
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(hyperparameters)
     num_streams = find_agent(config.agent).num_streams
-    # The first value gets the key itself, so that it is the same in all agents.
-    value_keys = [value_key, *jax.random.split(value_key, num_streams)[1:]]
+    # The first value gets the key itself, so that it is the same in all agents; `clone`
+    # tells JAX's check of keys that the key is meant to be used twice.
+    others = jax.random.split(jax.random.clone(value_key), num_streams)[1:]
+    value_keys = [value_key, *others]
     policy_params = policy.init(policy_key, observation)
     policy_params["params"]["log_std"] += jnp.log(hyperparameters.initial_deviation)
     return ActorCritic(

@@ -191,8 +191,11 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
         integrator.
 
     Raises:
-      ValueError: if the name is unknown or a value is out of range.
+      ValueError: if a name is unknown or a value is out of range.
     """
+    allowed = [field.name for field in dataclasses.fields(Settings)]
+    for setting in settings:
+        _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
     check(name, chosen)
     env = _constructor(name)(chosen)

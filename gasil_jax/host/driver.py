@@ -343,7 +343,7 @@ def drive(
             )
         return jax.tree.map(lambda x: x.copy(), members.trim(states))
 
-    stopped = False
+    stopped = warned = False
     while done < last and not stopped and interruption.signal is None:
         count = min(
             members.chunk,
@@ -359,6 +359,12 @@ def drive(
         tables.write(metrics)
         returns.append(metrics["episode_return"])
         progress.update(steps_before + steps_of(done), metrics["episode_return"])
+        if not warned and np.any(metrics["skipped_updates"] > 0):
+            warned = True
+            progress.warn(
+                "an update was undone because a number in it was not finite: see "
+                "skipped_updates in metrics.csv"
+            )
         due, evaluated, scores = checkpoints.is_due(done), None, None
         if evaluation is not None and evaluation.is_due(done):
             with progress.aside("evaluating the policies"):

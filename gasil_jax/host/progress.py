@@ -126,6 +126,13 @@ class Progress:
         self._bar.update(self._task, status=status)
         self._training_since += time.monotonic() - started
 
+    def warn(self, text: str) -> None:
+        """Print a line that stays above the progress."""
+        if self._live:
+            self._console.print(f"warning: {text}", highlight=False)
+        elif self._in_lines:
+            _line(self._title, f"warning: {text}")
+
     def update(self, steps: int, returns: np.ndarray) -> None:
         """Show progress.
 

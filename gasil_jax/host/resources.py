@@ -151,14 +151,18 @@ def check_memory(
     one, used = need(env, config), devices[:num_members]
     required, free = _padded(num_members, used) * one.memory, available(used)
     if free is not None and required > free:
-        # With more than one for each device, all devices have equally many.
-        fit = free // one.memory
-        fit -= fit % len(used) if fit > len(used) else 0
+        # All devices have equally many.
+        fit = free // len(used) // one.memory * len(used)
+        sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
+        if fit == 0:
+            raise ValueError(
+                f"with {sizes} a single seed needs about {_in_words(one.memory)} of "
+                f"memory, and {_in_words(free)} are free: both must be smaller"
+            )
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
             f"{_in_words(required)} of memory, {_in_words(one.memory)} each with "
-            f"num_envs {config.num_envs} and batch_steps {config.batch_steps}, and "
-            f"{_in_words(free)} are free: at most {fit} fit"
+            f"{sizes}, and {_in_words(free)} are free: at most {fit} fit"
         )
 
 

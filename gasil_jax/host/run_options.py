@@ -70,7 +70,7 @@ class Options:
     evaluate_every: int | None = None
     evaluate_episodes: int | None = None
     log: tuple[str, ...] = ()
-    preset: str = "tuned"
+    preset: str = presets.DEFAULT
     devices: int | None = None
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Settings
@@ -301,7 +301,7 @@ def tell_without_effect(options: Options, num_members: int) -> None:
 
 
 def tell_if_untuned(options: Options) -> None:
-    """Print a note if the preset has nothing for the agent on the task."""
+    """Print a note if the default preset has nothing for the agent on the task."""
     agent, delay = options.config.agent, options.settings.reward_delay
     if not presets.has_overrides(options.env, agent, options.preset, delay):
         rewards = "delayed" if delay > 1 else "dense"

@@ -78,6 +78,7 @@ def test_flags_override_the_preset():
 def test_the_papers_batch_is_of_one_environment(env):
     config = parse(env, "--preset", "paper")
     assert (config.num_envs, config.num_steps) == (1, 2048)
+    assert not config.stagger_episodes
     assert parse(env, "--preset", "paper", "--num-envs", "8").num_envs == 8
 
 
@@ -85,6 +86,18 @@ def test_the_papers_rule_for_humanoid():
     config = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper")
     assert config.hyperparameters.alpha == 0.02
     assert config.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
+
+
+def test_a_preset_that_has_nothing_for_the_run_is_refused(capsys):
+    """But for the default, with which a run starts from the defaults of `Config`."""
+    arguments = ["--env", "point_mass", "--agent", "ppo", "--preset", "scaled"]
+    assert run.main(arguments) == 2
+    assert (
+        "preset 'scaled' has nothing for agent 'ppo' on point_mass with dense rewards: "
+        "it has ppo on hopper, walker2d, halfcheetah, swimmer, ant, humanoid"
+    ) in capsys.readouterr().err
+    with pytest.raises(ValueError, match="on walker2d with dense rewards: it has ppo"):
+        gasil_jax.preset("walker2d", "ppo", "decomposed")
 
 
 def test_an_unknown_preset_is_refused(capsys):

@@ -162,6 +162,14 @@ def test_double_precision_is_refused():
             gasil_jax.make_train(env, SMALL)
 
 
+@pytest.mark.parametrize("agent", ["ppo+sil", "ppo+gasil", "ppo+gasil-adaptive"])
+def test_no_random_key_is_used_twice(agent):
+    env, config = gasil_jax.make_env("point_mass"), SMALL.replace(agent=agent)
+    with jax.debug_key_reuse(True):
+        train = jax.jit(gasil_jax.make_train(env, config))
+        jax.eval_shape(train, jax.random.key(0))
+
+
 def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
     old = {"weights": jnp.array([1.0, 2.0]), "count": jnp.int32(3)}
     fine = {"weights": jnp.array([5.0, 6.0]), "count": jnp.int32(4)}
