@@ -190,7 +190,7 @@ def train(program: Program) -> dict[Run, Record]:
             assembly.train(
                 options,
                 env,
-                [assembly.Job(members, folder, labels)],
+                [assembly.Job(members, folder, labels, folder.name)],
                 title=str(program),
                 on_finished=lambda job, batch, outcome: None,
             )

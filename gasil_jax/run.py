@@ -48,7 +48,8 @@ def train(
     if not run_folder.is_described(folder):
         write()
     title = f"{options.env} {options.config.agent}"
-    job = assembly.Job(program, folder, {"seed": seeds_of(options)})
+    labels = {"seed": seeds_of(options)}
+    job = assembly.Job(program, folder, labels, folder.absolute().name)
     finished: list[tuple[Members, driver.Outcome]] = []
     assembly.train(
         options,

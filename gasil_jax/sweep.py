@@ -99,11 +99,14 @@ def train(
             device_count=len(members.devices),
         )
 
+    shard = None if options.shard is None else shards.parse(options.shard)
+    name = shards.name(folder, shard)
     jobs = [
         assembly.Job(
             program,
             program.folder(folder),
             dict(zip(tables.LABELS, zip(*program.members))),
+            name=f"{name}-{program.number}",
             finished=tables.read_training(folder, program) is not None,
         )
         for program in programs

@@ -30,9 +30,10 @@ class Tracker(Protocol):
 
 
 class _TensorBoard:
-    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+    def __init__(self, folder: pathlib.Path, name: str, config: Mapping[str, Any]):
         import tensorboardX
 
+        del name  # TensorBoard names a run by its folder.
         self._writer = tensorboardX.SummaryWriter(str(folder / "tensorboard"))
         self._writer.add_text("config", f"```\n{_as_text(config)}\n```")
 
@@ -45,7 +46,7 @@ class _TensorBoard:
 
 
 class _WeightsAndBiases:
-    def __init__(self, folder: pathlib.Path, config: Mapping[str, Any]):
+    def __init__(self, folder: pathlib.Path, name: str, config: Mapping[str, Any]):
         import wandb
 
         # A continued run is the same run in Weights & Biases, even with more steps.
@@ -53,7 +54,7 @@ class _WeightsAndBiases:
         try:
             self._run = wandb.init(
                 project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
-                name=_run_name(folder),
+                name=name,
                 dir=str(folder),
                 id=_identifier(folder / "wandb-id"),
                 resume="allow",
@@ -71,18 +72,6 @@ class _WeightsAndBiases:
 
     def close(self) -> None:
         self._run.finish()
-
-
-def _run_name(folder: pathlib.Path) -> str:
-    """Return the run's name, SWEEP-SHARD-PROGRAM for a program's folder in a sweep."""
-    folder = folder.absolute()
-    names = [folder.name]
-    while (folder.parent.name == "programs" and folder.name.isdigit()) or (
-        folder.parent.name == "shards" and "-of-" in folder.name
-    ):
-        folder = folder.parent.parent
-        names.insert(0, folder.name)
-    return "-".join(names)
 
 
 def _identifier(path: pathlib.Path) -> str:
@@ -123,20 +112,24 @@ def check(names: Sequence[str]) -> None:
 
 
 def make(
-    names: Sequence[str], folder: pathlib.Path, config: Mapping[str, Any]
+    names: Sequence[str],
+    folder: pathlib.Path,
+    *,
+    run_name: str,
+    config: Mapping[str, Any],
 ) -> list[Tracker]:
     """Return the trackers of a run.
 
     Args:
       names: names in `TRACKERS`.
-      folder: folder of the run, or of a program of a sweep; the name of the run is made
-        from it.
+      folder: folder of the run, or of a program of a sweep.
+      run_name: name that the run has in the trackers.
       config: settings to show with the run.
 
     Raises:
       InputError: if a tracker can't start.
     """
-    return [TRACKERS[name][1](folder, config) for name in names]
+    return [TRACKERS[name][1](folder, run_name, config) for name in names]
 
 
 def log(

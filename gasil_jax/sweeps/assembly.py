@@ -37,12 +37,14 @@ class Job:
       program: the program, with its config and members.
       folder: folder of its metrics.csv and checkpoints, created if it is missing.
       labels: columns that identify the members in the tables, (members,) each.
+      name: name of the program's run in trackers.
       finished: whether it is already trained to its end.
     """
 
     program: Program
     folder: pathlib.Path
     labels: Mapping[str, Sequence[Any]]
+    name: str
     finished: bool = False
 
     @property
@@ -161,7 +163,9 @@ def train(
                     # A program of a sweep may have other values than the base.
                     own = dataclasses.replace(options, config=job.program.config)
                     described = run_folder.flat(vars(own))
-                    following = trackers.make(options.log, job.folder, described)
+                    following = trackers.make(
+                        options.log, job.folder, run_name=job.name, config=described
+                    )
                 members = make_members(
                     env,
                     job.program.config,

@@ -111,6 +111,20 @@ def root(sweep: pathlib.Path) -> pathlib.Path:
     return sweep / "shards"
 
 
+def name(folder: pathlib.Path, shard: Shard | None) -> str:
+    """Return the name of a sweep, its folder's, or SWEEP-3-of-8 of one of its shards.
+
+    Args:
+      folder: folder of the sweep or the shard.
+      shard: the shard; None for a whole sweep.
+    """
+    folder = folder.absolute()
+    sweep = folder.parent.parent
+    # A shard's folder may have been moved out of its sweep's.
+    inside = shard is not None and folder == shard.folder(sweep)
+    return f"{sweep.name}-{folder.name}" if inside else folder.name
+
+
 def refuse_whole(out: pathlib.Path) -> None:
     """Raise `InputError` if the folder holds a run or sweep without shards."""
     if run_folder.is_described(out) and not root(out).is_dir():

@@ -76,7 +76,7 @@ class Collector:
 
     taken: list = []  # noqa: RUF012
 
-    def __init__(self, folder, config):
+    def __init__(self, folder, name, config):
         pass
 
     def log(self, step, scalars):

@@ -107,7 +107,8 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     labels = {"seed": [3, 4]}
     # A run, and its continuation with more steps.
     for total_steps, steps in ((256, [128, 256]), (384, [384])):
-        (tracker,) = trackers.make(["wandb"], out, {"total_steps": total_steps})
+        config = {"total_steps": total_steps}
+        (tracker,) = trackers.make(["wandb"], out, run_name="alpha-2", config=config)
         returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
         metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
         trackers.log([tracker], labels, metrics)
@@ -124,14 +125,30 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
-def test_a_run_of_a_sweep_has_the_sweeps_name(tmp_path):
-    for folder, name in (
-        (("alpha",), "alpha"),
-        (("programs", "alpha"), "alpha"),
-        (("alpha", "programs", "2"), "alpha-2"),
-        (("alpha", "shards", "3-of-8", "programs", "0"), "alpha-3-of-8-0"),
-    ):
-        assert trackers._run_name(tmp_path.joinpath(*folder)) == name
+def first_made(monkeypatch, program, *arguments):
+    """Return the name and the settings of the first run that trackers are told of."""
+    told = []
+
+    def make(names, folder, *, run_name, config):
+        told.append((run_name, config))
+        raise InputError("enough")
+
+    monkeypatch.setattr(trackers, "make", make)
+    assert program.main([*SMALL, *map(str, arguments)]) == 2
+    (first,) = told
+    return first
+
+
+def test_runs_have_the_names_of_their_folders(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert first_made(monkeypatch, run, "--out", "programs/7")[0] == "7"
+    grid = ("--grid", "num_epochs=2,3", "--out", "alpha")
+    assert first_made(monkeypatch, sweep, *grid)[0] == "alpha-0"
+    grid = ("--grid", "num_epochs=2,3", "--out", "beta")
+    second = first_made(monkeypatch, sweep, *grid, "--shard", "2/2")[0]
+    assert second == "beta-2-of-2-1"
+    (tmp_path / "beta" / "shards" / "2-of-2").rename(tmp_path / "moved")
+    assert first_made(monkeypatch, sweep, "--resume", "--out", "moved")[0] == "moved-1"
 
 
 def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
@@ -148,16 +165,8 @@ def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
 
 
 def test_a_program_of_a_sweep_is_told_with_its_own_values(tmp_path, monkeypatch):
-    told = []
-
-    def make(names, folder, config):
-        told.append(config["num_epochs"])
-        raise InputError("enough")
-
-    monkeypatch.setattr(trackers, "make", make)
-    arguments = [*SMALL, "--grid", "num_epochs=2,3", "--out", str(tmp_path / "out")]
-    assert sweep.main(arguments) == 2
-    assert told == [2]
+    more = ("--grid", "num_epochs=2,3", "--out", tmp_path / "out")
+    assert first_made(monkeypatch, sweep, *more)[1]["num_epochs"] == 2
 
 
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
