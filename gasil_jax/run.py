@@ -25,7 +25,7 @@ from gasil_jax.host.run_options import (
     check_out,
     open_folder,
     parse,
-    resumed_folder,
+    resumed_run,
     seeds_of,
     write_config,
 )
@@ -168,7 +168,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    options = parse(Options, arguments, "gasil_jax.run", resumed_folder(arguments))
+    options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
     # A run is a sweep of one point, in one program.

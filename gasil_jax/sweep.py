@@ -29,6 +29,7 @@ from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
+from gasil_jax.host.run_folder import Begun
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
 from gasil_jax.sweeps.points import Point, check_saved, kinds, make_points
 from gasil_jax.sweeps.shards import Program
@@ -128,13 +129,17 @@ def _main(arguments: Sequence[str] | None) -> None:
         options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
         return
-    resumed = run_options.resumed_folder(arguments)
     if given.shard is not None:
         shard = shards.parse(given.shard)
         folder = _shard_folder(shard, given.out)
-        _train_shard(arguments, shard, folder, bool(given.resume))
-    elif resumed is not None and (text := run_folder.read(resumed).get("shard")):
-        _train_shard(arguments, shards.parse(text), resumed, resume=True)
+        resumed = None
+        if given.resume and run_folder.is_described(folder):
+            resumed = Begun(folder, run_folder.read(folder))
+        _train_shard(arguments, shard, folder, resumed)
+        return
+    resumed = run_options.resumed_run(arguments)
+    if resumed is not None and (text := resumed.described.get("shard")):
+        _train_shard(arguments, shards.parse(text), resumed.folder, resumed)
     else:
         options = run_options.parse(Options, arguments, _PROGRAM, resumed)
         _train_whole(options, resumed)
@@ -153,42 +158,38 @@ def _placement(
     return parser.parse_known_args(arguments)
 
 
-def _points(options: Options, resumed: pathlib.Path | None) -> list[dict[str, Any]]:
-    """Return the points, which a sweep to continue has in its config.json as well.
+def _points(options: Options, begun: Sequence[Begun]) -> list[dict[str, Any]]:
+    """Return the points, which what has begun of the sweep has in its config.json too.
 
     Those of config.json are taken if the file that listed the points is gone. A
     launcher, and a shard that has not begun, need the file.
     """
-    if resumed is not None and options.points_file is not None:
-        before = run_folder.read(resumed)
-        file = options.points_file
-        if file == before.get("points_file") and not pathlib.Path(file).exists():
-            points = list(before["points"])
-            check_saved(points, before["config"], resumed / "config.json")
-            return points
+    file = options.points_file
+    if file is not None and not pathlib.Path(file).exists():
+        for folder, described in begun:
+            if described.get("points_file") == file:
+                points = list(described["points"])
+                check_saved(points, described["config"], folder / "config.json")
+                return points
     return make_points(
-        options.grid,
-        options.random,
-        options.points_file,
-        options.first_seed,
-        options.config.agent,
+        options.grid, options.random, file, options.first_seed, options.config.agent
     )
 
 
 def plan(
-    options: Options, resumed: pathlib.Path | None = None
+    options: Options, begun: Sequence[Begun] = ()
 ) -> tuple[list[dict[str, Any]], list[Program]]:
     """Return all points and programs of a sweep, checked.
 
     Args:
       options: the options.
-      resumed: the folder of the sweep or shard that is continued, if any.
+      begun: the sweep, or those of its shards, that have begun.
 
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
     """
     run_options.check(options)
-    points = _points(options, resumed)
+    points = _points(options, begun)
     unused = run_options.unused_fields(options.config)
     for point in points:
         if name := next((name for name in point if name in unused), None):
@@ -212,20 +213,27 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     return [program for program in programs if program.number in left]
 
 
-def check_points(points: Sequence[Point], resumed: pathlib.Path | None) -> None:
-    """Raise `InputError` if the sweep that has begun in a folder has other points."""
-    if resumed is not None and list(run_folder.read(resumed)["points"]) != list(points):
+def _refuse_other_points(points: Sequence[Point], resumed: Begun) -> None:
+    """Raise `InputError` if the sweep that is continued has other points."""
+    if list(resumed.described["points"]) != list(points):
         raise InputError(
-            f"out is {resumed}, where a sweep of other points has begun: name the "
-            "same points or another folder"
+            f"out is {resumed.folder}, where a sweep of other points has begun: name "
+            "the same points or another folder"
         )
 
 
 def _plan_without_launcher(
-    options: Options, resumed: pathlib.Path | None
+    options: Options, resumed: Begun | None
 ) -> tuple[list[dict[str, Any]], list[Program]]:
-    points, programs = plan(options, resumed)
-    check_points(points, resumed)
+    """Return what `plan` does; refuse other points than before, and --shards.
+
+    Args:
+      options: the options, of a sweep or a shard.
+      resumed: the sweep or the shard that is continued, if any.
+    """
+    points, programs = plan(options, [resumed] if resumed else ())
+    if resumed is not None:
+        _refuse_other_points(points, resumed)
     if options.shards is not None:
         raise InputError(
             f"shards is {options.shards}: it needs --launcher (one part is --shard)"
@@ -233,7 +241,7 @@ def _plan_without_launcher(
     return points, programs
 
 
-def _train_whole(options: Options, resumed: pathlib.Path | None) -> None:
+def _train_whole(options: Options, resumed: Begun | None) -> None:
     points, programs = _plan_without_launcher(options, resumed)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
@@ -256,35 +264,46 @@ def _shard_folder(shard: shards.Shard, out: str | None) -> pathlib.Path:
 
 
 def _refuse_other_sweep(
-    shard_folder: pathlib.Path, options: Options, points: Sequence[Point]
+    options: Options,
+    shard_folder: pathlib.Path,
+    *,
+    points: Sequence[Point],
+    others: Sequence[Begun],
 ) -> None:
-    """Raise `InputError` if another shard beside this one is of another sweep."""
+    """Raise `InputError` if other shards are of another sweep.
+
+    Args:
+      options: options of this shard.
+      shard_folder: folder of this shard.
+      points: points of the sweep.
+      others: the other shards that have begun.
+    """
+    if not others:
+        return
     now = {**vars(options), "points": tuple(points)}
     with command_line.input_checked():
         now |= run_folder.expert_hash(options.config)
-    for path in sorted(shard_folder.parent.glob("*-of-*")):
-        if path != shard_folder and run_folder.is_described(path):
-            # A shard may have been continued to more total_steps than this one yet.
-            before = run_folder.read(path)
-            before["config"] = before["config"].replace(
-                total_steps=options.config.total_steps
-            )
-            merging.refuse_different((path, before), (shard_folder, now))
+    for folder, described in others:
+        # A shard may have been continued to more total_steps than this one yet.
+        config = described["config"].replace(total_steps=options.config.total_steps)
+        merging.refuse_different(
+            Begun(folder, {**described, "config": config}), Begun(shard_folder, now)
+        )
 
 
 def _train_shard(
     arguments: Sequence[str] | None,
     shard: shards.Shard,
     shard_folder: pathlib.Path,
-    resume: bool,
+    resumed: Begun | None,
 ) -> None:
-    """Train a shard in its own folder or, if `resume` is true, continue it."""
-    begun = run_folder.is_described(shard_folder)
-    resumed = shard_folder if resume and begun else None
+    """Train a shard in its own folder or, if it has begun, continue it."""
     options = run_options.parse(Options, arguments, _PROGRAM, resumed)
     options = dataclasses.replace(options, out=shard_folder)
+    begun = merging.begun_shards(shard_folder.parent)
+    others = [other for other in begun if other.folder != shard_folder]
     points, programs = _plan_without_launcher(options, resumed)
-    _refuse_other_sweep(shard_folder, options, points)
+    _refuse_other_sweep(options, shard_folder, points=points, others=others)
     programs = shards.share(programs, shard)
     trained = tables.Trained(shard_folder, programs)
     if resumed is not None and not trained.unfinished():

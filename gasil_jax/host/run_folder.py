@@ -12,7 +12,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from typing import Any, Required, TypedDict
+from typing import Any, NamedTuple, Required, TypedDict
 
 from gasil_jax.config import Config, validate
 from gasil_jax.errors import InputError
@@ -252,6 +252,18 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     except ValueError as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None
     return described
+
+
+class Begun(NamedTuple):
+    """A run, a sweep or a shard that has begun.
+
+    Attributes:
+      folder: its folder.
+      described: the content of its config.json, from `read`.
+    """
+
+    folder: pathlib.Path
+    described: Mapping[str, Any]
 
 
 #: The largest number of seeds; their keys are numbered up to 2**32.

@@ -6,7 +6,7 @@ import dataclasses
 import pathlib
 import shlex
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, TypeVar
 
 import jax
@@ -22,6 +22,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
+from gasil_jax.host.run_folder import Begun
 from gasil_jax.imitation import find_agent, unused
 
 
@@ -87,7 +88,7 @@ def parse(
     kind: type[T],
     arguments: Sequence[str] | None,
     program: str,
-    resumed: pathlib.Path | None = None,
+    resumed: Begun | None = None,
 ) -> T:
     """Return the command line's options, on top of the preset that they name.
 
@@ -95,16 +96,16 @@ def parse(
       kind: the class of the options.
       arguments: the command line; default the one that the program was started with.
       program: name of the module that was started.
-      resumed: folder of the run to continue. Its own options are then the
-        defaults, and the preset is not used.
+      resumed: the run to continue. Its own options are then the defaults, and the
+        preset is not used.
 
     Raises:
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if resumed is not None:
         stored = _stored(kind, resumed)
-        options = command_line.parse(kind, arguments, program, stored[0])
-        _refuse_changes(options, resumed, stored)
+        options = command_line.parse(kind, arguments, program, stored)
+        _refuse_changes(options, stored, resumed)
         return options
     given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
     with command_line.input_checked():
@@ -118,13 +119,13 @@ def parse(
     return command_line.parse(kind, arguments, program, default)
 
 
-def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
-    """Return the options of the run in a folder, and the content of its config.json.
+def _stored(kind: type[T], begun: Begun) -> T:
+    """Return the options of a run that has begun.
 
     Raises:
-      InputError: if another program has written it.
+      InputError: if another program has written them.
     """
-    described = run_folder.read(folder)
+    folder, described = begun
     fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
     # An option with the default None or False may be newer than the run.
     newer = {
@@ -141,32 +142,29 @@ def _stored(kind: type[T], folder: pathlib.Path) -> tuple[T, Mapping[str, Any]]:
         )
     if missing or set(described) - names - others:
         raise InputError(f"out is {folder}, which another program has written")
-    stored = newer | described
+    stored = {**newer, **described}
     values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
-    return kind(**values), described
+    return kind(**values)
 
 
-def _refuse_changes(
-    options: Options, folder: pathlib.Path, stored: tuple[Options, Mapping[str, Any]]
-) -> None:
+def _refuse_changes(options: Options, stored: Options, begun: Begun) -> None:
     """Raise `InputError` if a run was begun with other settings than these.
 
     Args:
       options: the options to continue with.
-      folder: folder of the run.
-      stored: what `_stored` returns for the folder.
+      stored: the options of the run.
+      begun: the run.
     """
-    before, described = stored
-    if changed := run_folder.differences(vars(before), vars(options)):
+    if changed := run_folder.differences(vars(stored), vars(options)):
         raise InputError(
-            f"resume continues the run in {folder}, where {'; '.join(changed)}: only "
-            "total_steps may change, and grow, and checkpoint_every, "
+            f"resume continues the run in {begun.folder}, where {'; '.join(changed)}: "
+            "only total_steps may change, and grow, and checkpoint_every, "
             "keep_checkpoints, devices and log"
         )
     with command_line.input_checked():
         expert = run_folder.expert_hash(options.config)
     now = {"expert": options.config.expert, **expert}
-    run_folder.refuse_other_expert(described, now, folder)
+    run_folder.refuse_other_expert(begun.described, now, begun.folder)
 
 
 def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
@@ -192,11 +190,12 @@ def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
     return kind(env=tyro.MISSING, config=Config(agent=agent))
 
 
-def resumed_folder(arguments: Sequence[str] | None) -> pathlib.Path | None:
-    """Return the folder of the run that --resume continues, or None if there is none.
+def resumed_run(arguments: Sequence[str] | None) -> Begun | None:
+    """Return the run that --resume continues, or None if there is none.
 
     Raises:
-      InputError: if --resume is given without --out, or without --env where no run is.
+      InputError: if --resume is given without --out, or without --env where no run is,
+        or if the run's config.json is damaged.
     """
     given = _first_arguments(arguments)
     if given is None or not given.resume:
@@ -204,7 +203,7 @@ def resumed_folder(arguments: Sequence[str] | None) -> pathlib.Path | None:
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
     if run_folder.is_described(given.out):
-        return given.out
+        return Begun(given.out, run_folder.read(given.out))
     if given.env is None:
         raise InputError(
             f"out is {given.out}, which holds no run to continue: to begin one there, "
@@ -351,7 +350,8 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     with run_folder.lock(folder):
         if options.resume and run_folder.is_described(folder):
             # Another process may have written to it since the options were parsed.
-            _refuse_changes(options, folder, _stored(type(options), folder))
+            begun = Begun(folder, run_folder.read(folder))
+            _refuse_changes(options, _stored(type(options), begun), begun)
         else:
             run_folder.refuse_used(folder)
         try:

@@ -6,6 +6,7 @@ from typing import Any
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
+from gasil_jax.host.run_folder import Begun
 from gasil_jax.sweeps import shards, tables
 
 
@@ -23,49 +24,56 @@ def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
     return {name: x for name, x in described.items() if name != "shard"}
 
 
-def refuse_different(
-    first: tuple[pathlib.Path, Mapping[str, Any]],
-    other: tuple[pathlib.Path, Mapping[str, Any]],
-) -> None:
-    """Raise `InputError` if two shards are not of the same sweep and the same expert.
-
-    Args:
-      first: folder of a shard and the content of its config.json.
-      other: the same of the other one.
-    """
-    before, now = _comparable(first[1]), _comparable(other[1])
+def refuse_different(first: Begun, other: Begun) -> None:
+    """Raise `InputError` if two shards are not of one sweep with one expert."""
+    before, now = _comparable(first.described), _comparable(other.described)
     # total_steps may not grow here.
     changed = run_folder.differences(before, now)
     changed = changed or run_folder.differences(now, before)
     if changed:
         raise InputError(
-            f"{other[0]} is of another sweep than {first[0]}: {'; '.join(changed)}"
+            f"{other.folder} is of another sweep than {first.folder}: "
+            f"{'; '.join(changed)}"
         )
-    run_folder.refuse_other_expert(first[1], run_folder.flat(other[1]), first[0])
+    own = run_folder.flat(other.described)
+    run_folder.refuse_other_expert(first.described, own, first.folder)
 
 
-def _read(folder: pathlib.Path) -> dict[str, Any]:
+def _read(folder: pathlib.Path) -> Begun:
     described = run_folder.read(folder)
     if not isinstance(described.get("shard"), str) or "points" not in described:
         raise InputError(f"folder is {folder}: it must be of a sweep's shard")
-    return described
+    return Begun(folder, described)
 
 
-def _read_all(folders: Sequence[pathlib.Path]) -> dict[pathlib.Path, dict[str, Any]]:
-    """Return each shard's config.json, after checking that they make one sweep."""
-    every = {path: _read(path) for folder in folders for path in _shard_folders(folder)}
-    (first, described), *others = every.items()
+def begun_shards(inside: pathlib.Path) -> list[Begun]:
+    """Return the shards of a sweep that have begun.
+
+    Args:
+      inside: the folder that holds the shards, which may be missing.
+
+    Raises:
+      InputError: if one of them is damaged.
+    """
+    paths = sorted(inside.glob("*-of-*"))
+    return [_read(path) for path in paths if run_folder.is_described(path)]
+
+
+def _read_all(folders: Sequence[pathlib.Path]) -> list[Begun]:
+    """Return the shards in order, after checking that they make one sweep."""
+    paths = [path for folder in folders for path in _shard_folders(folder)]
+    first, *others = every = [_read(path) for path in dict.fromkeys(paths)]
     for other in others:
-        refuse_different((first, described), other)
-    folder_of: dict[shards.Shard, pathlib.Path] = {}
-    for path, content in every.items():
-        shard = shards.parse(content["shard"])
-        if shard in folder_of:
+        refuse_different(first, other)
+    begun: dict[shards.Shard, Begun] = {}
+    for each in every:
+        shard = shards.parse(each.described["shard"])
+        if shard in begun:
             raise InputError(
-                f"shard {shard} is there twice: {folder_of[shard]}, {path}"
+                f"shard {shard} is there twice: {begun[shard].folder}, {each.folder}"
             )
-        folder_of[shard] = path
-    counts = {shard.count for shard in folder_of}
+        begun[shard] = each
+    counts = {shard.count for shard in begun}
     if len(counts) > 1:
         raise InputError(
             f"there are shards of {' and of '.join(map(str, sorted(counts)))}: name "
@@ -73,21 +81,19 @@ def _read_all(folders: Sequence[pathlib.Path]) -> dict[pathlib.Path, dict[str, A
         )
     count = counts.pop()
     expected = [shards.Shard(number, count) for number in range(1, count + 1)]
-    missing = [str(shard) for shard in expected if shard not in folder_of]
+    missing = [str(shard) for shard in expected if shard not in begun]
     if missing:
         raise InputError(f"missing: shards {', '.join(missing)}, which have not begun")
-    return {folder_of[shard]: every[folder_of[shard]] for shard in expected}
+    return [begun[shard] for shard in expected]
 
 
-def _refuse_used(
-    out: pathlib.Path, shard: tuple[pathlib.Path, Mapping[str, Any]]
-) -> None:
+def _refuse_used(out: pathlib.Path, shard: Begun) -> None:
     """Refuse a folder that holds anything but earlier tables of the same shards."""
     if run_folder.is_described(out):
-        earlier = run_folder.read(out)
+        earlier, now = run_folder.read(out), shard.described
         # The shards may have been continued to more total_steps since.
-        if run_folder.differences(_comparable(earlier), _comparable(shard[1])):
-            refuse_different((out, earlier), shard)
+        if run_folder.differences(_comparable(earlier), _comparable(now)):
+            refuse_different(Begun(out, earlier), shard)
         # A single run has no points, and a sweep that was not merged has programs.
         used = "points" not in earlier or (out / "programs").is_dir()
     else:
@@ -108,13 +114,13 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
         holds something else.
     """
     every = _read_all(folders)
-    described = next(iter(every.values()))
+    described = every[0].described
     points = described["points"]
     seeds = run_folder.seeds_of(described)
-    parts = [tables.Trained.described(*shard) for shard in every.items()]
+    parts = [tables.Trained.described(*shard) for shard in every]
     unfinished = [
-        content["shard"]
-        for part, content in zip(parts, every.values(), strict=True)
+        shard.described["shard"]
+        for part, shard in zip(parts, every, strict=True)
         if part.unfinished()
     ]
     if unfinished:
@@ -123,7 +129,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
         )
     run_folder.create(out)
     with run_folder.lock(out):
-        _refuse_used(out, next(iter(every.items())))
-        content = described | {"shard": None, "resume": False, "out": str(out)}
-        run_folder.describe(out, content)
+        _refuse_used(out, every[0])
+        own = {"shard": None, "resume": False, "out": str(out)}
+        run_folder.describe(out, {**described, **own})
         return tables.write(out, points, seeds, parts)

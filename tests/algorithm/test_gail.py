@@ -153,7 +153,8 @@ def test_a_run_does_not_continue_with_another_expert(expert, tmp_path, capsys):
     assert main([*continued, "--env", "point_mass"]) == 2
     assert "whose trajectories are not those with which" in capsys.readouterr().err
     shutil.copy(expert[1], path)
-    options = run_options.parse(run_options.Options, continued, "gasil_jax.run", out)
+    begun = run_options.resumed_run(continued)
+    options = run_options.parse(run_options.Options, continued, "gasil_jax.run", begun)
     assert options.config.total_steps == 256
 
 

@@ -231,7 +231,8 @@ def test_settings_that_changed_before_the_lock_are_refused(whole, tmp_path):
     """Another process may have trained in the folder since they were read."""
     out = copy(whole, tmp_path)
     arguments = ["--resume", "--out", str(out)]
-    options = run_options.parse(run.Options, arguments, "gasil_jax.run", out)
+    begun = run_options.resumed_run(arguments)
+    options = run_options.parse(run.Options, arguments, "gasil_jax.run", begun)
     path = out / "config.json"
     changed = json.loads(path.read_text())
     changed["config"]["total_steps"] *= 2

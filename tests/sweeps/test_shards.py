@@ -69,16 +69,15 @@ def test_counts_share_a_program_where_that_is_asked_for():
 
 
 GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
+SMALL = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
+SMALL += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
 
 
 def train(folder, shard=None, *arguments):
     """Write the files of a trained sweep, with metrics that tell members apart."""
-    small = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
-    small += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
+    part = ("--shard", shard) if shard else ()
     options = command_line.parse(
-        sweep.Options,
-        [*small, "--grid", *GRID, *arguments, *(("--shard", shard) if shard else ())],
-        "x",
+        sweep.Options, [*SMALL, "--grid", *GRID, *arguments, *part], "x"
     )
     folder = folder if shard is None else shards.parse(shard).folder(folder)
     folder.mkdir(parents=True)
@@ -245,7 +244,9 @@ def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, caps
         assert "is cut into 2 shards" in capsys.readouterr().err
 
 
-def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
+@pytest.fixture
+def jobs_to_train(monkeypatch):
+    """The jobs that are trained in a test, where training is interrupted at once."""
     jobs_to_train = []
 
     def interrupted_at_once(options, env, jobs, **_):
@@ -253,6 +254,10 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
         raise Interrupted(signal.SIGTERM)
 
     monkeypatch.setattr(assembly, "train", interrupted_at_once)
+    return jobs_to_train
+
+
+def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
     trained, _ = train(tmp_path, "1/2")
     folder = trained.folder
     more = ["--env", "point_mass", "--grid", *GRID, "--out", str(tmp_path)]
@@ -264,7 +269,8 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
     assert sweep.main([*same, "--resume", "--gamma", "0.9"]) == 2
     assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
     # The shard's own settings are used, and nothing is left to do.
-    resumed = ([*same, "--resume"], ["--resume", "--out", str(folder)])
+    of_the_sweep = ["--resume", "--out", str(tmp_path), "--shard", "1/2"]
+    resumed = ([*same, "--resume"], of_the_sweep, ["--resume", "--out", str(folder)])
     for command in resumed:
         assert sweep.main(command) == 0
         assert "shard 1/2 is done" in capsys.readouterr().out
@@ -288,6 +294,22 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, monkeypatch):
     begin += ["--out", str(tmp_path / "other")]
     assert sweep.main(begin) == 128 + signal.SIGTERM
     assert sum(len(job.program.members) for job in jobs_to_train) == 6
+
+
+def test_the_first_shard_has_no_expert_to_compare(tmp_path, monkeypatch, jobs_to_train):
+    hashed = []
+    original = run_folder.expert_hash
+
+    def expert_hash(config):
+        hashed.append(config)
+        return original(config)
+
+    monkeypatch.setattr(run_folder, "expert_hash", expert_hash)
+    more = [*SMALL, "--grid", *GRID, "--out", str(tmp_path), "--shard"]
+    for part, count in (("1/2", 1), ("2/2", 3)):
+        assert sweep.main([*more, part]) == 128 + signal.SIGTERM
+        # Each is written to config.json.
+        assert len(hashed) == count
 
 
 def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):

@@ -14,10 +14,10 @@ from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.host import command_line, run_options
+from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.members import Members
+from gasil_jax.sweeps import assembly, saved_states, shards, tables
 from gasil_jax.sweeps import points as sweep_points
-from gasil_jax.sweeps import saved_states, shards, tables
 from gasil_jax.sweeps.points import PAPER_RANGES
 
 SMALL = (
@@ -284,7 +284,9 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
 
 
-def test_a_sweep_continues_with_its_own_points_from_any_file(tmp_path, capsys):
+def test_a_sweep_continues_with_its_own_points_from_any_file(
+    tmp_path, capsys, monkeypatch
+):
     first, copy, other = (tmp_path / f"{name}.json" for name in ("a", "b", "c"))
     points = [{"alpha": 0.1}, {"alpha": 1.0, "discriminator_updates": 2}]
     for path, listed in ((first, points), (copy, points), (other, points[:1])):
@@ -300,13 +302,22 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(tmp_path, capsys):
     assert "a sweep of other points has begun" in capsys.readouterr().err
     assert sweep.main([*arguments, str(copy), "--seeds", "3"]) == 2
     assert "seeds was 1, is 3: only" in capsys.readouterr().err
-    options = run_options.parse(sweep.Options, [*arguments, str(copy)], "x", out)
-    assert sweep.plan(options)[0] == points
-    sweep.check_points(points, out)
+    planned, read = [], []
+
+    def prepare(options, programs, unfinished):
+        planned.append([program.hyperparameters[0].alpha for program in programs])
+        raise InputError("enough")
+
+    original = run_folder.read
+    monkeypatch.setattr(assembly, "prepare", prepare)
+    monkeypatch.setattr(
+        run_folder, "read", lambda folder: read.append(folder) or original(folder)
+    )
+    assert sweep.main([*arguments, str(copy)]) == 2
     # Its config.json has the points as well.
     first.unlink()
-    options = run_options.parse(sweep.Options, [*SMALL, "--resume"], "x", out)
-    assert sweep._plan_without_launcher(options, out)[0] == points
+    assert sweep.main(["--resume", "--out", str(out)]) == 2
+    assert planned == [[0.1, 1.0]] * 2 and read == [out] * 2
     other.unlink()
     assert sweep.main([*arguments, str(other)]) == 2
     assert "c.json, which can't be read" in capsys.readouterr().err
