@@ -161,8 +161,7 @@ def _placement(
 def _points(options: Options, begun: Sequence[Begun]) -> list[dict[str, Any]]:
     """Return the points, which what has begun of the sweep has in its config.json too.
 
-    Those of config.json are taken if the file that listed the points is gone. A
-    launcher, and a shard that has not begun, need the file.
+    Those of config.json are taken if the file that listed the points is gone.
     """
     file = options.points_file
     if file is not None and not pathlib.Path(file).exists():
@@ -223,15 +222,16 @@ def _refuse_other_points(points: Sequence[Point], resumed: Begun) -> None:
 
 
 def _plan_without_launcher(
-    options: Options, resumed: Begun | None
+    options: Options, resumed: Begun | None, others: Sequence[Begun] = ()
 ) -> tuple[list[dict[str, Any]], list[Program]]:
     """Return what `plan` does; refuse other points than before, and --shards.
 
     Args:
       options: the options, of a sweep or a shard.
       resumed: the sweep or the shard that is continued, if any.
+      others: the sweep's other shards that have begun.
     """
-    points, programs = plan(options, [resumed] if resumed else ())
+    points, programs = plan(options, [resumed, *others] if resumed else others)
     if resumed is not None:
         _refuse_other_points(points, resumed)
     if options.shards is not None:
@@ -302,7 +302,7 @@ def _train_shard(
     options = dataclasses.replace(options, out=shard_folder)
     begun = merging.begun_shards(shard_folder.parent)
     others = [other for other in begun if other.folder != shard_folder]
-    points, programs = _plan_without_launcher(options, resumed)
+    points, programs = _plan_without_launcher(options, resumed, others)
     _refuse_other_sweep(options, shard_folder, points=points, others=others)
     programs = shards.share(programs, shard)
     trained = tables.Trained(shard_folder, programs)
@@ -330,7 +330,8 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
         raise InputError(f"{given}--launcher needs --shards, 1 or more")
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
-    points, programs = plan(options)
+    begun = merging.begun_shards(shards.root(options.out))
+    points, programs = plan(options, begun)
     last = shards.Shard(options.shards, options.shards)
     shards.share(programs, last)  # Refuses more shards than members.
     shards.refuse_whole(options.out)

@@ -296,6 +296,33 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
     assert sum(len(job.program.members) for job in jobs_to_train) == 6
 
 
+def test_shards_need_no_file_of_points_once_one_has_begun(
+    tmp_path, capsys, jobs_to_train, monkeypatch
+):
+    launched = []
+    monkeypatch.setitem(launch.LAUNCHERS, "local", lambda *jobs: launched.append(jobs))
+    path, out = tmp_path / "points.json", tmp_path / "out"
+    path.write_text('[{"alpha": 0.1}, {"num_epochs": 3}]')
+    more = [*SMALL, "--out", str(out), "--points-file"]
+    assert sweep.main([*more, str(path), "--shard", "1/2"]) == 128 + signal.SIGTERM
+    assert jobs_to_train.pop().program.members == ((0, 0), (0, 1), (0, 2))
+    path.unlink()
+    launcher = ["--launcher", "local", "--shards", "2", "--resume"]
+    for part in (["--shard", "2/2"], launcher):
+        assert sweep.main([*more, str(tmp_path / "other.json"), *part]) == 2
+        assert "other.json, which can't be read" in capsys.readouterr().err
+    assert sweep.main([*more, str(path), "--shard", "2/2", "--gamma", "0.9"]) == 2
+    assert "is of another sweep" in capsys.readouterr().err
+    assert not jobs_to_train
+    assert sweep.main([*more, str(path), "--shard", "2/2"]) == 128 + signal.SIGTERM
+    (job,) = jobs_to_train
+    assert job.program.members == ((1, 0), (1, 1), (1, 2))
+    assert job.program.config.num_epochs == 3
+    assert sweep.main([*more, str(path), *launcher]) == 2
+    assert "not finished: shards 1/2, 2/2" in capsys.readouterr().err
+    assert len(launched) == 1
+
+
 def test_the_first_shard_has_no_expert_to_compare(tmp_path, monkeypatch, jobs_to_train):
     hashed = []
     original = run_folder.expert_hash
