@@ -137,7 +137,7 @@ def _train(name: str, options: Options) -> None:
     while True:
         stored, searched = stores()
         requested = chosen.requested(searched)
-        missing = stored.missing(engine.share(requested, shard))
+        missing = stored.missing(engine.select_by_key(requested, shard))
         print(f"{name}: {len(missing)} runs are missing", flush=True)
         if options.list or not missing:
             break

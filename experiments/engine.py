@@ -142,7 +142,7 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     return [Program(ordered(group), setup) for group in groups.values()]
 
 
-def share(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
+def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
     """Return the runs of a shard, the same on each machine.
 
     A run's key alone decides, so that no run changes its shard when others join.

@@ -304,7 +304,7 @@ def _train_shard(
     others = [other for other in begun if other.folder != shard_folder]
     points, programs = _plan_without_launcher(options, resumed, others)
     _refuse_other_sweep(options, shard_folder, points=points, others=others)
-    programs = shards.share(programs, shard)
+    programs = shards.cut_evenly(programs, shard)
     trained = tables.Trained(shard_folder, programs)
     if resumed is not None and not trained.unfinished():
         print(f"shard {shard} is done, in {shard_folder}")
@@ -333,7 +333,7 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     begun = merging.begun_shards(shards.root(options.out))
     points, programs = plan(options, begun)
     last = shards.Shard(options.shards, options.shards)
-    shards.share(programs, last)  # Refuses more shards than members.
+    shards.cut_evenly(programs, last)  # Refuses more shards than members.
     shards.refuse_whole(options.out)
     shards.refuse_recut(options.out, last)
     shards.refuse_used(options.out, options.resume)

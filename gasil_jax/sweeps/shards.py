@@ -191,7 +191,7 @@ def parse(text: str) -> Shard:
     return shard
 
 
-def share(whole: Sequence[Program], shard: Shard) -> list[Program]:
+def cut_evenly(whole: Sequence[Program], shard: Shard) -> list[Program]:
     """Return the programs that a shard trains, each with the shard's members only.
 
     Sizes of shards differ by at most one member. Each member is in exactly one shard.

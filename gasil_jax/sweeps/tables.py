@@ -100,7 +100,7 @@ class Trained:
             content["config"], content["points"], seeds, content["share_counts"]
         )
         if content["shard"] is not None:
-            programs = shards.share(programs, shards.parse(content["shard"]))
+            programs = shards.cut_evenly(programs, shards.parse(content["shard"]))
         return cls(folder, programs)
 
     def unfinished(self) -> list[int]:

@@ -78,14 +78,14 @@ def test_runs_with_other_counts_share_a_program_on_request():
 
 def test_shards_are_all_runs_once_and_none_moves_when_others_join():
     runs = [run(seed) for seed in range(60)]
-    shards = [engine.share(runs, Shard(number, 3)) for number in (1, 2, 3)]
+    shards = [engine.select_by_key(runs, Shard(number, 3)) for number in (1, 2, 3)]
     assert sorted(x.seed for shard in shards for x in shard) == list(range(60))
     assert all(10 < len(shard) < 30 for shard in shards)
     for number, shard in enumerate(shards, start=1):
-        assert engine.share(runs[:40], Shard(number, 3)) == [
+        assert engine.select_by_key(runs[:40], Shard(number, 3)) == [
             x for x in shard if x.seed < 40
         ]
-    assert engine.share(runs, Shard(1, 1)) == runs
+    assert engine.select_by_key(runs, Shard(1, 1)) == runs
 
 
 def test_a_record_is_what_make_train_gives(trained):

@@ -33,9 +33,9 @@ def test_shards_hold_each_member_once(updates, num_seeds, count):
     every = [shards.Shard(number, count) for number in range(1, count + 1)]
     if count > total:
         with pytest.raises(InputError, match=f"{total} members"):
-            shards.share(whole, every[0])
+            shards.cut_evenly(whole, every[0])
         return
-    parts = [shards.share(whole, shard) for shard in every]
+    parts = [shards.cut_evenly(whole, shard) for shard in every]
     sizes = [sum(len(program.members) for program in part) for part in parts]
     assert max(sizes) - min(sizes) <= 1
     seen = [program for part in parts for program in part]
@@ -63,7 +63,7 @@ def test_counts_share_a_program_where_that_is_asked_for():
         for x in program.hyperparameters
     ]
     assert counts == [(5, 1000, 1.0), (20, 500, 0.1), (5, 500, 0.1)]
-    (second,) = shards.share(shared[:1], shards.Shard(2, 2))
+    (second,) = shards.cut_evenly(shared[:1], shards.Shard(2, 2))
     assert second.members == ((1, 7),)
     assert second.hyperparameters == shared[0].hyperparameters[1:]
 
@@ -83,7 +83,7 @@ def train(folder, shard=None, *arguments):
     folder.mkdir(parents=True)
     points, programs = sweep.plan(options)
     if shard is not None:
-        programs = shards.share(programs, shards.parse(shard))
+        programs = shards.cut_evenly(programs, shards.parse(shard))
     run_options.write_config(options, folder, points=points)
     for program in programs:
         program_folder = program.folder(folder)
