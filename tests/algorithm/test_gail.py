@@ -10,6 +10,7 @@ import minari
 import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax.host import run_options
@@ -141,10 +142,8 @@ def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
 def test_a_run_does_not_continue_with_another_expert(expert, tmp_path, capsys):
     path, out = tmp_path / "own.npz", tmp_path / "out"
     shutil.copy(expert[1], path)
-    command = ["--env", "point_mass", "--agent", "gail", "--expert", str(path)]
-    command += ["--total-steps", "128", "--batch-steps", "128", "--num-envs", "4"]
-    command += ["--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "4"]
-    command += ["--discriminator-hidden-sizes", "4", "--out", str(out)]
+    command = [*FLAGS, "--agent", "gail", "--expert", str(path)]
+    command += ["--total-steps", "128", "--out", str(out)]
     assert main(command) == 0
     with np.load(path) as arrays:
         others = {name: -arrays[name] for name in arrays}

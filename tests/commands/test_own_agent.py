@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import evaluate, merge, render, run, sweep
@@ -73,11 +74,7 @@ UNFINISHED = OWN._replace(update_and_reward=unfinished)
 GROWS = OWN._replace(init=start, update_and_reward=grows)
 NO_CLASS = OWN._replace(hyperparameters={"my_weight": 0.5})
 '''
-SMALL = (
-    *("--env", "point_mass", "--agent", "my_agents:OWN", "--total-steps", "256"),
-    *("--batch-steps", "128", "--num-envs", "4", "--num-epochs", "1"),
-    *("--hidden-sizes", "4", "--devices", "1"),
-)
+SMALL = (*FLAGS, "--agent", "my_agents:OWN", "--devices", "1")
 
 
 @pytest.fixture(autouse=True)

@@ -4,31 +4,15 @@ import csv
 
 import numpy as np
 import pytest
+from small_training import FLAGS
 
 from gasil_jax import plot, run
 from gasil_jax.errors import InputError
 
 
 def test_runs_are_drawn(tmp_path, capsys):
-    small = (
-        "--env",
-        "point_mass",
-        "--seeds",
-        "3",
-        "--total-steps",
-        "2048",
-        "--batch-steps",
-        "256",
-        "--num-envs",
-        "4",
-        "--num-epochs",
-        "1",
-        "--no-stagger-episodes",
-        "--hidden-sizes",
-        "8",
-        "--discriminator-hidden-sizes",
-        "8",
-    )
+    small = (*FLAGS, "--seeds", "3", "--no-stagger-episodes")
+    small += ("--total-steps", "2048", "--batch-steps", "256")
     folders = []
     for name, first_seed in (("ppo", "0"), ("others", "3")):
         folders.append(str(tmp_path / name))

@@ -17,36 +17,18 @@ import mujoco
 import numpy as np
 import pytest
 from PIL import Image
+from small_training import FLAGS
 
 from gasil_envs import locomotion
 from gasil_jax import policy, render, run
 from gasil_jax.host.members import member
 from gasil_jax.sweeps import saved_states
 
-SMALL = (
-    "--seeds",
-    "2",
-    "--total-steps",
-    "256",
-    "--batch-steps",
-    "128",
-    "--num-envs",
-    "4",
-    "--num-epochs",
-    "1",
-    "--minibatch-size",
-    "32",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
-)
-
 
 @pytest.fixture(scope="module")
 def point_mass(tmp_path_factory):
     out = tmp_path_factory.mktemp("render") / "run"
-    assert run.main(["--env", "point_mass", *SMALL, "--out", str(out)]) == 0
+    assert run.main([*FLAGS, "--seeds", "2", "--out", str(out)]) == 0
     return out
 
 

@@ -13,6 +13,7 @@ import types
 
 import brax.envs
 import pytest
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_envs import locomotion
@@ -21,33 +22,9 @@ from gasil_jax.run import main
 from gasil_jax.sweeps import assembly
 
 SMALL = (
-    "--env",
-    "point_mass",
-    "--seeds",
-    "3",
-    "--first-seed",
-    "5",
-    "--total-steps",
-    "1e3",
-    "--batch-steps",
-    "256",
-    "--num-envs",
-    "4",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
-    "--num-epochs",
-    "2",
-    "--alpha",
-    "0.5",
-    "--buffer-steps",
-    "300",
-    "--alpha-schedule",
-    "0",
-    "0.5",
-    "500",
-    "1",
+    *(*FLAGS, "--seeds", "3", "--first-seed", "5", "--total-steps", "1e3"),
+    *("--batch-steps", "256", "--num-epochs", "2", "--buffer-steps", "300"),
+    *("--alpha", "0.5", "--alpha-schedule", "0", "0.5", "500", "1"),
 )
 
 

@@ -9,7 +9,7 @@ import signal
 import jax
 import numpy as np
 import pytest
-import test_members
+import small_training
 
 import gasil_jax
 from gasil_jax import run
@@ -19,12 +19,10 @@ from gasil_jax.host.interruption import Interrupted
 
 # Iterations, the longest of a chunk, and the config of both ways to train.
 ITERATIONS, CHUNK = 100, 2
-CONFIG = test_members.SMALL.replace(agent="ppo", total_steps=ITERATIONS * 128)
+CONFIG = small_training.CONFIG.replace(agent="ppo", total_steps=ITERATIONS * 128)
 FLAGS = (
-    *("--env", "point_mass", "--agent", "ppo", "--total-steps", str(ITERATIONS * 128)),
-    *("--num-envs", "4", "--batch-steps", "128", "--minibatch-size", "32"),
-    *("--num-epochs", "1", "--hidden-sizes", "8", "--discriminator-hidden-sizes", "8"),
-    *("--preset", "paper"),
+    *(*small_training.FLAGS, "--agent", "ppo", "--preset", "paper"),
+    *("--total-steps", str(ITERATIONS * 128)),
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
 BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import test_members
 from brax.envs import State
+from small_training import CONFIG, FLAGS
 
 import gasil_jax
 from gasil_envs import wrappers
@@ -97,29 +98,8 @@ def test_an_update_that_is_not_finite_is_skipped_and_flagged():
 
 def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
     out = tmp_path / "out"
-    arguments = (
-        "--env",
-        "point_mass",
-        "--agent",
-        "ppo",
-        "--seeds",
-        "2",
-        "--total-steps",
-        "256",
-        "--batch-steps",
-        "128",
-        "--num-envs",
-        "4",
-        "--minibatch-size",
-        "32",
-        "--hidden-sizes",
-        "8",
-        "--num-epochs",
-        "1",
-        "--learning-rate",
-        "1e38",
-    )
-    assert run.main([*arguments, "--out", str(out)]) == 0
+    wild = ("--agent", "ppo", "--seeds", "2", "--learning-rate", "1e38")
+    assert run.main([*FLAGS, *wild, "--out", str(out)]) == 0
     told = capsys.readouterr().err
     assert "warning: numbers that were not finite in seeds [0, 1]" in told
     # While it trains, once.
@@ -156,7 +136,7 @@ class Fragile:
 
 def test_a_first_observation_is_looked_at_too():
     """It must not reach the buffer, nor the return of an evaluation."""
-    small = test_members.SMALL.replace(agent="ppo+gasil", total_steps=8 * 128)
+    small = CONFIG.replace(agent="ppo+gasil", total_steps=8 * 128)
     env = wrappers.EpisodeLimit(Fragile(bad_starts=True), 20)
     train = jax.jit(gasil_jax.make_train(env, small))
     state, metrics = train(jax.random.key(0))
@@ -178,9 +158,7 @@ def test_a_first_observation_is_looked_at_too():
 @pytest.mark.parametrize("limit", [20, 15])
 def test_a_reward_that_is_held_back_is_looked_at_too(limit):
     env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), 20), 10)
-    small = test_members.SMALL.replace(
-        agent="ppo", total_steps=4 * 128, max_episode_steps=limit
-    )
+    small = CONFIG.replace(agent="ppo", total_steps=4 * 128, max_episode_steps=limit)
     _, metrics = jax.jit(gasil_jax.make_train(env, small))(jax.random.key(0))
     assert metrics["faulty_steps"].sum() > 0
     assert metrics["skipped_updates"].sum() == 0

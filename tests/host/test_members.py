@@ -6,19 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_training import CONFIG
 
 import gasil_jax
 from gasil_jax.host.members import make_members
-
-SMALL = gasil_jax.Config(
-    total_steps=256,
-    num_envs=4,
-    batch_steps=128,
-    minibatch_size=32,
-    num_epochs=1,
-    hidden_sizes=(8,),
-    discriminator_hidden_sizes=(8,),
-)
 
 
 @functools.cache
@@ -29,7 +20,7 @@ def compiled(agent):
     that use it are of the group "members AGENT", so that it is compiled once.
     """
     env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
-    config = SMALL.replace(
+    config = CONFIG.replace(
         agent=agent,
         total_steps=4 * 128,
         buffer_steps=100,
@@ -63,7 +54,7 @@ def test_the_members_of_padded_states_are_taken_on_the_host():
 def test_a_seed_does_not_depend_on_the_number_of_devices():
     """With host calls in the environment; test_determinism.py has one without."""
     env = gasil_jax.make_env("halfcheetah", physics="mujoco")
-    config = SMALL.replace(agent="ppo")
+    config = CONFIG.replace(agent="ppo")
     results = []
     # Three members on two devices: one is padding.
     for devices, seeds in ((1, [6]), (2, [5, 6, 7])):

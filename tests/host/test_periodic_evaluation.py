@@ -12,7 +12,7 @@ import signal
 import jax
 import numpy as np
 import pytest
-import test_members
+from small_training import CONFIG, FLAGS
 
 import gasil_jax
 from gasil_jax import plot, run, sweep
@@ -31,40 +31,10 @@ ITERATIONS, EVERY, EPISODES = 22, 5, 3
 SEEDS = (5, 6, 7)
 # Three members on two devices: one is padding.
 SMALL = (
-    "--env",
-    "point_mass",
-    "--agent",
-    "ppo",
-    "--seeds",
-    "3",
-    "--first-seed",
-    "5",
-    "--devices",
-    "2",
-    "--total-steps",
-    str(ITERATIONS * 128),
-    "--num-envs",
-    "4",
-    "--batch-steps",
-    "128",
-    "--minibatch-size",
-    "32",
-    "--num-epochs",
-    "1",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
-    "--buffer-steps",
-    "300",
-    "--reward-delay",
-    "7",
-    "--learning-rate",
-    "0.01",
-    "--checkpoint-every",
-    str(8 * 128),
-    "--keep-checkpoints",
-    "99",
+    *(*FLAGS, "--agent", "ppo", "--seeds", "3", "--first-seed", "5", "--devices", "2"),
+    *("--total-steps", str(ITERATIONS * 128), "--buffer-steps", "300"),
+    *("--reward-delay", "7", "--learning-rate", "0.01"),
+    *("--checkpoint-every", str(8 * 128), "--keep-checkpoints", "99"),
 )
 # Rounded up to five iterations.
 EVALUATED = ("--evaluate-every", "600", "--evaluate-episodes", str(EPISODES))
@@ -281,7 +251,7 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
 def scored(tmp_path, seeds, devices, times=1):
     """Return the mean, lowest and highest return of each seed's amplified policy."""
     env = gasil_jax.make_env("point_mass", reward_delay=7)
-    config = test_members.SMALL.replace(agent="ppo")
+    config = CONFIG.replace(agent="ppo")
     members = make_members(env, config, seeds, devices=jax.devices()[:devices])
     states = members.init()
     # The first policies hardly move.

@@ -18,6 +18,7 @@ import jax
 import numpy as np
 import pytest
 import test_members
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import run
@@ -29,34 +30,9 @@ from gasil_jax.host.members import Members
 ITERATIONS = 400
 # PPO's state, which has the buffer too, compiles soonest; every agent's: below.
 SMALL = (
-    "--env",
-    "point_mass",
-    "--agent",
-    "ppo",
-    "--seeds",
-    "3",
-    "--devices",
-    "2",
-    "--total-steps",
-    str(ITERATIONS * 128),
-    "--batch-steps",
-    "128",
-    "--minibatch-size",
-    "32",
-    "--num-envs",
-    "4",
-    "--num-epochs",
-    "1",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
-    "--buffer-steps",
-    "300",
-    "--reward-delay",
-    "7",
-    "--obs-noise",
-    "0.1",
+    *(*FLAGS, "--agent", "ppo", "--seeds", "3", "--devices", "2"),
+    *("--total-steps", str(ITERATIONS * 128), "--buffer-steps", "300"),
+    *("--reward-delay", "7", "--obs-noise", "0.1"),
 )
 OFTEN = ("--checkpoint-every", str(20 * 128))
 

@@ -6,6 +6,7 @@ import time
 
 import numpy as np
 import pytest
+from small_training import FLAGS
 
 from gasil_jax import run, sweep
 from gasil_jax.errors import InputError
@@ -13,28 +14,8 @@ from gasil_jax.host import progress, run_options, trackers
 from gasil_jax.sweeps import assembly
 
 SMALL = (
-    "--env",
-    "point_mass",
-    "--agent",
-    "ppo",
-    "--seeds",
-    "2",
-    "--first-seed",
-    "3",
-    "--total-steps",
-    "512",
-    "--batch-steps",
-    "128",
-    "--num-envs",
-    "4",
-    "--num-epochs",
-    "1",
-    "--minibatch-size",
-    "32",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
+    *(*FLAGS, "--agent", "ppo", "--seeds", "2", "--first-seed", "3"),
+    *("--total-steps", "512"),
 )
 
 

@@ -9,6 +9,7 @@ import types
 import jax
 import numpy as np
 import pytest
+from small_training import FLAGS
 
 from gasil_jax import evaluate, merge, run, sweep
 from gasil_jax.config import Config
@@ -21,24 +22,8 @@ from gasil_jax.sweeps import points as sweep_points
 from gasil_jax.sweeps.points import PAPER_RANGES
 
 SMALL = (
-    "--env",
-    "point_mass",
-    "--preset",
-    "paper",
-    "--total-steps",
-    "512",
-    "--batch-steps",
-    "256",
-    "--num-envs",
-    "4",
-    "--hidden-sizes",
-    "8",
-    "--discriminator-hidden-sizes",
-    "8",
-    "--num-epochs",
-    "2",
-    "--buffer-steps",
-    "300",
+    *(*FLAGS, "--preset", "paper", "--total-steps", "512", "--batch-steps", "256"),
+    *("--minibatch-size", "64", "--num-epochs", "2", "--buffer-steps", "300"),
 )
 
 
