@@ -34,7 +34,7 @@ from gasil_jax.errors import unknown
 from gasil_jax.imitation import find_agent
 from gasil_jax.imitation.adaptive import RULES
 from gasil_jax.imitation.adversarial import BONUSES
-from gasil_jax.imitation.interface import Context, Imitation
+from gasil_jax.imitation.interface import Context, Imitation, checked
 from gasil_jax.networks import Policy, Value
 from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
@@ -198,9 +198,10 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
       ended in the batch are NaN if none did.
 
     Raises:
-      ValueError: if an agent's metric has a name that is taken.
+      ValueError: if an agent's metric has a name that is taken, or if one of its
+        functions returns what it may not.
     """
-    agent = find_agent(config.agent)
+    agent = checked(find_agent(config.agent), config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(

@@ -1,9 +1,11 @@
 """The interface between the training loop and an imitation method."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax.config import Config, Hyperparameters
@@ -106,6 +108,66 @@ class Imitation(NamedTuple):
     hyperparameters: type[Hyperparameters] = Hyperparameters
     num_streams: int = 1
     mix: Callable[[Any, jax.Array, Context], tuple[jax.Array, Metrics]] = one_advantage
+
+
+#: What the functions of an `Imitation` that train return, in order.
+_OUTPUTS: Mapping[str, tuple[str, ...]] = {
+    "update_and_reward": ("state", "rewards", "metrics"),
+    "update_policy": ("state", "actor_critic", "metrics"),
+    "mix": ("advantage", "metrics"),
+}
+
+
+def checked(agent: Imitation, name: str) -> Imitation:
+    """Return an agent whose functions refuse to return what the loop can't take.
+
+    Without it an error would name a line of the loop and not the agent's function.
+
+    Args:
+      agent: the agent.
+      name: its name, for the message.
+
+    Returns:
+      The agent. Its functions raise `ValueError` if they return more or fewer values
+      than are due, or rewards or an advantage of another shape.
+    """
+
+    def call(function: str, *arguments: Any) -> Any:
+        outputs, due = getattr(agent, function)(*arguments), _OUTPUTS[function]
+        count = len(outputs) if isinstance(outputs, tuple | list) else 1
+        if count != len(due):
+            raise ValueError(
+                f"{function} of agent {name!r} returns {count} "
+                f"value{'s' * (count != 1)}: it must return {len(due)}, "
+                f"{', '.join(due)}"
+            )
+        return outputs
+
+    def check_shape(function: str, what: str, value: Any, due: Any) -> None:
+        if jnp.shape(value) != due:
+            raise ValueError(
+                f"{function} of agent {name!r} returns {what} of shape "
+                f"{jnp.shape(value)}: it must be {due}"
+            )
+
+    def update_and_reward(state: Any, context: Context, key: jax.Array) -> Any:
+        outputs = call("update_and_reward", state, context, key)
+        rewards, due = outputs[1], context.rollout.reward.shape
+        if agent.num_streams > 1 or jnp.ndim(rewards) == 3:
+            due = (*due, agent.num_streams)
+        check_shape("update_and_reward", "rewards", rewards, due)
+        return outputs
+
+    def mix(state: Any, advantages: jax.Array, context: Context) -> Any:
+        outputs = call("mix", state, advantages, context)
+        check_shape("mix", "an advantage", outputs[0], advantages.shape[:2])
+        return outputs
+
+    return agent._replace(
+        update_and_reward=update_and_reward,
+        update_policy=functools.partial(call, "update_policy"),
+        mix=mix,
+    )
 
 
 def leave_policy(

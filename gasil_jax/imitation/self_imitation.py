@@ -12,6 +12,11 @@ advantage is clipped at one standard deviation of the returns (they divide rewar
 it). The mean is over the steps with a positive advantage, or over 64 if they are fewer.
 The advantage of the first term is in units of that standard deviation. That of the
 second term is in the unit of the returns, as in PPO's value loss here.
+
+R is of rewards that were not clipped. V learns from those that PPO gets, so where many
+normalized rewards are clipped (the metric `clipped_rewards`) R - V is too large. If an
+iteration's update is undone because it is not finite, so is its insertion into the
+replay, and the episodes that ended in it are lost for PPO+SIL.
 """
 
 from typing import Any, NamedTuple

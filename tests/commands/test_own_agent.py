@@ -73,6 +73,15 @@ MANY = OWN._replace(update_and_reward=rewards)
 UNFINISHED = OWN._replace(update_and_reward=unfinished)
 GROWS = OWN._replace(init=start, update_and_reward=grows)
 NO_CLASS = OWN._replace(hyperparameters={"my_weight": 0.5})
+TWO = OWN._replace(update_and_reward=lambda state, context, key: (state, {}))
+FOUR = OWN._replace(update_policy=lambda state, policy, *_: (state, policy, {}, {}))
+ONE = OWN._replace(mix=lambda state, advantages, context: advantages[..., 0])
+SUMMED = OWN._replace(
+    update_and_reward=lambda state, context, key: (
+        state, context.rollout.reward.sum(axis=0), {}
+    )
+)
+UNMIXED = OWN._replace(mix=lambda state, advantages, context: (advantages, {}))
 '''
 SMALL = (*FLAGS, "--agent", "my_agents:OWN", "--devices", "1")
 
@@ -133,6 +142,11 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:MISSPELT", "says that it uses 'alhpa': it must be the name"),
         ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
         ("my_agents:MANY", "'my_rewards' .* has shape .*: it must be one number"),
+        ("my_agents:TWO", "reward .* returns 2 values: .* 3, state, rewards, metrics"),
+        ("my_agents:FOUR", "update_policy .* returns 4 values: .* 3, state, actor_"),
+        ("my_agents:ONE", "mix of agent .* returns 1 value: .* 2, advantage, metrics"),
+        ("my_agents:SUMMED", r"returns rewards of shape \(4,\): it must be \(32, 4\)"),
+        ("my_agents:UNMIXED", r"mix .* advantage of shape \(32, 4, 1\): .* \(32, 4\)"),
         (
             "my_agents:UNFINISHED",
             r"can't be traced: AttributeError: .*my_agents.py, li",

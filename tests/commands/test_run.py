@@ -269,7 +269,6 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
         ("brax:ant", "nothing for agent 'ppo+gasil' on brax:ant with dense rewards"),
         ("walker2d --agent ppo+bonus --preset paper", None),
         ("walker2d --agent ppo --reward-delay 20", None),
-        ("walker2d --agent ppo --preset decomposed", "preset 'decomposed' has nothing"),
         ("walker2d --agent ppo --preset decomposed --reward-delay 20", None),
     ],
 )
