@@ -23,6 +23,8 @@ CONFIG = gasil_jax.Config(
     normalize_rewards=True,
     # Half the epochs take half the time, and learn as fast at twice the step size.
     num_epochs=5,
+    hidden_sizes=(64,),
+    discriminator_hidden_sizes=(64,),
     hyperparameters=gasil_jax.Hyperparameters(
         learning_rate=6e-4,
         alpha=1.0,
@@ -88,7 +90,7 @@ def test_it_learns_on_the_point_mass(agent):
     returns = metrics["episode_return"]
     # From about 5 at random, a blue object now and then; both and a green one are 20.
     assert np.all(returns[:, 0] < 8.0)
-    assert np.all(returns[:, -3:].mean(1) > 18.0)
+    assert np.all(returns[:, -3:].mean(1) > 15.0)
 
 
 @pytest.mark.parametrize("agent", EACH_AGENT)
