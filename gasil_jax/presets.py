@@ -176,18 +176,15 @@ def preset(
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", str(env), ours, others))
     if name != DEFAULT and not has_overrides(env, agent, name, reward_delay):
-        rows = PRESETS[name].delayed if reward_delay > 1 else PRESETS[name].dense
+        delayed, rows = reward_delay > 1, _rows(PRESETS[name], reward_delay)
         raise ValueError(
             f"preset {name!r} has nothing for agent {agent!r} on {env} with "
-            f"{_kind(reward_delay)} rewards: it has {_listed(rows)}"
+            f"{'delayed' if delayed else 'dense'} rewards: it has "
+            + (_listed(rows) or f"rows for {'dense' if delayed else 'delayed'} ones")
         )
     chosen = PRESETS[name]
     row = _row(chosen, env, agent, reward_delay)
     return Config(agent=agent).replace(**{**chosen.every, **row})
-
-
-def _kind(reward_delay: int) -> str:
-    return "delayed" if reward_delay > 1 else "dense"
 
 
 def _listed(rows: Rows) -> str:
@@ -196,7 +193,7 @@ def _listed(rows: Rows) -> str:
     for env, agent in rows:
         by_agent.setdefault(agent, []).append(env)
     words = [f"{agent} on {', '.join(envs)}" for agent, envs in by_agent.items()]
-    return "; ".join(words) or "no rows for such rewards"
+    return "; ".join(words)
 
 
 def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> bool:
@@ -206,5 +203,8 @@ def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> boo
 
 
 def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides:
-    rows = chosen.delayed if reward_delay > 1 else chosen.dense
-    return rows.get((env, agent), {})
+    return _rows(chosen, reward_delay).get((env, agent), {})
+
+
+def _rows(chosen: Preset, reward_delay: int) -> Rows:
+    return chosen.delayed if reward_delay > 1 else chosen.dense
