@@ -296,7 +296,6 @@ _SCHEDULED = Arm(
     "ppo+gasil",
     {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
 )
-_LONG: Any = {"base": Search, "total_steps": 3_000_000}
 _PAPERS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
 #: Adaptive imitation, and without one of its parts at a time.
 _PARTS = [
@@ -483,10 +482,16 @@ FIGURES: Mapping[str, Figure] = {
         "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
         "where the reward is delayed.",
         joined(
-            [
-                grid(("humanoid",), _PAPERS, (1, DELAY), **_LONG),
-                grid(("humanoid",), [_SCHEDULED], **_LONG),
-            ]
+            grid(("humanoid",), arms, (delay,), base=base, total_steps=3_000_000)
+            for arms, delay, base in (
+                ([*(Arm(x, x) for x in PAIR), _SCHEDULED], 1, Search),
+                (
+                    [Arm("ppo (decomposed)", "ppo")],
+                    DELAY,
+                    functools.partial(Search, decompose_rewards=True),
+                ),
+                ([_SCALED], DELAY, "scaled"),
+            )
         ),
     ),
     "delays": Figure(
