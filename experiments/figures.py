@@ -509,7 +509,7 @@ FIGURES: Mapping[str, Figure] = {
             )
             for tasks, arms, delays, base, seeds in (
                 (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
-                (TASKS[:3], _NOT_CLIPPED, _DELAYS[3:], _usual_delay, 10),
+                (TASKS[:3], _NOT_CLIPPED, _DELAYS[-1:], _usual_delay, 10),
                 (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
                 (TASKS[:3], _LAMBDA_WITH_AND_WITHOUT[:1], _DELAYS, "scaled", 10),
                 # The others' episodes are shorter at first.

@@ -309,6 +309,7 @@ def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
         agent="ppo",
         total_steps=20 * 2048,
         num_epochs=5,
+        hidden_sizes=(64,),
         decomposition_minibatch_size=16,
         decomposition_hidden_sizes=(32,),
         hyperparameters=gasil_jax.Hyperparameters(learning_rate=6e-4),
