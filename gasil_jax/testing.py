@@ -1,4 +1,4 @@
-"""What the tests of an agent of one's own need."""
+"""A helper for the tests of your own agent."""
 
 from typing import Any
 
@@ -13,14 +13,15 @@ from gasil_jax.networks import Policy, Value
 
 @full_precision
 def example_context(env: Any, config: Config, key: jax.Array) -> Context:
-    """Return what an agent's functions get in the first iteration with a key.
+    """Return the `Context` that an agent's functions get in the first iteration.
 
-    The batch is an untrained policy's. The buffer has the whole episodes that ended in
-    it, so it is empty if a batch is shorter than an episode.
+    The batch is collected with the untrained policy. The buffer holds the whole
+    episodes that ended in the batch, so it is empty if a batch is shorter than an
+    episode.
 
     Args:
       env: one environment.
-      config: of the agent; its sizes decide the shapes.
+      config: the config of a run of the agent.
       key: random key; consumed.
 
     Raises:
@@ -41,7 +42,9 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
         policy=policy.apply,
         hyperparameters=hyperparameters,
     )
-    history, buffer = train.remember(config, state, batch, hyperparameters)
+    history, buffer = train.update_good_trajectories(
+        config, state, batch, hyperparameters
+    )
     rewards, _ = train.learner_rewards(
         env,
         config,

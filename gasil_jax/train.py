@@ -43,20 +43,21 @@ Metrics = dict[str, jax.Array]
 
 
 class TrainState(struct.PyTreeNode):
-    """All that a run needs to continue, and nothing that it can do without.
+    """The complete state of a run: everything that its next iteration depends on.
 
     Attributes:
-      actor_critic: policy and values, with their optimizers' states.
-      normalizer: of observations.
-      reward_decomposition: of rewards; None where they are not decomposed.
-      reward_normalizer: of rewards; None where they are not normalized.
+      actor_critic: the policy and value networks, with their optimizers' states.
+      normalizer: running mean and variance of observations.
+      reward_decomposition: the network that decomposes rewards, and its state; None if
+        rewards are not decomposed.
+      reward_normalizer: running scale of rewards; None if they are not normalized.
       environments: the running episodes, (env, ...).
       history: the last steps of each environment, (env, steps, ...).
-      good_trajectories: the buffer B of the paper.
-      imitation: the state of the agent's way of imitating.
-      hyperparameters: the numbers that this run trains with.
-      key: consumed by the next iteration.
-      iteration: int32 (), iterations done.
+      good_trajectories: the good-trajectory buffer, B in the paper.
+      imitation: the state of the agent's `Imitation`, such as its discriminator.
+      hyperparameters: the run's hyperparameters, float32 () each, before schedules.
+      key: random key of the next iteration.
+      iteration: int32 (), number of iterations done.
     """
 
     actor_critic: ActorCritic
@@ -73,7 +74,7 @@ class TrainState(struct.PyTreeNode):
 
 
 def max_episode_steps(env: Any, config: Config) -> int:
-    """Steps after which an episode is truncated, at the latest."""
+    """Return the number of steps after which an episode is truncated."""
     return config.max_episode_steps or int(getattr(env, "episode_length", 1000))
 
 
@@ -88,17 +89,17 @@ def init(
 
     Args:
       env: one environment with Brax's interface, not wrapped to reset itself.
-      config: decides the agent and all shapes; only `make_train` checks it.
+      config: the agent and all sizes; only `make_train` checks it.
       key: random key; consumed.
       hyperparameters: scalars, which may be traced; default the config's.
 
     Raises:
-      ValueError: if a hyperparameter that is not traced is not allowed.
+      ValueError: if a hyperparameter is out of its range and not traced.
     """
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
     validate_hyperparameters(config, hyperparameters)
-    # Of the agent's class, with its own numbers.
+    # `Config` converts them to the class that the agent declares.
     hyperparameters = config.replace(hyperparameters=hyperparameters).hyperparameters
     hyperparameters = jax.tree.map(
         lambda x: jnp.asarray(x, jnp.float32), hyperparameters
@@ -142,8 +143,8 @@ def init(
             age_limit=episode_steps if config.stagger_episodes else None,
         ),
         history=history,
-        # The configuration's own number decides the shape, a member's how much of it
-        # is filled.
+        # The config's buffer_steps is the size of the arrays. That of this run, which
+        # may be traced, limits how many steps are filled.
         good_trajectories=good_trajectories.init(
             int(config.hyperparameters.buffer_steps), *sizes
         ),
@@ -170,8 +171,8 @@ def _init_actor_critic(
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(hyperparameters)
     num_streams = find_agent(config.agent).num_streams
-    # The first value gets the key itself, so that it is the same in all agents; `clone`
-    # tells JAX's check of keys that the key is meant to be used twice.
+    # The first value network uses the key itself, so that all agents initialize it
+    # alike. `clone` allows this second use where JAX checks that keys are not reused.
     others = jax.random.split(jax.random.clone(value_key), num_streams)[1:]
     value_keys = [value_key, *others]
     policy_params = policy.init(policy_key, observation)
@@ -198,8 +199,8 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
       ended in the batch are NaN if none did.
 
     Raises:
-      ValueError: if an agent's metric has a name that is taken, or if one of its
-        functions returns what it may not.
+      ValueError: if an agent's metric has a name that another metric has, or if one of
+        the agent's functions returns too few or too many values, or a wrong shape.
     """
     agent = checked(find_agent(config.agent), config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
@@ -211,10 +212,10 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     environments, batch = sample_trajectories(
         env, config, state, act_key, policy=policy, hyperparameters=hyperparameters
     )
-    # Update the good trajectory buffer.
-    history, buffer = remember(config, state, batch, hyperparameters)
-    # The buffer ranks episodes by the environment's own rewards. The agent makes what
-    # PPO maximizes from these, which may be decomposed and normalized.
+    # Update the good-trajectory buffer.
+    history, buffer = update_good_trajectories(config, state, batch, hyperparameters)
+    # The buffer ranks episodes by the environment's own rewards. PPO and the agent
+    # learn from rewards that may be decomposed and normalized.
     rewards, reward_metrics = learner_rewards(
         env,
         config,
@@ -235,12 +236,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         policy=policy,
         value=value,
     )
-    # The agent's own part of Algorithm 1: sample good trajectories, update the
-    # discriminator (equation 8) and shape the reward with it (section 4.3).
+    # Sample good trajectories, update the discriminator (equation 8) and shape the
+    # reward with it (section 4.3); agents without a discriminator do other things here.
     imitation, streams, imitation_metrics = agent.update_and_reward(
         state.imitation, context, imitate_key
     )
-    # Update the policy.
+    # Update the policy (equations 9 and 11).
     actor_critic, imitation, policy_metrics = update_policy(
         agent,
         state.actor_critic,
@@ -261,10 +262,11 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     }
     state = state.replace(
         actor_critic=actor_critic,
-        # Only now: within an iteration the policy that acts is the one that learns.
+        # Observations are normalized with the same numbers in acting and in learning,
+        # so the normalizer is updated at the end.
         normalizer=normalization.update(
             state.normalizer,
-            # It leaves out what is NaN.
+            # Observations with a NaN are ignored.
             jnp.where(batch.faulty[..., None], jnp.nan, batch.observation),
         ),
         reward_decomposition=rewards.decomposition,
@@ -291,18 +293,18 @@ def sample_trajectories(
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     hyperparameters: Hyperparameters,
 ) -> tuple[rollout.EnvironmentStates, Rollout]:
-    """Act in the environments for one batch with the policy as it is.
+    """Collect one batch of experience with the current policy.
 
     Args:
       env: one environment.
       config: sizes of the batch.
       state: with the policy and the running episodes.
-      key: consumed.
+      key: random key; consumed.
       policy: (params, normalized observation) -> mean, log standard deviation.
       hyperparameters: their values in this iteration.
 
     Returns:
-      the running episodes after the batch, and the batch, (time, env, ...).
+      The running episodes after the batch, and the batch, (time, env, ...).
     """
     return rollout.collect(
         env,
@@ -319,23 +321,26 @@ def sample_trajectories(
 
 
 @jax.named_scope("good_trajectories")
-def remember(
+def update_good_trajectories(
     config: Config, state: TrainState, batch: Rollout, hyperparameters: Hyperparameters
 ) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
-    """Record a batch, and offer the whole episodes that ended in it to the buffer.
+    """Insert the whole episodes that ended in a batch into the buffer.
 
     Args:
-      config: gives the number of episodes that the buffer keeps at most.
+      config: the largest number of episodes in the buffer.
       state: with the history and the buffer before the batch.
-      batch: of the environment's own reward.
-      hyperparameters: give the number of steps that the buffer keeps at most.
+      batch: the batch, with the environment's own rewards.
+      hyperparameters: the largest number of steps in the buffer.
+
+    Returns:
+      The history with the batch recorded in it, and the buffer after the batch.
     """
     history = good_trajectories.record(
         state.history,
         batch.observation,
         batch.action,
-        # NaN marks an episode whose return does not count: one with a faulty step, or
-        # one that was cut short.
+        # A NaN marks an episode without a valid return: one with a faulty step, or one
+        # that was cut short.
         jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
         batch.ended,
         batch.next_observation,
@@ -353,15 +358,16 @@ def remember(
 
 
 class Rewards(NamedTuple):
-    """The rewards that PPO and the agent learn from, and the state behind them.
+    """The rewards that PPO and the agent learn from, and the state of their models.
 
     Attributes:
-      batch: with these rewards, (time, env, ...).
-      history: with these rewards, but not normalized.
-      scale: (), the number that the batch's rewards were divided by.
-      decomposition: after the batch; None where rewards are not decomposed.
-      normalizer: after the batch; None where rewards are not normalized.
-      healthy: (), whether what was learned of rewards is finite and was kept.
+      batch: the batch with these rewards, (time, env, ...).
+      history: the history with these rewards, but not normalized.
+      scale: float32 (), the number that the batch's rewards were divided by.
+      decomposition: its state after the batch; None if rewards are not decomposed.
+      normalizer: its state after the batch; None if rewards are not normalized.
+      healthy: bool (), false if the update of the decomposition was not finite and was
+        undone.
     """
 
     batch: Rollout
@@ -383,16 +389,19 @@ def learner_rewards(
     key: jax.Array,
     hyperparameters: Hyperparameters,
 ) -> tuple[Rewards, Metrics]:
-    """Decompose and normalize a batch's rewards, as far as the config says so.
+    """Decompose and normalize a batch's rewards, each if the config says so.
 
     Args:
-      env: gives the range of actions.
-      config: what is done.
-      state: before the batch.
-      batch: with the environment's own rewards.
-      history: with the batch in it.
-      key: consumed.
+      env: the environment, for its range of actions.
+      config: the config.
+      state: the state before the batch.
+      batch: the batch, with the environment's own rewards.
+      history: the history, with the batch recorded in it.
+      key: random key; consumed.
       hyperparameters: their values in this iteration.
+
+    Returns:
+      The rewards, and metrics.
     """
     decomposition, healthy = None, jnp.bool_(True)
     metrics: Metrics = {}
@@ -407,10 +416,10 @@ def learner_rewards(
             hyperparameters=hyperparameters,
             action_range=wrappers.action_range(env),
         )
-        # A NaN reward in the history marks an episode that has no valid return.
-        has_no_return = jnp.isnan(history.reward)
+        # The NaNs that mark episodes without a valid return must stay.
+        no_return = jnp.isnan(history.reward)
         history = history.replace(
-            reward=jnp.where(has_no_return, jnp.nan, decomposition.reward)
+            reward=jnp.where(no_return, jnp.nan, decomposition.reward)
         )
     normalizer, scale = None, jnp.float32(1.0)
     if state.reward_normalizer is not None:
@@ -436,18 +445,18 @@ def advantages(
     agent: Imitation,
     imitation: Any,
 ) -> tuple[ppo.Batch, Metrics]:
-    """Return what PPO learns from: the agent's mix of its streams' advantages.
+    """Return PPO's batch, with one advantage mixed from those of all reward streams.
 
     Args:
-      actor_critic: with a value for each stream.
-      rewards: float32 (time, env) of one stream, or (time, env, stream).
-      context: of the iteration.
-      agent: mixes the standardized advantages.
+      actor_critic: the networks, with a value for each stream.
+      rewards: float32 (time, env) for one stream, or (time, env, stream).
+      context: the iteration's data.
+      agent: its `mix` combines the streams' standardized advantages.
       imitation: the agent's state.
 
     Returns:
-      the batch, (steps, ...), and metrics: the share of the returns' variance that
-      the values explain, (), the mean over streams, and those of the mix.
+      The batch, (steps, ...), and metrics: those of `mix`, and "explained_variance",
+      the share of the returns' variance that the values explain, averaged over streams.
     """
     batch = context.rollout
     if rewards.ndim == 2:
@@ -487,18 +496,18 @@ def update_policy(
     context: Context,
     keys: tuple[jax.Array, jax.Array],
 ) -> tuple[ActorCritic, Any, Metrics]:
-    """Update the policy and the values by PPO, then by the agent's own steps.
+    """Update the policy and the values by PPO, then by the agent's `update_policy`.
 
     Args:
-      agent: mixes the advantages, and may take further gradient steps.
-      actor_critic: the networks before.
+      agent: the agent.
+      actor_critic: the networks before the update.
       imitation: the agent's state.
-      rewards: float32 (time, env) of one stream, or (time, env, stream).
-      context: of the iteration.
-      keys: of PPO and of the agent's own steps; both are consumed.
+      rewards: float32 (time, env) for one stream, or (time, env, stream).
+      context: the iteration's data.
+      keys: random keys of PPO and of the agent's steps; both are consumed.
 
     Returns:
-      The networks and the agent's state after, and metrics.
+      The networks and the agent's state after the update, and metrics.
     """
     ppo_key, own_key = keys
     batch, advantage_metrics = advantages(
@@ -530,8 +539,8 @@ def rollout_metrics(
     Means over the whole episodes that ended in the batch are NaN if none did.
 
     Args:
-      batch: (time, env, ...).
-      buffer: with the batch's episodes in it.
+      batch: the batch, (time, env, ...).
+      buffer: the buffer after the batch.
     """
     completed = batch.completed
     mean = lambda x: jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
@@ -549,13 +558,12 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
     """Return all metrics of an iteration as float32 scalars, by name.
 
     Raises:
-      ValueError: if an agent's metric has a name that is taken, or is not a single
-        number.
+      ValueError: if two metrics have the same name, or one is not a single number.
     """
     for own in more:
         if taken := metrics.keys() & own.keys():
             raise ValueError(
-                f"metrics of agent {agent!r} have names that others have: "
+                f"metrics of agent {agent!r} have names that other metrics have: "
                 f"{', '.join(sorted(taken))}"
             )
         metrics = {**metrics, **own}
@@ -569,7 +577,10 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
 
 
 def check(env: Any, config: Config) -> None:
-    """Raise `ValueError` for what can't run, before anything compiles."""
+    """Raise `ValueError` if the config can't train in the environment.
+
+    Nothing is compiled.
+    """
     for name in ("reset", "step", "observation_size", "action_size"):
         if not hasattr(env, name):
             raise ValueError(
@@ -595,44 +606,46 @@ def check(env: Any, config: Config) -> None:
 
 
 def _refuse_automatic_resets(env: Any) -> None:
-    """Raise `ValueError` if a wrapper starts the next episode by itself.
+    """Raise `ValueError` if a wrapper resets the environment when an episode ends.
 
-    The value of a truncated episode would be that of the next one's start.
+    The value of a truncated episode would then be bootstrapped from the first
+    observation of the next one.
     """
     wrapper = env
     while wrapper is not None:
         if "AutoReset" in (name := type(wrapper).__name__):
             raise ValueError(
-                f"env is wrapped in {name}: it must not reset itself (of Brax take "
-                "brax.envs.get_environment)"
+                f"env is wrapped in {name}: it must not reset itself (for a Brax "
+                "environment use brax.envs.get_environment)"
             )
-        # Not by getattr, which wrappers hand on.
+        # `getattr` would skip levels: wrappers forward attributes of what they wrap.
         wrapper = getattr(wrapper, "__dict__", {}).get("env")
 
 
 class Train(Protocol):
-    """A function of a key, consumed, to the last state and metrics (iterations,)."""
+    """The type of the function that `make_train` returns."""
 
     def __call__(
         self, key: jax.Array, hyperparameters: Hyperparameters | None = None
     ) -> tuple[TrainState, Metrics]:
-        """Train; default hyperparameters are the configuration's."""
+        """Return the last state, and metrics (iterations,); consumes the key."""
 
 
 def make_train(env: Any, config: Config) -> Train:
-    """Return a pure function that trains from nothing to `config.total_steps`.
+    """Return a pure function that trains from scratch for `config.total_steps`.
 
     Args:
       env: one environment with Brax's interface (`gasil_jax.make_env`, or any of
         ``brax.envs``), not wrapped to reset itself.
-      config: what to run.
+      config: the agent and its settings.
 
     Returns:
       ``train(key, hyperparameters=None) -> (TrainState, Metrics)``. The key is
-      consumed; metrics are (iterations,) each.
+      consumed; the default hyperparameters are the config's; metrics are float32
+      (iterations,) each.
 
     Raises:
-      ValueError: a bad configuration, before anything compiles.
+      ValueError: if the config can't train in the environment; nothing is compiled.
     """
     check(env, config)
 
