@@ -15,7 +15,7 @@ def find(name: Any) -> Any:
     """Return the `Imitation` of an agent's name.
 
     Args:
-      name: a key of `AGENTS`, or MODULE:NAME of an agent of one's own.
+      name: a key of `AGENTS`, or MODULE:NAME of an agent of your own.
 
     Raises:
       ValueError: if the name is unknown, or if it names no `Imitation`.
@@ -23,7 +23,7 @@ def find(name: Any) -> Any:
     if not isinstance(name, str):
         raise ValueError(f"agent is {name!r}: it must be a string")
     if ":" not in name:
-        importlib.import_module("gasil_jax.imitation")  # It fills the table.
+        importlib.import_module("gasil_jax.imitation")  # It fills `AGENTS`.
         if name not in AGENTS:
             raise ValueError(unknown("agent", name, tuple(AGENTS), ["MODULE:NAME"]))
         return AGENTS[name]

@@ -1,8 +1,8 @@
 """The imitation methods, one file each, and the registry of agents.
 
 An agent is PPO plus one `Imitation`. To add an agent to the package, write a file that
-defines one and add it to `AGENTS`; one of your own is named MODULE:NAME (see
-`gasil_jax.registry`).
+defines one and add it to `AGENTS`. An agent of your own code is named MODULE:NAME and
+needs no entry.
 """
 
 from gasil_jax import registry
@@ -35,10 +35,10 @@ def agents() -> tuple[str, ...]:
 
 
 def find_agent(name: str) -> Imitation:
-    """Return an agent by its name, or by MODULE:NAME.
+    """Return the agent with a name of `AGENTS`, or of the form MODULE:NAME.
 
     Raises:
-      ValueError: if there is none.
+      ValueError: if there is no such agent.
     """
     return registry.find(name)
 

@@ -1,19 +1,19 @@
-"""GASIL that imitates as far as it helps: adaptive mixing of two advantages.
+"""PPO+GASIL-adaptive: the weight of imitation follows how much imitation helps.
 
 The environment's reward and the discriminator's bonus are two streams, each with its
 own value. With A_r and A_b their advantages, each standardized over the batch, the
-policy's is
+policy's advantage is
 
-    (1 - w) A_r + w A_b,
+    (1 - w) A_r + w A_b.
 
-so that no unit of the reward must be tuned against one of the bonus: there is no alpha.
-The weight w is `imitation_weight` times two factors between 0 and 1:
+Standardized advantages have no unit, so there is no alpha to tune. The weight w is
+`imitation_weight` times two factors between 0 and 1:
 
-- the agreement max(0, corr(A_r, A_b)) over the batch: imitate as far as what imitation
-  favours is also what the reward favours;
-- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean returns, discounted as
-  the buffer ranks them, of the buffer and of the policy's latest episodes: imitate as
-  far as the past was better.
+- the agreement max(0, corr(A_r, A_b)) over the batch: imitation counts more, the more
+  the two advantages favour the same actions;
+- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean returns R_B of the
+  buffer and R_pi of the policy's latest episodes, both discounted as the buffer ranks
+  them: imitation counts more, the better the buffer is than the policy.
 
 `Config.imitation_rule` names the factors that are used. While the buffer is empty, w
 is 0.
@@ -32,12 +32,12 @@ from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_pol
 from gasil_jax.learner import Learner
 from gasil_jax.rollout import Rollout
 
-# Weight of the past in the mean of the policy's returns, for each new episode.
-_MEMORY = 0.9
-# Share of the buffer's return by which it must be better for the gap to be 1.
-_WIDE_GAP = 0.25
+# Decay of the moving mean of the policy's returns, for each new episode.
+_DECAY = 0.9
+# The gap is 1 if the buffer is better by at least this share of its own return.
+_FULL_GAP = 0.25
 
-#: Factors of the imitation's weight: functions of agreement and gap, () each.
+#: The factor of `imitation_weight` in w, as a function of agreement and gap, () each.
 RULES: Mapping[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
     "both": lambda agreement, gap: agreement * gap,
     "agreement": lambda agreement, gap: agreement,
@@ -50,12 +50,12 @@ class Adaptive(struct.PyTreeNode):
     """The state of the agent.
 
     Attributes:
-      discriminator: D.
-      bonus_normalizer: normalizes the bonus, so that its value has targets of the same
-        scale as that of a normalized reward.
+      discriminator: the discriminator D.
+      bonus_normalizer: normalizes the bonus, so that the targets of its value have the
+        same scale as those of a normalized reward's.
       policy_return: float32 (), moving mean of the returns of the policy's latest
-        episodes, discounted as the buffer ranks them; 0 before the first.
-      has_episodes: bool (), whether there was one.
+        episodes, discounted as the buffer ranks them; 0 before the first episode.
+      has_episodes: bool (), whether an episode has been counted.
     """
 
     discriminator: Learner
@@ -78,7 +78,7 @@ def _init(
 def follow_return(
     policy_return: jax.Array, has_episodes: jax.Array, batch: Rollout
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of the policy's returns with a batch's episodes in it.
+    """Return the moving mean of the policy's returns, updated by a batch's episodes.
 
     Args:
       policy_return: float32 (), the mean before the batch.
@@ -87,14 +87,14 @@ def follow_return(
         faulty step do not count.
 
     Returns:
-      The mean, and whether there are episodes now.
+      The mean, and whether there are episodes after the batch.
     """
     counted = batch.completed & jnp.isfinite(batch.discounted_return)
     count = jnp.sum(counted)
     mean = jnp.sum(jnp.where(counted, batch.discounted_return, 0.0)) / jnp.maximum(
         count, 1
     )
-    past = jnp.where(has_episodes, _MEMORY**count, 0.0)
+    past = jnp.where(has_episodes, _DECAY**count, 0.0)
     moved = past * policy_return + (1.0 - past) * mean
     return jnp.where(count > 0, moved, policy_return), has_episodes | (count > 0)
 
@@ -127,7 +127,7 @@ def correlation(advantages: jax.Array) -> jax.Array:
 
 def gap(good_return: jax.Array, policy_return: jax.Array) -> jax.Array:
     """Return how much better the buffer is than the policy, from 0 to 1, ()."""
-    spread = _WIDE_GAP * jnp.abs(good_return) + 1e-8
+    spread = _FULL_GAP * jnp.abs(good_return) + 1e-8
     return jnp.clip((good_return - policy_return) / spread, 0.0, 1.0)
 
 
@@ -156,7 +156,7 @@ def _mix(
     return mix(advantages, weight), metrics
 
 
-#: Decomposed rewards (`Config.decompose_rewards`) belong to its preset.
+#: Where rewards are delayed, its preset also decomposes them.
 PPO_GASIL_ADAPTIVE = Imitation(
     _init,
     _update_and_reward,

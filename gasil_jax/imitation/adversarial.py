@@ -7,8 +7,8 @@ and not from the buffer; the discriminator ascends
 
 and the policy receives the bonus -alpha log D(s, a) >= 0, which is larger for pairs
 that look like the buffer's. Everything is computed from the logit l of D:
-log D = -softplus(-l), log(1 - D) = -softplus(l). The bonus is never negative, as in the
-paper, and therefore favours long episodes (survival bias).
+log D = -softplus(-l), log(1 - D) = -softplus(l). As in the paper the bonus is never
+negative, so it favours long episodes (survival bias).
 
 While the buffer is empty, D does not train and the bonus is 0. GAIL is the same method
 with a fixed set of expert pairs instead of the buffer.
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 
 from gasil_jax import good_trajectories, learner, normalization
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config
 from gasil_jax.imitation import expert
 from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
 from gasil_jax.learner import Learner
@@ -29,14 +29,14 @@ from gasil_jax.networks import Discriminator
 
 
 def softplus_bonus(logit: jax.Array) -> jax.Array:
-    """Return -log D (paper, section 4.3): never negative, so it pays for staying up."""
+    """Return -log D (paper, section 4.3): never negative, favours long episodes."""
     return jax.nn.softplus(-logit)
 
 
 def logit_bonus(logit: jax.Array) -> jax.Array:
-    """Return log(1 - D) - log D (AIRL, Fu et al. 2018): of both signs.
+    """Return log(1 - D) - log D (AIRL, Fu et al. 2018): positive or negative.
 
-    It is 0 where D cannot tell, and so neither pays for staying up nor for ending.
+    It is 0 where D is 1/2, so it favours neither long nor short episodes.
     """
     return -logit
 
@@ -44,16 +44,16 @@ def logit_bonus(logit: jax.Array) -> jax.Array:
 def dail_bonus(logit: jax.Array) -> jax.Array:
     """Return sigmoid(x) (tanh(x) + 1) / 2 of x = -logit (DAIL, arXiv:2510.00922).
 
-    It is between 0 and 1, so it pays for staying up, but less for pairs that are
-    clearly the policy's own.
+    It is between 0 and 1, so it favours long episodes, but it is almost 0 where D is
+    near 1.
     """
     return 0.5 * jax.nn.sigmoid(-logit) * (jnp.tanh(-logit) + 1.0)
 
 
 def centered_bonus(logit: jax.Array) -> jax.Array:
-    """Return -log D minus its mean over the batch: of both signs.
+    """Return -log D minus its mean over the batch: positive or negative.
 
-    A step like all others gets 0, so on the whole it does not pay for staying up.
+    An average step gets 0, so it favours neither long nor short episodes.
     """
     softplus = softplus_bonus(logit)
     return softplus - jnp.mean(softplus)
@@ -78,8 +78,8 @@ def loss(
     Args:
       policy_logit: (minibatch,), logits of D on the policy's pairs.
       good_logit: (minibatch,), logits of D on the buffer's pairs.
-      entropy_coefficient: weight of the entropy of D's output on all pairs, which
-        keeps D from becoming certain (OpenAI baselines' GAIL).
+      entropy_coefficient: weight of the entropy of D's output, averaged over all
+        pairs, which keeps D away from 0 and 1 (as in OpenAI baselines' GAIL).
 
     Returns:
       The loss, (), and its parts as metrics.
@@ -109,9 +109,11 @@ def gradient_penalty(
 
     Args:
       logit: (observation, action) -> (minibatch,), the logit of D.
-      policy_pair: observation (minibatch, obs) and action (minibatch, action).
+      policy_pair: the policy's observations (minibatch, obs) and actions
+        (minibatch, action).
       good_pair: the same, from the buffer.
-      share: (minibatch,), from 0 to 1; where between the pairs the gradient is taken.
+      share: (minibatch,), from 0 to 1, the weight of the policy's pair in the point at
+        which the gradient is taken.
     """
     between = jax.tree.map(
         lambda x, y: share[:, None] * x + (1.0 - share[:, None]) * y,
@@ -120,7 +122,7 @@ def gradient_penalty(
     )
     gradients = jax.grad(lambda pair: jnp.sum(logit(*pair)))(between)
     squares = sum(jnp.sum(x**2, axis=-1) for x in gradients)
-    # The root of 0 has no gradient.
+    # The square root has no finite gradient at 0.
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
@@ -177,7 +179,7 @@ _EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
 def _preprocessor(
     context: Context,
 ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Return the function from pairs to what the discriminator sees of them."""
+    """Return the function that makes the discriminator's inputs from pairs."""
     normalize = lambda x: normalization.normalize(context.normalizer, x)
     if not context.config.discriminator_normalizes_actions:
         return lambda observation, action: (normalize(observation), action)
@@ -194,11 +196,10 @@ def _train_discriminator(
 ) -> tuple[Learner, Metrics]:
     """Take gradient steps on the discriminator, if the source is ready.
 
-    The loop takes as many steps as the config's own `discriminator_updates`, and keeps
-    only the first `discriminator_updates` of this member's hyperparameters.
+    The loop has as many steps as the config's `discriminator_updates`, which is static.
+    Only the first ones, as many as this run's own `discriminator_updates`, are kept.
     """
-    config: Config = context.config
-    hyperparameters: Hyperparameters = context.hyperparameters
+    config, hyperparameters = context.config, context.hyperparameters
     network, transform = _network(config), learner.adam()
     rollout = context.rollout
     observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
@@ -249,8 +250,8 @@ def _train_discriminator(
         step, state, (jax.random.split(key, num_updates), is_taken)
     )
     ready = source.is_ready(context)
-    # Multiplied by the inverse, as XLA does for a division by a constant, so that a
-    # constant count and a traced one give the same bits.
+    # XLA turns a division by a constant into this product. So a constant count and a
+    # traced one give the same bits.
     mean = lambda x: jnp.sum(x, where=is_taken) * (1.0 / jnp.sum(is_taken))
     metrics = {
         name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
@@ -262,17 +263,17 @@ def _train_discriminator(
 def update_and_score(
     state: Learner, context: Context, key: jax.Array, source: Source = GOOD_TRAJECTORIES
 ) -> tuple[Learner, jax.Array, Metrics]:
-    """Train the discriminator, and give each step of the batch its bonus.
+    """Train the discriminator, and return the bonus of each step of the batch.
 
     Args:
       state: the discriminator.
-      context: of the iteration.
-      key: consumed.
-      source: what the policy imitates.
+      context: the iteration's data.
+      key: random key; consumed.
+      source: the pairs that the policy imitates.
 
     Returns:
-      The discriminator, the bonus without alpha, float32 (time, env), 0 where there is
-      nothing to imitate yet, and metrics.
+      The discriminator; the bonus without alpha, float32 (time, env), which is 0 while
+      there is nothing to imitate; and metrics.
     """
     state, metrics = _train_discriminator(state, source, context, key)
     rollout = context.rollout

@@ -1,10 +1,11 @@
-"""PPO+BC: behaviour cloning of the good trajectories beside PPO (paper, section 5.1).
+"""PPO+BC: PPO and behaviour cloning of the good trajectories (paper, section 5.1).
 
-After PPO's own steps the policy descends, with the same optimizer, the loss
+After PPO's gradient steps the policy takes further ones, with the same optimizer, on
+minibatches of the good-trajectory buffer B. They minimize
 
-    -behavior_cloning_coefficient E_B[log pi(a | s)]
+    -behavior_cloning_coefficient E_B[log pi(a | s)].
 
-on minibatches of the good-trajectory buffer. Nothing happens while it is empty.
+While the buffer is empty, the policy is left as it is.
 """
 
 from typing import Any
@@ -13,7 +14,6 @@ import jax
 import jax.numpy as jnp
 
 from gasil_jax import good_trajectories, normalization, ppo
-from gasil_jax.config import Config
 from gasil_jax.imitation.interface import Context, Imitation, Metrics
 from gasil_jax.imitation.none import no_state, plain_reward
 from gasil_jax.learner import Learner
@@ -29,7 +29,7 @@ def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
 def _update_policy(
     state: tuple[()], actor_critic: ActorCritic, context: Context, key: jax.Array
 ) -> tuple[tuple[()], ActorCritic, Metrics]:
-    config: Config = context.config
+    config = context.config
     coefficient = context.hyperparameters.behavior_cloning_coefficient
 
     def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
@@ -55,11 +55,11 @@ def _update_policy(
         actor_critic.policy,
         jax.random.split(key, config.behavior_cloning_updates),
     )
-    has_good = context.good_trajectories.size > 0
+    filled = context.good_trajectories.size > 0
     policy = jax.tree.map(
-        lambda new, old: jnp.where(has_good, new, old), cloned, actor_critic.policy
+        lambda new, old: jnp.where(filled, new, old), cloned, actor_critic.policy
     )
-    cloning_loss = jnp.where(has_good, jnp.mean(values), jnp.nan)
+    cloning_loss = jnp.where(filled, jnp.mean(values), jnp.nan)
     metrics = {"behavior_cloning_loss": cloning_loss}
     return state, actor_critic.replace(policy=policy), metrics
 

@@ -1,7 +1,8 @@
-"""The control of GASIL: a bonus that is the same in every step, without imitation.
+"""PPO+BONUS, the control of PPO+GASIL: the same bonus alpha in every step.
 
-The paper's bonus -alpha log D is never negative, so it pays for staying up. This agent
-is paid for staying up alone. What GASIL has over it is what imitation gives.
+The paper's bonus -alpha log D is never negative, so it favours long episodes even
+without imitation. So does this agent's bonus. How much better PPO+GASIL is than this
+agent is the effect of imitation.
 """
 
 import jax

@@ -23,13 +23,16 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
         "minari:" and the name of a local data set; Minari must then be installed.
 
     Raises:
-      ValueError: if it can't be read or holds other arrays.
+      ValueError: if it can't be read, or its arrays have wrong names, shapes or values.
     """
     return _load(source, _version(source))
 
 
 def _version(source: str) -> Any:
-    """Return what changes when an expert's files do; None if they can't be seen."""
+    """Return names, modification times and sizes of an expert's files.
+
+    It is None if they can't be read.
+    """
     paths = [pathlib.Path(source)]
     if source.startswith(_MINARI):
         try:
@@ -113,7 +116,7 @@ def check(source: str | None, observation_size: int, action_size: int) -> None:
     """Check that an expert is given and fits the environment's sizes.
 
     Raises:
-      ValueError: if it is missing, can't be read, or has other sizes.
+      ValueError: if it is missing, can't be read, or does not fit the sizes.
     """
     if source is None:
         raise ValueError(

@@ -26,9 +26,9 @@ class Context(struct.PyTreeNode):
       history: the last steps of each environment, including the batch's.
       good_trajectories: the buffer, including the batch's ended episodes.
       normalizer: the normalizer of observations that the policy used in the batch.
-      reward_scale: (), the number that the rollout's rewards were divided by; 1 if
-        they are not normalized. Rewards in the history and returns in the buffer
-        never are.
+      reward_scale: float32 (), the number that the rollout's rewards were divided by; 1
+        if they are not normalized. Rewards in the history and returns in the buffer are
+        not divided by it.
       hyperparameters: their values in this iteration.
       config: the static configuration.
       policy: (params, normalized observation) -> mean, log standard deviation.
@@ -69,7 +69,9 @@ def one_advantage(
 
 
 class Imitation(NamedTuple):
-    """An imitation method as pure functions; the loop carries their state, a pytree.
+    """An imitation method: pure functions, and settings, for the training loop.
+
+    The method's state is a pytree that the training loop carries.
 
     Attributes:
       init: (key, config, observation size, action size) -> state.
@@ -82,17 +84,16 @@ class Imitation(NamedTuple):
         anything compiles, if the agent can't run with them; default
         `check_without_expert`.
       fields: names of the fields of `Config` and `Hyperparameters` that the method
-        uses, besides those that PPO uses. A sweep over a field that the agent does
-        not use is refused. None if the method does not say.
+        uses, besides those that PPO uses. A sweep over a field that is only used by
+        other agents is refused. None if it is not known which fields the method uses.
       uses_reward: whether PPO maximizes the environment's reward, alone or with others.
-        Where it does not, a note says that settings which change the reward have no
-        effect.
+        If not, a run prints a note that settings of that reward have no effect.
       hyperparameters: the class of the agent's hyperparameters: `Hyperparameters`, or
-        one that is derived from it and declares numbers of the agent's own.
+        a class derived from it that declares more.
       num_streams: number of reward streams.
       mix: (state, advantages, context) -> advantage, metrics. Combines the standardized
-        advantages of the streams, (time, env, stream), to that of the policy,
-        (time, env); default the only one.
+        advantages of the streams, (time, env, stream), into the policy's advantage,
+        (time, env); default `one_advantage`, for a single stream.
     """
 
     init: Callable[[jax.Array, Config, int, int], Any]
@@ -119,43 +120,43 @@ _OUTPUTS: Mapping[str, tuple[str, ...]] = {
 
 
 def checked(agent: Imitation, name: str) -> Imitation:
-    """Return an agent whose functions refuse to return what the loop can't take.
+    """Return an agent whose functions check what they return.
 
-    Without it an error would name a line of the loop and not the agent's function.
+    So an error names the agent's function and not a line of the training loop.
 
     Args:
       agent: the agent.
       name: its name, for the message.
 
     Returns:
-      The agent. Its functions raise `ValueError` if they return more or fewer values
-      than are due, or rewards or an advantage of another shape.
+      The agent. Its functions raise `ValueError` if they return too few or too many
+      values, or rewards or an advantage of a wrong shape.
     """
 
     def call(function: str, *arguments: Any) -> Any:
-        outputs, due = getattr(agent, function)(*arguments), _OUTPUTS[function]
+        outputs, names = getattr(agent, function)(*arguments), _OUTPUTS[function]
         count = len(outputs) if isinstance(outputs, tuple | list) else 1
-        if count != len(due):
+        if count != len(names):
             raise ValueError(
                 f"{function} of agent {name!r} returns {count} "
-                f"value{'s' * (count != 1)}: it must return {len(due)}, "
-                f"{', '.join(due)}"
+                f"value{'s' * (count != 1)}: it must return {len(names)}, "
+                f"{', '.join(names)}"
             )
         return outputs
 
-    def check_shape(function: str, what: str, value: Any, due: Any) -> None:
-        if jnp.shape(value) != due:
+    def check_shape(function: str, what: str, value: Any, expected: Any) -> None:
+        if jnp.shape(value) != expected:
             raise ValueError(
                 f"{function} of agent {name!r} returns {what} of shape "
-                f"{jnp.shape(value)}: it must be {due}"
+                f"{jnp.shape(value)}: it must be {expected}"
             )
 
     def update_and_reward(state: Any, context: Context, key: jax.Array) -> Any:
         outputs = call("update_and_reward", state, context, key)
-        rewards, due = outputs[1], context.rollout.reward.shape
+        rewards, expected = outputs[1], context.rollout.reward.shape
         if agent.num_streams > 1 or jnp.ndim(rewards) == 3:
-            due = (*due, agent.num_streams)
-        check_shape("update_and_reward", "rewards", rewards, due)
+            expected = (*expected, agent.num_streams)
+        check_shape("update_and_reward", "rewards", rewards, expected)
         return outputs
 
     def mix(state: Any, advantages: jax.Array, context: Context) -> Any:
@@ -173,5 +174,5 @@ def checked(agent: Imitation, name: str) -> Imitation:
 def leave_policy(
     state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
 ) -> tuple[Any, ActorCritic, Metrics]:
-    """Change nothing: the `update_policy` of methods that only shape rewards."""
+    """Take no steps: the `update_policy` of methods that only shape rewards."""
     return state, actor_critic, {}

@@ -9,14 +9,14 @@ from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_pol
 def no_state(
     key: jax.Array, config: Config, observation_size: int, action_size: int
 ) -> tuple[()]:
-    """Return an empty state: the `init` of agents that have none."""
+    """Return an empty state: the `init` of agents without a state."""
     return ()
 
 
 def plain_reward(
     state: tuple[()], context: Context, key: jax.Array
 ) -> tuple[tuple[()], jax.Array, Metrics]:
-    """Return the environment's reward: the `update_and_reward` that learns nothing."""
+    """Return the environment's reward: the `update_and_reward` without imitation."""
     return state, context.rollout.reward, {}
 
 
