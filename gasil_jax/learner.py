@@ -1,4 +1,4 @@
-"""A network that learns: its parameters with its optimizer's state."""
+"""A trainable network: its parameters and its optimizer's state."""
 
 from typing import Any
 
@@ -23,7 +23,7 @@ def init(params: Any, transform: optax.GradientTransformation) -> Learner:
 def adam() -> optax.GradientTransformation:
     """Return Adam without a step size.
 
-    It treats the parameters as one vector, which is faster, see `ppo.optimizer`.
+    It treats all parameters as one vector, which is faster (see `ppo.optimizer`).
     """
     return optax.flatten(optax.scale_by_adam())
 
@@ -39,8 +39,8 @@ def descend(
     Args:
       learner: the learner before the step.
       gradient: gradient of the loss, with the parameters' structure.
-      transform: the optimizer without a step size, so that the latter may be traced.
-      step_size: (), factor of the transformed gradient.
+      transform: the optimizer without a step size.
+      step_size: (), factor of the transformed gradient; it may be traced.
     """
     updates, optimizer_state = transform.update(gradient, learner.optimizer_state)
     params = jax.tree.map(lambda p, u: p - step_size * u, learner.params, updates)
@@ -48,14 +48,14 @@ def descend(
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
-    """Return an update, or what was before it if the update is not finite.
+    """Undo an update that is not finite.
 
     Args:
-      new: what was learned, a pytree.
-      old: the same before it.
+      new: a pytree after the update.
+      old: the same pytree before the update.
 
     Returns:
-      whether every number of `new` is finite, (), and `new` if so, else `old`.
+      Whether every number in `new` is finite, bool (), and `new` if so, else `old`.
     """
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(new)]
     healthy = jnp.all(jnp.stack(finite))

@@ -1,4 +1,4 @@
-"""Policy, value and discriminator networks (Flax linen)."""
+"""The networks, in Flax linen, and the Gaussian distribution of actions."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -92,7 +92,7 @@ class Discriminator(nn.Module):
 
 
 class StepReward(nn.Module):
-    """The reward of a step, for `reward_decomposition`; it starts near 0."""
+    """The reward of a step, for `reward_decomposition`; near 0 before training."""
 
     hidden_sizes: Sequence[int]
 

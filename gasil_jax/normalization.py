@@ -7,7 +7,7 @@ from flax import struct
 
 from gasil_envs import wrappers
 
-# Defined there, because a saved policy runs without JAX.
+# Defined in `numpy_policy`, which must not import JAX.
 from gasil_jax.numpy_policy import CLIP
 
 
@@ -15,9 +15,9 @@ class Normalizer(struct.PyTreeNode):
     """The mean and variance of all observations so far.
 
     Attributes:
-      count: number of observations, float32 ().
+      count: float32 (), number of observations.
       mean: float32 (obs,).
-      m2: sum of squared differences from the mean, float32 (obs,).
+      m2: float32 (obs,), sum of squared differences from the mean.
     """
 
     count: jax.Array
@@ -26,17 +26,17 @@ class Normalizer(struct.PyTreeNode):
 
 
 def init(observation_size: int) -> Normalizer:
-    """Return a normalizer without observations; until it has some it only clips."""
+    """Return a normalizer without observations, which has mean 0 and variance 1."""
     # Each field needs its own array: a shared one could not be donated.
     zeros = lambda: jnp.zeros(observation_size, jnp.float32)
     return Normalizer(jnp.float32(0), zeros(), zeros())
 
 
 def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
-    """Return the normalizer updated by a batch (..., obs).
+    """Return the normalizer updated by a batch of observations (..., obs).
 
-    Rows with a number for which `wrappers.is_sound` is false are left out. Mean and sum
-    of squares are updated as in Chan, Golub, LeVeque 1979.
+    Observations with a number for which `wrappers.is_sound` is false are left out. Mean
+    and sum of squares are updated as in Chan, Golub, LeVeque 1979.
     """
     chex.assert_equal(observation.shape[-1:], normalizer.mean.shape)
     rows = observation.reshape(-1, observation.shape[-1])

@@ -17,11 +17,11 @@ from gasil_jax.permutation import permutation
 
 
 class ActorCritic(struct.PyTreeNode):
-    """The policy and one value per reward stream, each with its own optimizer.
+    """The policy and one value for each reward stream, all with their own optimizers.
 
     Attributes:
-      policy: a learner of `networks.Policy`.
-      values: a learner of `networks.Value` for each stream.
+      policy: parameters and optimizer state of a `networks.Policy`.
+      values: the same of a `networks.Value` for each stream.
     """
 
     policy: Learner
@@ -71,9 +71,10 @@ def generalized_advantage_estimation(
       value: float32, the same shape, V of the observation.
       next_value: float32, the same shape, V of the next observation. At the end of an
         episode it is V of the final observation, which bootstraps truncated episodes.
-      terminated: bool, broadcasts to the reward; the future after this step is worth 0.
-      ended: bool, the shape of `terminated`; terminated or truncated, so that the sum
-        stops at this step.
+      terminated: bool, broadcasts to the reward's shape; the value after a terminated
+        step is 0.
+      ended: bool, the shape of `terminated`: terminated or truncated, where the sum
+        over later steps stops.
       gamma: discount.
       gae_lambda: lambda.
 
@@ -203,9 +204,9 @@ def loss(
 def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
     """Return one network's optimizer: a clip of the gradient's norm, then Adam.
 
-    It leaves the step size to the caller. It treats the parameters as one vector,
-    because networks this small spend their time on starting operations: one operation
-    per layer took a tenth of the training time on a CPU.
+    The caller applies the step size. All parameters are treated as one vector, because
+    with networks this small the time goes into starting operations: separate operations
+    for each layer took a tenth of the training time on a CPU.
     """
     transform = optax.chain(
         optax.clip_by_global_norm(hyperparameters.max_grad_norm),
@@ -217,18 +218,18 @@ def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
 def descend(
     actor_critic: ActorCritic, gradient: Any, hyperparameters: Hyperparameters
 ) -> ActorCritic:
-    """Take one gradient step of every network; each gradient is clipped by itself.
+    """Take one gradient step of every network; each gradient's norm is clipped alone.
 
     Args:
       actor_critic: the networks before the step.
       gradient: {"policy": ..., "values": (stream)}.
-      hyperparameters: give the step size and the largest norm of a gradient.
+      hyperparameters: the step size and the largest norm of a gradient.
     """
     return ActorCritic(
         policy=descend_one(actor_critic.policy, gradient["policy"], hyperparameters),
         values=tuple(
-            descend_one(value, its_gradient, hyperparameters)
-            for value, its_gradient in zip(
+            descend_one(value, value_gradient, hyperparameters)
+            for value, value_gradient in zip(
                 actor_critic.values, gradient["values"], strict=True
             )
         ),
@@ -257,16 +258,16 @@ def update(
     """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
     Args:
-      actor_critic: the networks before.
-      batch: (steps, ...), with standardized advantages.
+      actor_critic: the networks before the update.
+      batch: the batch, (steps, ...), with standardized advantages.
       key: random key; consumed.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
-      config: gives the numbers and sizes of minibatches.
+      config: number of epochs, and number and size of minibatches.
       hyperparameters: their values in this iteration.
 
     Returns:
-      The networks after, and the mean of each metric over all minibatches.
+      The networks after the update, and the mean of each metric over all minibatches.
     """
 
     def minibatch_step(actor_critic: ActorCritic, rows: jax.Array) -> Any:

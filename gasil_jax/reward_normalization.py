@@ -32,7 +32,7 @@ class RewardNormalizer(struct.PyTreeNode):
 
 
 def init(num_envs: int) -> RewardNormalizer:
-    """Return a normalizer that has seen no rewards."""
+    """Return a normalizer without rewards, whose scale is 1."""
     return RewardNormalizer(jnp.zeros(num_envs, jnp.float32), normalization.init(1))
 
 
@@ -75,9 +75,9 @@ def normalize(
 ) -> jax.Array:
     """Return rewards of any shape divided by `scale` and clipped to +-`clip`.
 
-    Where an episode of n steps pays once, its sums are 0 but for the last, so that
-    `scale` is about the payment divided by sqrt(n): above some 100 steps a clip at 10
-    makes many payments equal, and near 1000 almost all.
+    If an episode of n steps is paid only at its end, all of its sums but the last are
+    0, so `scale` is about the payment divided by sqrt(n). A clip at 10 then makes many
+    payments equal if n is above about 100, and almost all if n is near 1000.
     """
     return jnp.clip(reward / scale(normalizer), -clip, clip)
 
@@ -89,5 +89,5 @@ def clipped(
 
     It is NaN if all rewards are 0.
     """
-    beyond = jnp.abs(reward) > clip * scale(normalizer)
-    return jnp.sum(beyond) / jnp.sum(reward != 0.0)
+    is_clipped = jnp.abs(reward) > clip * scale(normalizer)
+    return jnp.sum(is_clipped) / jnp.sum(reward != 0.0)

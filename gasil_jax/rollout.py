@@ -20,15 +20,17 @@ class Rollout(struct.PyTreeNode):
         ended, it is its final observation and not the start of the next episode.
       action: float32 (time, env, action), as drawn from the policy, not clipped.
       log_prob: float32 (time, env), log density of the action when it was drawn.
-      reward: float32 (time, env), the environment's reward, delayed if it delays it;
-        in an agent's context decomposed and normalized if the config says so.
+      reward: float32 (time, env), the reward that the environment gives, which may be
+        delayed; in an agent's `Context`, decomposed and normalized if the config says
+        so.
       terminated: bool (time, env), whether the episode ended and has no future value.
       truncated: bool (time, env), whether the episode was cut off; its value is then
         bootstrapped.
-      episode_return: float32 (time, env), sum of the true rewards up to this step.
-      discounted_return: float32 (time, env), sum of gamma^t reward up to this step,
-        with gamma 1 if `Config.buffer_discounts` is false; NaN from the first faulty
-        step on, and where the episode was cut short.
+      episode_return: float32 (time, env), the episode's sum of undelayed rewards up to
+        this step.
+      discounted_return: float32 (time, env), the episode's sum of gamma^t reward up to
+        this step, with gamma 1 if `Config.buffer_discounts` is false; NaN from the
+        first faulty step on, and where the episode was cut short.
       episode_length: int32 (time, env), number of steps up to this one.
       faulty: bool (time, env), whether the physics failed in this step.
       cut_short: bool (time, env), whether the episode was truncated before it reached
@@ -67,14 +69,14 @@ class EnvironmentStates(struct.PyTreeNode):
 
     Attributes:
       state: the environments' states, a Brax ``State``.
-      episode_return: float32 (env,), sum of the true rewards so far.
+      episode_return: float32 (env,), sum of undelayed rewards so far.
       discounted_return: float32 (env,), sum of gamma^t reward so far, with the same
         gamma.
       discount: float32 (env,), gamma^t.
       episode_length: int32 (env,), number of steps so far.
-      starting_age: int32 (env,), the age at which the running episode began. The
-        episode is truncated when this plus its length reaches the limit. Only first
-        episodes have an age above 0.
+      starting_age: int32 (env,), the age in steps at which the running episode began.
+        The episode is truncated when this plus its length reaches the limit. Only an
+        environment's first episode may begin at an age above 0.
     """
 
     state: Any
@@ -99,11 +101,11 @@ def _strip_weak_types(tree: Any) -> Any:
 def init(
     env: Any, key: jax.Array, num_envs: int, age_limit: int | None = None
 ) -> EnvironmentStates:
-    """Start an episode in each of `num_envs` environments. The key is consumed.
+    """Start an episode in each of `num_envs` environments.
 
     Args:
       env: a single environment with Brax's interface, not wrapped to reset itself.
-      key: key for the initial states and the ages.
+      key: random key for the initial states and the ages; consumed.
       num_envs: number of environments.
       age_limit: each first episode begins at an age drawn uniformly from
         [0, age_limit); None starts all of them at age 0. In a task whose episodes
@@ -151,12 +153,13 @@ def collect(
 
     If the physics diverges, the episode terminates with reward 0 and the step is marked
     in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in the
-    observation before or after the step or for a reward, given or held back. An episode
-    that is truncated here is given the reward that the environment still holds back,
-    ``info["held_reward"]``.
+    observation before or after the step, or for a reward, given or held back. If an
+    episode is truncated here, its last step also gets the reward that the environment
+    still holds back, ``info["held_reward"]``.
 
-    A first episode that began at an age above 0 is truncated at the same limit and
-    marked in ``cut_short``. PPO learns from its steps, but its return is not reported.
+    An episode that began at an age above 0 is truncated when its age reaches the limit,
+    and marked in ``cut_short``. PPO learns from its steps, but its return is not
+    reported.
     """
     num_envs = environments.episode_length.shape[0]
     low, high = wrappers.action_range(env)
@@ -169,7 +172,7 @@ def collect(
 
     def step(carry: EnvironmentStates, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
-        # The physics of a reset may have diverged, too.
+        # The observation may be that of a reset, whose physics may have diverged too.
         sound = wrappers.is_sound(carry.state.obs).all(axis=-1)
         observation = jnp.where(sound[:, None], carry.state.obs, 0.0)
         with jax.named_scope("policy"):
