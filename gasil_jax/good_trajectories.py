@@ -1,12 +1,12 @@
 """The good-trajectory buffer: the steps of the top-K episodes, in fixed arrays.
 
-Paper, section 4.1. The capacity is in steps. All steps ever offered are ordered by
-(return descending, episode, time) and the first `capacity` are kept, so the last
-admitted episode may be cut. On a tie the older episode stays. An episode is offered as
-a whole once it has ended. It is ranked by the return of the environment's own reward:
-R = sum_t gamma^t r_t, or the undiscounted sum if `Config.buffer_discounts` is false.
-All functions are pure and work under jit, vmap and shard_map; an empty buffer is a
-normal state.
+Paper, section 4.1. An episode is offered to the buffer as a whole once it has ended. It
+is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, or the
+undiscounted sum if `Config.buffer_discounts` is false. The capacity is in steps: all
+steps that were ever offered are ordered by (return descending, episode, time), and the
+first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
+a tie the older episode stays. All functions are pure and work under jit, vmap and
+shard_map; an empty buffer is a normal state.
 """
 
 import chex
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-#: Settings of the buffer, which all agents that imitate it use.
+#: Names of the settings that all agents with this buffer use.
 FIELDS = ("buffer_steps", "buffer_episodes", "buffer_discounts", "sample_by_return")
 
 # Shape letters: C capacity in steps, E offered episodes, H steps of history per
@@ -51,7 +51,7 @@ class History(struct.PyTreeNode):
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
       reward: float32 (N, H), the reward, never normalized; in an agent's context it is
-        decomposed if the config says so. NaN on faulty steps, and on the last step of
+        decomposed if the config says so. NaN in faulty steps, and in the last step of
         an episode that was cut short.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
@@ -71,10 +71,10 @@ class History(struct.PyTreeNode):
 
 
 class Episodes(struct.PyTreeNode):
-    """Ended episodes offered to the buffer; entries with ``length == 0`` are empty.
+    """Ended episodes that are offered to the buffer; length 0 marks an empty entry.
 
     Attributes:
-      return_: float32 (E,), the return that episodes are ranked by.
+      return_: float32 (E,), the return that the episode is ranked by.
       length: int32 (E,), number of steps.
       env: int32 (E,), index of the environment that the episode ran in.
       last: int32 (E,), index of its last step in that environment's ring.
@@ -112,8 +112,8 @@ def init_history(
     """Return an empty history, long enough for every episode that ends in a batch.
 
     Its length H is a multiple of `num_steps`, so that a batch is written in one piece,
-    and that of at least `num_episodes` episodes and a batch. With `keep_next` it also
-    keeps the observations after each action.
+    and at least the length of `num_episodes` episodes and a batch. With `keep_next` the
+    history also has the observation after each action.
     """
     batches = -(-(num_episodes * max_episode_steps + num_steps) // num_steps)
     length = batches * num_steps
@@ -123,7 +123,7 @@ def init_history(
         observation=observations(),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
         reward=jnp.zeros((num_envs, length), jnp.float32),
-        # No episode reaches back beyond the first step.
+        # No episode begins before the first recorded step.
         ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
         next_observation=observations() if keep_next else None,
@@ -179,7 +179,8 @@ def ended_episodes(
     Args:
       history: the history after `record` of that batch.
       ended: bool (time, N), whether the episode ended with this step.
-      return_: float32 (time, N), the episode's return up to this step, as it is ranked.
+      return_: float32 (time, N), the episode's return up to this step, by which it is
+        ranked.
       length: int32 (time, N), the episode's number of steps up to this one.
     """
     chex.assert_equal_shape([ended, return_, length])
@@ -203,15 +204,15 @@ def insert(
     max_steps: jax.Array | float | None = None,
     max_episodes: int | None = None,
 ) -> GoodTrajectories:
-    """Return the buffer with the best `capacity` of its own and the offered steps.
+    """Return the buffer with the best of its own and the offered episodes.
 
     Args:
-      good_trajectories: the buffer before.
-      history: the steps of the offered episodes.
-      episodes: the offered episodes. Those whose return is not finite are rejected;
-        every episode with a step that is not finite must have such a return.
-      max_steps: a smaller capacity, (), which may be traced. A buffer must always be
-        given the same one.
+      good_trajectories: the buffer before the insertion.
+      history: the history that holds the steps of the offered episodes.
+      episodes: the offered episodes. Those whose return is not finite are rejected. The
+        return of an episode with a number that is not finite must not be finite either.
+      max_steps: a capacity () below the buffer's, which may be traced. It must be the
+        same in all insertions into a buffer.
       max_episodes: number of episodes to keep at most; None for any number.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
@@ -272,15 +273,16 @@ def sample(
     num_samples: int,
     by_return: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
-    """Draw steps with replacement: (samples, obs), (samples, action).
+    """Draw observations (samples, obs) and actions (samples, action) with replacement.
 
-    An empty buffer gives zeros, so check ``size`` first. The key is consumed.
+    From an empty buffer they are zeros, so check ``size`` first.
 
     Args:
       key: random key; consumed.
       good_trajectories: the buffer.
       num_samples: number of steps.
-      by_return: draw with the probabilities `return_weights`; otherwise uniformly.
+      by_return: draw with probabilities proportional to `return_weights`; otherwise
+        uniformly.
     """
     uniform = jax.random.uniform(key, (num_samples,))
     if by_return:
@@ -293,7 +295,10 @@ def sample(
 
 
 def return_weights(good_trajectories: GoodTrajectories) -> jax.Array:
-    """Return exp((R - best R) / deviation of R) of each step, (C,); 0 where empty."""
+    """Return exp((R - best R) / standard deviation of R), (C,); 0 where empty.
+
+    R is the return of the step's episode.
+    """
     filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
     return_ = jnp.where(filled, good_trajectories.return_, 0.0)
     deviation = jnp.std(return_, where=filled)

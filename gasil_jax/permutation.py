@@ -1,7 +1,8 @@
 """Random permutations equal to those of `jax.random.permutation`, faster on a CPU.
 
-JAX orders the numbers by random keys of 32 bits. XLA's CPU sorts a single array several
-times as fast as keys with values, and PPO draws a permutation in each of its epochs.
+JAX sorts the numbers by random keys of 32 bits. On a CPU, XLA sorts a single array
+several times as fast as an array of keys with an array of values, and PPO draws a
+permutation in each of its epochs.
 """
 
 import math
@@ -10,8 +11,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-# With more numbers too few bits of a key are left beside the index.
-_MOST = 2**16
+# A larger index would leave too few of a key's 32 bits.
+_MAX_SIZE = 2**16
 
 
 @jax.named_scope("permutation")
@@ -21,14 +22,14 @@ def permutation(key: jax.Array, size: int) -> jax.Array:
     The order is that of `jax.random.permutation`. The key is consumed.
     """
     of_jax = lambda key: jax.random.permutation(key, size)
-    if not 1 < size <= _MOST:
+    if not 1 < size <= _MAX_SIZE:
         return of_jax(key)
     ours = lambda key: _by_packed_keys(key, size)
     return jax.lax.platform_dependent(key, cpu=ours, default=of_jax)
 
 
 def _by_packed_keys(key: jax.Array, size: int) -> jax.Array:
-    # As many rounds as JAX has, so that equal keys hardly matter.
+    # The same number of rounds as in JAX; several make equal keys unimportant.
     rounds = math.ceil(3.0 * math.log(size) / math.log(2**32 - 1))
     numbers = jnp.arange(size, dtype=jnp.int32)
     for _ in range(rounds):

@@ -1,10 +1,10 @@
 """Decompose a delayed reward into a reward for each step.
 
 A window is the steps between two payouts: it ends where the reward is not zero or the
-episode ends. Windows are known from rewards alone, so this works in any environment. A
-network g of (observation, action, next observation) learns the reward of a step in
-standard units. With m and s the running mean and standard deviation of payout / length,
-it takes gradient steps on
+episode ends. The rewards alone show where windows end, so this works in any
+environment. A network g of (observation, action, next observation) learns the
+standardized reward of a step. With m and s the running mean and standard deviation of
+payout / length, it takes gradient steps on
 
     (mean_window g - (payout / length - m) / s)^2.
 
@@ -12,12 +12,12 @@ A window that is longer than `Config.decomposition_window_steps` is represented 
 many of its steps, drawn at random, as in randomized return decomposition (Ren et al.
 2022, arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
 
-PPO then sees m + s g instead of the environment's reward. The difference between what a
-window paid and the sum of m + s g over it is shared evenly by its steps. So a window's
-rewards sum to what it paid; before the network has learned anything the payout is
-spread evenly; and where every step pays, the reward is the environment's own. If a
-window began in an earlier batch, only its steps in this batch get their share, because
-PPO has already learned from the others; the sum then lacks the others' shares.
+PPO then learns from m + s g instead of the environment's reward. The difference
+between a window's payout and the sum of m + s g over its steps is added to them in
+equal shares. So a window's rewards sum to its payout; an untrained network spreads the
+payout almost evenly; and where every step pays, the reward is the environment's own. If
+a window began in an earlier batch, only its steps in this batch get their share,
+because PPO has already learned from the earlier ones, whose shares are lost.
 """
 
 from collections.abc import Callable
@@ -38,7 +38,8 @@ from gasil_jax.rollout import Rollout
 
 Metrics = dict[str, jax.Array]
 
-# A part of a minibatch is 2 MB at most: on a CPU it then stays in the cache.
+# Largest count of float32 numbers in a part of a minibatch: 2 MB, which fits a CPU's
+# cache.
 _PART_NUMBERS = 2**19
 
 # Shape letters: N environments, H steps of history per environment, T steps of a batch
@@ -46,17 +47,16 @@ _PART_NUMBERS = 2**19
 
 
 class Decomposition(struct.PyTreeNode):
-    """What decomposing rewards needs from one iteration to the next.
+    """The state of reward decomposition between iterations.
 
     Attributes:
-      network: g, a learner of `networks.StepReward`.
+      network: g, parameters and optimizer state of a `networks.StepReward`.
       rates: moments of payout / length of all windows so far; a normalizer with
         obs = 1.
       reward: float32 (N, H), the decomposed rewards of the history's steps.
       open_reward: float32 (N,), sum of the decomposed rewards of the running window.
       open_steps: float32 (N,), number of steps of the running window.
-      recorded_steps: int32 (), number of steps per environment that were ever
-        recorded, at most H.
+      recorded_steps: int32 (), number of steps of each environment in the history.
     """
 
     network: Learner
@@ -89,12 +89,12 @@ def _network(config: Config) -> Any:
 def init(
     key: jax.Array, config: Config, history: History, action_size: int
 ) -> Decomposition:
-    """Return a decomposition that has seen no windows. The key is consumed.
+    """Return the state before the first window.
 
     Args:
-      key: key for the network's parameters.
+      key: random key for the network's parameters; consumed.
       config: sizes of the network.
-      history: the empty history beside which it records.
+      history: the empty history, for its sizes.
       action_size: dimension of an action.
     """
     num_envs, steps, observation_size = history.observation.shape
@@ -125,7 +125,7 @@ def windows(history: History, recorded_steps: jax.Array) -> Windows:
 
     Args:
       history: the history, with NaN rewards where a payout is not known.
-      recorded_steps: int32 (), how many of the history's steps were ever recorded.
+      recorded_steps: int32 (), number of steps of each environment in the history.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     steps = reward.shape[1]
@@ -171,11 +171,14 @@ def window_sums(
 
 
 def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
-    """Give every step of a batch what its window's last step has, 0 if it has none.
+    """Return for each step the share at the end of its window.
 
     Args:
-      rest: float32 (T, N), read where a window ends.
+      rest: float32 (T, N), the share of each step of a window, read where it ends.
       ends: bool (T, N), whether a window ends with this step.
+
+    Returns:
+      float32 (T, N); 0 in steps of a window that does not end in the batch.
     """
 
     def backward(share: jax.Array, now: Any) -> Any:
@@ -190,24 +193,24 @@ def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
 def goodness_of_fit(
     predicted: jax.Array, actual: jax.Array, valid: jax.Array
 ) -> Metrics:
-    """Return how well windows are explained.
+    """Return how well the network predicts the payouts of windows.
 
     Args:
       predicted: float32 (T, N), mean of the network's rewards over a window.
-      actual: float32 (T, N), mean of what it paid.
-      valid: bool (T, N), where a window counts.
+      actual: float32 (T, N), the window's payout / length.
+      valid: bool (T, N), which windows count.
 
     Returns:
       "decomposition_fit", the share of the variance that is explained (R2), NaN if
-      fewer than two windows count or all of them pay the same, and
-      "decomposition_error", the root of the mean squared error of a step, both ().
+      fewer than two windows count or all payouts are equal, and "decomposition_error",
+      the root of the mean squared error of a step, both ().
     """
     count = jnp.sum(valid)
     mean = lambda x: jnp.sum(jnp.where(valid, x, 0.0)) / count
     error = mean((predicted - actual) ** 2)
     middle = mean(actual)
     variance = mean((actual - middle) ** 2)
-    # Less is the rounding of equal payouts.
+    # A variance below this is rounding error of equal payouts.
     varies = (count > 1) & (variance > 1e-10 * middle**2)
     return {
         "decomposition_fit": jnp.where(varies, 1.0 - error / variance, jnp.nan),
@@ -226,26 +229,25 @@ def decompose(
     hyperparameters: Hyperparameters,
     action_range: tuple[Any, Any],
 ) -> tuple[Decomposition, Rollout, jax.Array, Metrics]:
-    """Learn from the windows that were completed, and decompose a batch's rewards.
+    """Train the network on complete windows, and decompose a batch's rewards.
 
-    The network stays as it was where what it learned is not finite. The rest of the
-    state goes with the history, which no failed update undoes.
+    If the network's update is not finite, it is undone. The rest of the state belongs
+    to the recorded steps and is updated in any case.
 
     Args:
       decomposition: the state before the batch.
-      batch: (T, N, ...), with the environment's rewards.
+      batch: the batch, (T, N, ...), with the environment's rewards.
       history: the history after `record` of the batch; it keeps next observations.
-      normalizer: of observations.
+      normalizer: the normalizer of observations.
       key: random key; consumed.
       config: number and size of the gradient steps.
-      hyperparameters: give the step size.
-      action_range: the lowest and the highest action that the environment sees.
+      hyperparameters: the step size.
+      action_range: the lowest and the highest action of the environment.
 
     Returns:
-      The state after the batch, the batch with decomposed rewards, whether the update
-      of the network was finite and is kept, (), and metrics: the `goodness_of_fit` of
-      the windows of more than one step, which had not been trained on when they were
-      predicted.
+      The state after the batch; the batch with decomposed rewards; whether the update
+      of the network was finite, bool (); and metrics: the `goodness_of_fit` of the
+      batch's windows of more than one step, predicted before training on them.
     """
     network = _network(config)
     low, high = action_range
@@ -268,7 +270,7 @@ def decompose(
         )
         return mean[0] + scale[0] * output
 
-    # Score the predictions of the windows that ended in the batch, then learn of them.
+    # Measure how well the windows that ended in the batch are predicted, then train.
     ends = pays(batch.reward, batch.ended)
     scored = ends & ~batch.faulty
     running = (decomposition.open_reward, decomposition.open_steps)
@@ -293,8 +295,8 @@ def decompose(
         step_size=hyperparameters.decomposition_learning_rate,
     )
     healthy, trained = learner.keep_if_finite(trained, decomposition.network)
-    # What the network leaves unexplained of a window is shared by its steps; the shares
-    # of steps in earlier batches are lost.
+    # The rest of a payout, which the network does not explain, is shared by the steps of
+    # the window; the shares of steps in earlier batches are lost.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
     rest = jnp.where(scored, (batch.reward - total) / length, 0.0)
@@ -323,11 +325,11 @@ def _train(
     config: Config,
     step_size: jax.Array | float,
 ) -> Learner:
-    """Take gradient steps on windows drawn from the history, if one is long enough.
+    """Take gradient steps on windows drawn from the history.
 
-    Windows of a single step need no network. So a run whose every step pays takes no
-    gradient steps at all, also in a batch of such runs: a loop that is vmapped ends
-    with its last member.
+    If all windows have a single step, no network is needed and no step is taken. The
+    number of steps is a loop's bound, not a mask, so a vmapped batch of such runs saves
+    the time too.
     """
     num_windows = config.decomposition_minibatch_size
     num_rows = config.decomposition_window_steps
@@ -341,7 +343,7 @@ def _train(
 
     def objective(params: Any, drawn: Any) -> jax.Array:
         env, position, weight, target = drawn
-        # One axis of rows: a CPU takes a third longer with one of windows and of steps.
+        # Windows and steps are one axis: with two, a CPU takes a third longer.
         index = (jnp.repeat(env, num_rows), position.ravel())
         output = predict(params, *(ring[index] for ring in rings))
         predicted = jnp.sum(weight * output.reshape(weight.shape), axis=1)
@@ -361,16 +363,16 @@ def _train(
         return learner.descend(network, gradient, learner.adam(), step_size)
 
     keys = jax.random.split(key, config.decomposition_updates)
-    late = jnp.any(complete.ends & (complete.length > 1))
-    return jax.lax.fori_loop(0, jnp.where(late, len(keys), 0), step, network)
+    is_delayed = jnp.any(complete.ends & (complete.length > 1))
+    return jax.lax.fori_loop(0, jnp.where(is_delayed, len(keys), 0), step, network)
 
 
 def num_parts(num_windows: int, window_numbers: int) -> int:
-    """Return in how many equal parts a minibatch is read, so that each fits a cache.
+    """Return the fewest equal parts of a minibatch that each fit a CPU's cache.
 
     Args:
-      num_windows: W, of which the result is a divisor.
-      window_numbers: how many numbers the network reads of a window.
+      num_windows: W; the result divides it.
+      window_numbers: count of the network's input numbers for a window.
     """
     divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
     fits = lambda parts: num_windows // parts * window_numbers <= _PART_NUMBERS
@@ -380,7 +382,7 @@ def num_parts(num_windows: int, window_numbers: int) -> int:
 def mean_gradient(
     gradient: Callable[[Any, Any], Any], params: Any, minibatch: Any, parts: int
 ) -> Any:
-    """Return the gradient of a mean over a minibatch, from one part after another.
+    """Return the gradient of a mean over a minibatch, computed part by part.
 
     Args:
       gradient: (params, minibatch) -> gradient of the mean.
@@ -403,13 +405,13 @@ def mean_gradient(
 def sample_window_steps(
     key: jax.Array, length: jax.Array, num_steps: int
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the steps that stand for each window, and their weights in its mean.
+    """Draw the steps that represent each window, with their weights in its mean.
 
     Args:
       key: random key; consumed.
       length: int32 (W,), number of steps of each window.
-      num_steps: S. A window that has no more is represented by all of its steps, a
-        longer one by S of them, drawn with replacement.
+      num_steps: S. A window of at most S steps is represented by all of them, a longer
+        one by S of them, drawn with replacement.
 
     Returns:
       int32 (W, S), the steps' distance from the window's last one, and float32 (W, S).

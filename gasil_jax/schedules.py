@@ -1,4 +1,4 @@
-"""Change hyperparameters over the environment steps of training."""
+"""Schedules: hyperparameters that change over the environment steps of training."""
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
 def at(
     config: Config, hyperparameters: Hyperparameters, iteration: jax.Array
 ) -> Hyperparameters:
-    """Return an iteration's hyperparameters, annealed and scheduled."""
+    """Return the hyperparameters of an iteration, with all schedules applied."""
     # In float32, because int32 would overflow at 2^31 steps.
     env_steps = iteration.astype(jnp.float32) * config.batch_steps
     # A user's own loop may run for more iterations than the config has.

@@ -1,9 +1,10 @@
-"""PPO+SIL: self-imitation learning (Oh, Guo, Singh, Lee 2018) beside PPO.
+"""PPO+SIL: PPO and self-imitation learning (Oh, Guo, Singh, Lee 2018).
 
-A replay buffer holds (s, a, R) of the steps of ended episodes, R being the discounted
-return from that step on. After PPO's own steps, policy and value take
-`sil_updates` gradient steps on minibatches drawn with probability proportional to
-max(R - V(s), 0)^0.6, on `sil_coefficient` times the loss (equations 1 to 4 there)
+A replay buffer holds (s, a, R) of the steps of ended episodes, where R is the
+discounted return from that step on. After PPO's gradient steps the policy and the value
+take `sil_updates` further ones on minibatches, drawn with probability proportional to
+max(R - V(s), 0)^0.6. They minimize `sil_coefficient` times the loss (equations 1 to 4
+of Oh et al.)
 
     -E[w log pi(a | s) (R - V(s))+] + sil_value_coefficient / 2 E[w ((R - V(s))+)^2]
 
@@ -13,10 +14,10 @@ it). The mean is over the steps with a positive advantage, or over 64 if they ar
 The advantage of the first term is in units of that standard deviation. That of the
 second term is in the unit of the returns, as in PPO's value loss here.
 
-R is of rewards that were not clipped. V learns from those that PPO gets, so where many
-normalized rewards are clipped (the metric `clipped_rewards`) R - V is too large. If an
-iteration's update is undone because it is not finite, so is its insertion into the
-replay, and the episodes that ended in it are lost for PPO+SIL.
+R is a sum of rewards that were not clipped, but V learns from PPO's rewards. So if many
+normalized rewards are clipped (the metric `clipped_rewards`), R - V is too large. If an
+iteration's update is undone because it is not finite, its insertion into the replay is
+undone too, and PPO+SIL never gets the episodes that ended in it.
 """
 
 from typing import Any, NamedTuple
@@ -35,10 +36,10 @@ from gasil_jax.ppo import ActorCritic
 
 _PRIORITY_EXPONENT = 0.6
 _IMPORTANCE_EXPONENT = 0.1
-_LEAST_PRIORITY = 1e-6
-_HIGHEST_ADVANTAGE = 1.0
-_LEAST_SCALE = 1e-8
-_LEAST_SAMPLES = 64
+_MIN_PRIORITY = 1e-6
+_MAX_ADVANTAGE = 1.0
+_MIN_SCALE = 1e-8
+_MIN_SAMPLES = 64
 
 
 class Steps(NamedTuple):
@@ -128,12 +129,12 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
     complete = flat(complete)
     count = jnp.sum(complete)
     rank = jnp.cumsum(complete) - 1
-    # If there are too many, the last ones are kept. The index `capacity` is out of
-    # bounds, so what is written there is dropped.
+    # If there are more steps than fit, the last ones are kept. The index `capacity` is
+    # out of bounds, so steps with it are dropped.
     kept = complete & (rank >= count - capacity)
     index = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
     write = lambda ring, new: ring.at[index].set(new, mode="drop")
-    highest = jnp.maximum(jnp.max(replay.priority), _LEAST_PRIORITY)
+    highest = jnp.maximum(jnp.max(replay.priority), _MIN_PRIORITY)
     highest = jnp.where(jnp.any(replay.priority > 0), highest, 1.0)
     return Replay(
         observation=write(
@@ -174,14 +175,14 @@ def return_scale(replay: Replay) -> jax.Array:
     size = jnp.maximum(jnp.sum(filled), 1)
     mean = jnp.sum(jnp.where(filled, replay.return_, 0.0)) / size
     square = jnp.sum(jnp.where(filled, (replay.return_ - mean) ** 2, 0.0)) / size
-    return jnp.maximum(jnp.sqrt(square), _LEAST_SCALE)
+    return jnp.maximum(jnp.sqrt(square), _MIN_SCALE)
 
 
 def clipped_advantage(
     return_: jax.Array, value: jax.Array, scale: jax.Array | float
 ) -> jax.Array:
     """Return (R - V)+ in units of `scale`, clipped at 1: (samples,)."""
-    return jnp.clip((return_ - value) / scale, 0.0, _HIGHEST_ADVANTAGE)
+    return jnp.clip((return_ - value) / scale, 0.0, _MAX_ADVANTAGE)
 
 
 def loss(
@@ -196,11 +197,12 @@ def loss(
     chex.assert_equal_shape([log_prob, value, return_, weight])
     advantage = clipped_advantage(return_, value, scale)
     num_positive = jnp.sum(advantage > 0)
-    num_samples = jnp.maximum(num_positive, _LEAST_SAMPLES)
+    num_samples = jnp.maximum(num_positive, _MIN_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
     policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
-    # Its gradient is minus the clipped advantage, in the unit of the returns: that of
-    # half the square and, where the clip is active, constant instead of 0.
+    # Its gradient with respect to the value is minus the clipped advantage, in the unit
+    # of the returns. That is the gradient of half the square where the advantage is not
+    # clipped; where it is, the gradient is a constant instead of 0.
     value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
     fraction = num_positive / advantage.shape[0]
     return policy_loss + value_coefficient * value_loss, fraction
@@ -258,7 +260,7 @@ def _update_policy(
         )
         actor_critic = ppo.descend(actor_critic, gradient, hyperparameters)
         advantage = clipped_advantage(rows.return_, value, scale)
-        priority = priority.at[index].set(jnp.maximum(advantage, _LEAST_PRIORITY))
+        priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
         return (actor_critic, priority), fraction
 
     before = (actor_critic, replay.priority)
