@@ -1,4 +1,4 @@
-"""Check, on import, that the installed release of JAX computes correctly."""
+"""Refuse, on import, releases of jaxlib that compute wrong numbers."""
 
 import contextlib
 import importlib.metadata

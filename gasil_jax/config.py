@@ -26,7 +26,7 @@ Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
 class Range(NamedTuple):
-    """The range of finite numbers that a field may have.
+    """The range of finite numbers that a field allows.
 
     Attributes:
       low: the lowest number.
@@ -62,13 +62,13 @@ class Range(NamedTuple):
 def number(
     default: float, low: float, high: float = math.inf, excludes_low: bool = False
 ) -> Any:
-    """Declare a float of `Hyperparameters` or of a class that is derived from it.
+    """Declare a float field of `Hyperparameters` or of a class derived from it.
 
     Args:
-      default: its value where none is given.
-      low: the lowest number that it may be.
-      high: the highest number that it may be.
-      excludes_low: whether it must be more than `low`.
+      default: the default value.
+      low: the lowest value.
+      high: the highest value.
+      excludes_low: whether the value must be more than `low`.
     """
     return _field(default, Range(low, high, excludes_low))
 
@@ -82,16 +82,16 @@ def _field(default: Any, allowed: Range) -> Any:
 
 
 class Hyperparameters(struct.PyTreeNode):
-    """The numbers that may differ within one compiled program.
+    """The numbers that may differ between the runs of one compiled program.
 
     They are a pytree, so a sweep is a `vmap` over its leaves.
 
     Two of them are counts, `discriminator_updates` and `buffer_steps`. The values in
-    the configuration decide shapes and are upper limits: a member of a sweep may have
-    smaller ones.
+    the config decide shapes and are upper limits: a run of a sweep may have smaller
+    ones.
 
-    An agent with numbers of its own derives a class from this one, declares them with
-    `number` and names the class in its `Imitation`.
+    An agent with further hyperparameters derives a class from this one, declares them
+    with `number` and names the class in its `Imitation`.
 
     Attributes:
       learning_rate: Adam's step size for policy and value.
@@ -265,7 +265,7 @@ class Config:
 
     def __post_init__(self) -> None:
         """Give the hyperparameters the class that the agent declares."""
-        # `validate` refuses what is not an agent.
+        # `validate` reports an unknown agent.
         with contextlib.suppress(ValueError):
             own = hyperparameters_of(self.agent)
             values = self.hyperparameters
@@ -275,7 +275,7 @@ class Config:
 
     @staticmethod
     def types_of(values: Mapping[str, Any]) -> dict[str, type]:
-        """Return the types of fields that the values of others decide.
+        """Return the types of fields that depend on the values of other fields.
 
         Raises:
           ValueError: if the values name no agent.
@@ -302,7 +302,7 @@ class Config:
         """Return a copy with changed fields, including those of `hyperparameters`.
 
         Raises:
-          ValueError: if the agent has no hyperparameter of a name.
+          ValueError: if a name is no field and no hyperparameter of the agent.
         """
         swept = {name: changes.pop(name) for name in set(changes) - set(_names(Config))}
         changed = dataclasses.replace(self, **changes)
@@ -311,13 +311,13 @@ class Config:
         names = _names(type(changed.hyperparameters))
         for name in swept:
             if name not in names:
-                hyperparameters_of(changed.agent)  # An agent may be what is unknown.
+                hyperparameters_of(changed.agent)  # If it is unknown, this says so.
                 raise ValueError(unknown("hyperparameter", name, names))
         hyperparameters = changed.hyperparameters.replace(**swept)
         return dataclasses.replace(changed, hyperparameters=hyperparameters)
 
 
-#: What the tables and the summary of a sweep have beside its points' hyperparameters.
+#: Columns of a sweep's tables, whose names no hyperparameter may have.
 _COLUMNS = frozenset(
     "point seed mean worst_seed diverged diverged_seeds final_return final_length "
     "final_evaluation".split()
@@ -336,9 +336,9 @@ def hyperparameters_of(agent: Any) -> type[Hyperparameters]:
       agent: the agent's name, see `registry.find`.
 
     Raises:
-      ValueError: if there is no such agent, if a number of its own is not declared
-        with `number` or has a name that is taken, or if it says that it uses a field
-        that does not exist.
+      ValueError: if there is no such agent, if it declares a hyperparameter without
+        `number` or with a name that is taken, or if its `fields` name one that does not
+        exist.
     """
     imitation = registry.find(agent)
     kind = imitation.hyperparameters
@@ -417,12 +417,12 @@ def validate(config: Config) -> None:
 
 
 def validate_hyperparameters(config: Config, hyperparameters: Hyperparameters) -> None:
-    """Check that the numbers of one run are allowed, but for values that are traced.
+    """Check that the hyperparameters of one run are allowed.
 
     Args:
       config: the config of the run, whose counts are upper limits.
-      hyperparameters: scalars. Those that are traced have no value yet; only their
-        shapes are checked.
+      hyperparameters: scalars. Of those that are traced only the shapes are checked,
+        because they have no value yet.
 
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
@@ -450,9 +450,10 @@ def validate_hyperparameters(config: Config, hyperparameters: Hyperparameters) -
 
 
 def _unboxed(value: Any, allowed: Range) -> Any:
-    """Return the number of an array without dimensions, and other values as they are.
+    """Return an array of shape () as a Python number, and other values unchanged.
 
-    Members of a sweep have all their numbers as float32, counts too.
+    The runs of a sweep have all their hyperparameters as float32, counts too, so a
+    whole number that a count allows becomes an int.
     """
     if not isinstance(value, np.generic | np.ndarray | jax.Array):
         return value
@@ -462,7 +463,7 @@ def _unboxed(value: Any, allowed: Range) -> Any:
 
 
 def _refusal(name: str, value: Any, allowed: object) -> ValueError:
-    # NumPy's numbers have a longer form.
+    # The repr of NumPy's numbers also names their type.
     shown = value if isinstance(value, numbers.Number) else repr(value)
     return ValueError(f"{name} is {shown}: it must be {allowed}")
 

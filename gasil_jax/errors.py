@@ -14,7 +14,7 @@ class NotImportable(InputError):
 
 
 def nearest(name: str, allowed: Sequence[str]) -> str | None:
-    """Return the allowed name that `name` may be a slip for, or None."""
+    """Return the allowed name that is most similar to `name`, or None if none is."""
     return next(iter(difflib.get_close_matches(name, allowed, n=1, cutoff=0.7)), None)
 
 
@@ -24,16 +24,16 @@ def unknown(
     """Return the error message for a name that is not among the allowed ones.
 
     Args:
-      kind: what is named.
+      kind: the kind of thing that is named, such as "agent".
       name: the unknown name.
       allowed: the names that exist.
-      forms: what other names look like, such as MODULE:NAME.
+      forms: the forms of other allowed names, such as MODULE:NAME.
     """
     return f"{kind} {name!r} is unknown: {did_you_mean(name, allowed, forms)}"
 
 
 def did_you_mean(name: str, allowed: Sequence[str], forms: Sequence[str] = ()) -> str:
-    """Return what is allowed in place of a name: the nearest, if one is near, and all.
+    """Return the end of an error message: the most similar allowed name, and all names.
 
     Names with spaces are quoted, as on a command line.
     """

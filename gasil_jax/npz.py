@@ -8,7 +8,7 @@ import numpy as np
 
 
 def read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Return every array of the file by its name; nothing is unpickled.
+    """Return all arrays of a file by their names; nothing is unpickled.
 
     Raises:
       ValueError: if the file can't be read; the message is one line.

@@ -3,8 +3,8 @@
     act = gasil_jax.numpy_policy.load("runs/hopper")
     action = act(observation)
 
-"zoo:NAME" names one of the trained policies that the package comes with. The file is an
-``.npz`` of plain arrays, never unpickled:
+"zoo:NAME" names one of the trained policies that come with the package. The file is an
+``.npz`` of plain arrays; nothing is unpickled:
 
     seeds (S,)  final_return (S,)  mean, scale (S, obs)  log_std (S, action)
     kernel_0 (S, obs, width), bias_0 (S, width), kernel_1 ...  low, high (action,)
@@ -60,7 +60,7 @@ def _file(path: str | pathlib.Path) -> pathlib.Path:
 
 
 def about(name: str) -> dict[str, Any]:
-    """Return what is known of a policy of the zoo.
+    """Return how a policy of the zoo was trained, and its score.
 
     Args:
       name: one of `zoo()`, as "zoo:NAME".
@@ -78,7 +78,7 @@ def about(name: str) -> dict[str, Any]:
             f"{', '.join(zoo())}"
         )
     stored = json.loads(str(npz.read(_file(name))["about"]))
-    # Files from before rewards could be decomposed don't say it.
+    # Older files lack this entry.
     return {"decompose_rewards": False, **stored}
 
 

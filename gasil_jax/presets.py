@@ -1,22 +1,25 @@
-"""Tables of hyperparameters that runs start from, by environment, agent and delay.
+"""Presets: settings that runs start from, by environment, agent and reward delay.
 
-A row overrides the defaults of `Config` and `Hyperparameters`; a flag overrides a row.
+A preset has rows, each for an environment and an agent. A row overrides the defaults of
+`Config` and `Hyperparameters`; a flag overrides a row.
 
-"tuned" holds what a search chose for an agent and a task, with the number of
-environments and the unit of rewards that it ran with. A flag that changes the unit
-needs another alpha. Where the stored search is complete, the row is what it chose; the
-other rows are from earlier searches. Adaptive imitation has one setting for all
-locomotion tasks. An agent without a row for a task starts from the defaults.
+"tuned" has the settings that a search chose for an agent on a task, with the number of
+environments and the normalization of rewards that it ran with. Alpha suits only that
+normalization. If the stored search is complete, the row is its choice; the other rows
+are from earlier searches. Adaptive imitation has one setting for all locomotion tasks.
+An agent without a row for a task starts from the defaults.
 
-"decomposed" holds what a search chose on each task for PPO that decomposes delayed
-rewards.
+"decomposed" has the settings that a search chose on each task for PPO on decomposed
+rewards, where rewards are delayed.
 
-"scaled" holds one setting for PPO on all locomotion tasks, whose step size, exploration
-and lambda follow the dimension of an action; it decomposes delayed rewards.
+"scaled" has one setting for PPO on all locomotion tasks, whose learning rate,
+exploration and lambda depend on the dimension of an action. Delayed rewards are
+decomposed.
 
-"paper" holds the paper's batch, one environment x 2,048 steps, and what its appendix
-gives for a task. The rest are the defaults, which are the appendix's where it gives
-them. A single environment is slow, because only the seeds share the cost of a step.
+"paper" has the paper's batch, one environment x 2,048 steps, and what its appendix says
+about individual tasks. The rest are the defaults, which are the appendix's where it
+gives them. A single environment is slow, because only the seeds are stepped in
+parallel.
 """
 
 import json
@@ -37,9 +40,9 @@ Overrides = Mapping[str, Any]
 Rows = Mapping[tuple[str, str], Overrides]
 
 
-#: What searches chose, by "dense", "delayed" or "decomposed", environment and agent;
-#: `python -m experiments report` writes the rows of complete searches and leaves the
-#: others.
+#: File of the settings that searches chose, by "dense", "delayed" or "decomposed",
+#: environment and agent. `python -m experiments report` writes the rows of complete
+#: searches and leaves the others as they are.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
@@ -83,13 +86,13 @@ def _tuned(rewards: str, adaptive: Overrides) -> Rows:
 
 
 def _scaled(decompose_rewards: bool) -> Rows:
-    """Return rows for PPO whose numbers follow the dimension of an action.
+    """Return rows for PPO whose settings depend on the dimension of an action.
 
-    The more dimensions an action has, the smaller the step size and the exploration
-    must be, as the searches suggest (experiments/results/matrix.md). So the noise on an
-    untrained policy's action has a length of about 1 in every task. The more dimensions
-    the noise has, the more it varies the returns after an action, so lambda falls too,
-    from 0.96 for two dimensions to 0.90 for seventeen
+    The searches suggest that the learning rate and the exploration must be smaller for
+    actions with more dimensions (experiments/results/matrix.md). With these rows the
+    noise on an untrained policy's action has a length of about 1 in every task. Noise
+    with more dimensions makes the returns after an action vary more, so lambda falls
+    too, from 0.96 for two dimensions to 0.90 for seventeen
     (experiments/results/action_dimension.md).
     """
     return {
@@ -133,8 +136,8 @@ PRESETS: Mapping[str, Preset] = {
             },
         },
         {},
-        # The paper's horizon is 2,048 steps of one environment, which has no others to
-        # be out of step with.
+        # The paper's horizon is 2,048 steps of one environment. Staggering would only
+        # matter with several.
         every={"num_envs": 1, "stagger_episodes": False},
     ),
 }
@@ -158,13 +161,13 @@ def preset(
 
     Args:
       env: name of the environment.
-      agent: name of the agent, or MODULE:NAME of one of your own.
+      agent: name of the agent, or MODULE:NAME of your own agent.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
 
     Returns:
-      The defaults, changed by what the preset has for all tasks and by its row. With
-      "tuned" they may be the defaults alone.
+      The defaults, overridden by what the preset has for all tasks and by its row. For
+      "tuned" the preset may have neither.
 
     Raises:
       ValueError: if the environment, the agent or the preset is unknown, or if a preset

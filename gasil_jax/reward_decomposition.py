@@ -295,8 +295,8 @@ def decompose(
         step_size=hyperparameters.decomposition_learning_rate,
     )
     healthy, trained = learner.keep_if_finite(trained, decomposition.network)
-    # The rest of a payout, which the network does not explain, is shared by the steps of
-    # the window; the shares of steps in earlier batches are lost.
+    # What the network does not explain of a payout is shared by the window's steps; the
+    # shares of steps in earlier batches are lost.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
     rest = jnp.where(scored, (batch.reward - total) / length, 0.0)
