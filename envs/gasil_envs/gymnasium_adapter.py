@@ -1,12 +1,13 @@
-"""Our environments with Gymnasium's interface, single or as a batch.
+"""The package's environments with Gymnasium's interface, single or as a batch.
 
     import gasil_envs.gymnasium_adapter  # registers the names
 
     gymnasium.make("gasil_envs/walker2d", reward_delay=20)
     gymnasium.make_vec("gasil_envs/walker2d", num_envs=64)
 
-Physics runs under `jax.jit`; the batch is one `jax.vmap`. With a delayed reward an
-episode is also given the rest of its reward where ``max_episode_steps`` cuts it.
+Physics runs under `jax.jit`; a batch is one `jax.vmap`. With a delayed reward, an
+episode that ``max_episode_steps`` truncates gets the rest of its reward in its last
+step.
 """
 
 import inspect
@@ -24,7 +25,7 @@ from gymnasium.wrappers import TimeLimit
 from gasil_envs import pictures, registry, wrappers
 
 _NAMESPACE = "gasil_envs"
-#: The process that has used these environments first; None if none has.
+#: Id of the process that first used these environments; None before that.
 _process: int | None = None
 
 
@@ -42,7 +43,7 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
 def _refuse_fork() -> None:
     """Raise `RuntimeError` in a process forked from one that has used JAX.
 
-    JAX would wait there for ever.
+    JAX would hang there.
     """
     global _process
     _process = _process or os.getpid()
@@ -78,14 +79,14 @@ class GymnasiumEnv(gymnasium.Env):
 
     Args:
       name: one of `gasil_envs.names()`.
-      render_mode: "rgb_array" to draw pictures with `render`; default none. MuJoCo
-        chooses its OpenGL by the variable MUJOCO_GL: egl needs no display.
+      render_mode: "rgb_array" to draw pictures with `render`; default none. The
+        environment variable MUJOCO_GL chooses MuJoCo's OpenGL: egl needs no display.
       width: width of a picture in pixels.
       height: height of a picture in pixels.
       **settings: arguments of `gasil_envs.make`.
 
-    The environment has its own step limit; an episode that reaches it is truncated. So
-    is one that reaches the limit of a `gymnasium.wrappers.TimeLimit` around it.
+    An episode is truncated when it reaches the environment's own step limit, or that of
+    a `gymnasium.wrappers.TimeLimit` around it.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -113,7 +114,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._state: Any = None
         # Typed as Any because an elapsed number of steps is None before the reset.
         self._limits: list[Any] = []
-        # The physics states since the episode's start, which a picture may show.
+        # The physics states since the episode's start, for `render`.
         self._episode: list[Any] = []
 
     def reset(
@@ -135,7 +136,7 @@ class GymnasiumEnv(gymnasium.Env):
                 )
         self._state = self._reset(_key(self.np_random))
         self._episode = []
-        self._remember()
+        self._record()
         return np.array(self._state.obs), {}
 
     def step(
@@ -152,7 +153,7 @@ class GymnasiumEnv(gymnasium.Env):
         _refuse_fork()
         given = _checked_action(action, self._state, self.action_space)
         self._state = state = self._step(self._state, given)
-        self._remember()
+        self._record()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
         reward = float(state.reward)
@@ -160,8 +161,8 @@ class GymnasiumEnv(gymnasium.Env):
         held = state.info.get("held_reward")
         last = any(x._elapsed_steps + 1 >= x._max_episode_steps for x in self._limits)
         if last and not terminated and held is not None:
-            # The limit ends the episode after this step, so nothing may be held back.
-            # A wrapper that repeats actions may take several steps in it.
+            # The limit ends the episode after this step, so the held reward is given
+            # now. It is then 0, in case a wrapper that repeats actions goes on.
             reward += float(held)
             paid = {**state.info, "held_reward": jnp.zeros_like(held)}
             self._state = state.replace(info=paid)
@@ -172,11 +173,11 @@ class GymnasiumEnv(gymnasium.Env):
         return None if self._painter is None else self._painter.draw(self._episode)
 
     def close(self) -> None:
-        """Free what draws the pictures."""
+        """Free the resources of rendering."""
         if self._painter is not None:
             self._painter.close()
 
-    def _remember(self) -> None:
+    def _record(self) -> None:
         if self._painter is not None:
             self._episode.append(self._state.pipeline_state)
 
@@ -283,7 +284,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
 
 
 def register() -> None:
-    """Register our environments with Gymnasium."""
+    """Register the package's environments with Gymnasium."""
     for name in registry.names():
         gymnasium.register(
             id=f"{_NAMESPACE}/{name}",

@@ -1,4 +1,4 @@
-"""Our environments with the interface of gymnax 1.0; all functions are pure.
+"""The package's environments with gymnax 1.0's interface; all functions are pure.
 
     env = GymnaxEnv("walker2d", reward_delay=20)
     observation, state = env.reset(key, env.default_params)
@@ -40,8 +40,9 @@ class GymnaxEnv:
     def reset(
         self, key: jax.Array, params: Params | None = None
     ) -> tuple[jax.Array, State]:
-        """Return the first observation, float32 (obs,), and the state. The key is
-        consumed.
+        """Return the first observation, float32 (obs,), and the state.
+
+        The key is consumed.
         """
         state = self._env.reset(key)
         return state.obs, state

@@ -1,8 +1,8 @@
 """Gymnasium's MuJoCo locomotion tasks (version 5) as Brax environments.
 
-One class, and a row in `TASKS` for each task. The models are the XML files that
-Gymnasium ships; observation, reward, termination, start and frame skip are those of
-``gymnasium.envs.mujoco.*_v5``.
+There is one class, `Locomotion`, and a row in `TASKS` for each task. The models are
+Gymnasium's XML files; observation, reward, termination, start and frame skip are those
+of ``gymnasium.envs.mujoco.*_v5``.
 """
 
 import dataclasses
@@ -203,7 +203,7 @@ class Locomotion(Env):
       name: name of the task.
       physics: "mjx", in pure JAX, or "mujoco", in C on the host's cores.
       solver: solver of MJX's constraints, see `MjxPhysics`.
-      integrator: "model", the same as Gymnasium's, or "euler", which is not the same
+      integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
     """
 
@@ -269,7 +269,7 @@ class Locomotion(Env):
             qvel = scale * jax.random.normal(velocity_key, shape, jnp.float32)
         else:
             qvel = jax.random.uniform(velocity_key, shape, jnp.float32, -scale, scale)
-        # MuJoCo normalizes quaternions that it reads; MJX does not everywhere.
+        # MuJoCo normalizes the quaternions in qpos; MJX does so only in some places.
         for joint in np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
             first = self.model.jnt_qposadr[joint] + 3
             quaternion = qpos[first : first + 4]
@@ -321,7 +321,7 @@ class Locomotion(Env):
         healthy = within(qpos[task.z_index], task.healthy_z)
         healthy &= within(qpos[2], task.healthy_angle)
         healthy &= within(jnp.concatenate([qpos[2:], physics.qvel]), task.healthy_state)
-        # If there are no bounds, this still catches NaN and infinity.
+        # Without bounds this is still false for NaN and infinity.
         return healthy.astype(jnp.float32)
 
     def _observe(self, physics: PhysicsState, fields: Fields) -> jax.Array:

@@ -1,4 +1,4 @@
-"""Import what a user gives as MODULE:NAME, and tell of errors in it in one line."""
+"""Import an object that a user names as MODULE:NAME; report errors in one line."""
 
 import importlib
 import pathlib
@@ -29,7 +29,10 @@ def find(kind: str, name: str) -> Any:
 
 
 def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
-    """Return the message of an error, with its type and place if they are the user's.
+    """Return an error as one line: its message, with type and place if they help.
+
+    The place is the innermost line of the user's own code, if the error passed any. The
+    type is left out of an error that explains itself without it.
 
     Args:
       error: the error.

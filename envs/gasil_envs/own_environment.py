@@ -1,6 +1,6 @@
-"""Import, build and check an environment of the user's own, given as MODULE:NAME.
+"""Import, build and check a user's environment, which is named as MODULE:NAME.
 
-Mistakes that would stop training with a long trace are reported in one line beforehand.
+Mistakes that would stop training with a long trace are reported in one line before it.
 """
 
 import inspect
@@ -100,7 +100,7 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
 
 def _check_states(name: str, env: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
-    # Training wraps the environment, which adds fields that need not match.
+    # Training wraps the environment in `EpisodeLimit`, which adds fields to its states.
     limited = wrappers.EpisodeLimit(env, 1)
     key, action = jax.random.key(0), jnp.zeros(env.action_size)
     bare = _traced(name, env, "reset", key)
@@ -123,7 +123,7 @@ def _check_states(name: str, env: Env) -> None:
                     f"env {name!r}: the {field} of its {where} has the shape {given}, "
                     f"must have {shape}{of if field == 'obs' else ''}"
                 )
-            # The wrappers take a truncation that is a bool, too.
+            # A truncation may be a bool too.
             if field in fields and value.dtype != jnp.float32:
                 raise ValueError(
                     f"env {name!r}: the {field} of its {where} is {value.dtype}, must "

@@ -1,4 +1,4 @@
-"""Draw moments of an episode: MuJoCo draws locomotion, Matplotlib the point mass."""
+"""Draw states of an episode: MuJoCo draws locomotion, Matplotlib the point mass."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +10,7 @@ from brax.envs import Env
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.point_mass import PointMass
 
-#: How far the metres are marked, to both sides.
+#: Distance to which metres are marked on both sides, in metres.
 _METRES = 5
 
 
@@ -56,7 +56,7 @@ class LocomotionPainter:
         return self._renderer.render().copy()
 
     def _mark_metres(self) -> None:
-        """Lay a line across the ground at each whole metre near by, with its number."""
+        """Draw a line across the ground at each whole metre nearby, with its number."""
         scene, floor = self._renderer.scene, self._model.geom("floor").pos[2]
         x, y, _ = self._data.subtree_com[1]
         for metre in range(round(x) - _METRES, round(x) + _METRES + 1):
@@ -73,7 +73,7 @@ class LocomotionPainter:
             scene.ngeom += 1
 
     def moment(self, step: int) -> str:
-        """Return the time of a step, to write it at its picture."""
+        """Return the time of a step as the label of its picture."""
         return f"{step * self.seconds_per_step:.2f} s"
 
     def close(self) -> None:
@@ -113,7 +113,7 @@ class PointMassPainter:
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
     def moment(self, step: int) -> str:
-        """Return the number of a step, to write it at its picture."""
+        """Return the number of a step as the label of its picture."""
         return f"step {step}"
 
     def close(self) -> None:
@@ -121,11 +121,11 @@ class PointMassPainter:
 
 
 def painter(env: Env, size: tuple[int, int]) -> LocomotionPainter | PointMassPainter:
-    """Return what draws an environment, wrapped or not.
+    """Return the painter of an environment, wrapped or not.
 
     Raises:
-      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
-      ValueError: if it is not one of our own environments.
+      NoOpenGL: if the environment is a locomotion task and MuJoCo finds no OpenGL.
+      ValueError: if it is not one of this package's environments.
     """
     if isinstance(env.unwrapped, Locomotion):
         return LocomotionPainter(env.unwrapped, size)

@@ -2,10 +2,10 @@
 
 The action is the agent's velocity. Objects are collected once: blue +5, green +10,
 orange distractors -5. An actuation cost proportional to the L2 norm of the action
-discourages speed. The paper gives no coordinates. `Layout`'s defaults are the result of
-our search for a layout in which the paper's findings appear
-(experiments/point_mass_layouts.py): two tempting blue objects on both sides of the
-start, three green ones further up, and distractors on both sides of those.
+discourages speed. The paper gives no coordinates. `Layout`'s defaults were found by a
+search for a layout in which the paper's findings appear
+(experiments/point_mass_layouts.py): a blue object on each side of the start, three
+green ones further up, and two distractors on each side of those.
 """
 
 import dataclasses
@@ -87,7 +87,7 @@ class PointMass(Env):
 
     @property
     def backend(self) -> str:
-        """Brax's name of the physics engine; there is none here."""
+        """The name of the physics engine, which Brax's `Env` requires: "none"."""
         return "none"
 
     def reset(self, rng: jax.Array) -> State:

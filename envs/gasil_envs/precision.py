@@ -15,14 +15,14 @@ def full_precision(
 ) -> Callable[Arguments, Result]:
     """Make a function's traced matrix products use full float32.
 
-    GPUs from Ampere on use TF32 by default, with ten bits for the fraction, which has
-    ruined PPO runs. If a program sets `jax_default_matmul_precision` itself, that
+    GPUs from Ampere on use TF32 by default, whose fraction has ten bits; PPO runs have
+    failed with it. If a program sets `jax_default_matmul_precision` itself, that
     setting applies instead.
     """
 
     @functools.wraps(function)
     def traced(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
-        config: Any = jax.config  # Its options are attributes that its type lacks.
+        config: Any = jax.config  # Its type does not declare the options.
         if config.jax_default_matmul_precision is not None:
             return function(*args, **kwargs)
         with jax.default_matmul_precision("highest"):

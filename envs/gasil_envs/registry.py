@@ -1,4 +1,4 @@
-"""The names of environments, and the function that builds an environment by name."""
+"""Build environments by name; check names and settings."""
 
 import dataclasses
 import difflib
@@ -53,10 +53,10 @@ def _refuse_unknown(
     """Raise `ValueError` for a name that is not among the allowed ones.
 
     Args:
-      kind: what is named.
+      kind: the kind of thing that is named, such as "env".
       name: the name.
       allowed: the names that exist.
-      forms: what other names look like, such as MODULE:NAME.
+      forms: the forms of other allowed names, such as MODULE:NAME, for the message.
     """
     allowed = tuple(allowed)
     listed = ", ".join((*allowed, *forms))
@@ -64,7 +64,7 @@ def _refuse_unknown(
         raise ValueError(f"{kind} is {name!r}: it must be one of {listed}")
     if name in allowed:
         return
-    # A prefix that all have in common makes no name similar to another.
+    # The prefix, which all names have, must not make them similar.
     bare = {x.removeprefix(BRAX): x for x in allowed}
     near = difflib.get_close_matches(name.removeprefix(BRAX), bare, n=1, cutoff=0.7)
     if not near:
@@ -75,7 +75,7 @@ def _refuse_unknown(
 
 
 def names() -> tuple[str, ...]:
-    """Return the names of our own environments."""
+    """Return the names of this package's environments."""
     return ("point_mass", *locomotion.TASKS)
 
 
@@ -107,7 +107,7 @@ def _build_ours(name: str, settings: Settings) -> Env:
 
 
 def _build_of_brax(name: str) -> Env:
-    """Build an environment of Brax's and trace a step of it, without running it."""
+    """Build an environment of Brax, and trace a step without running it."""
     try:
         with warnings.catch_warnings():
             # Brax warns that its physics is not maintained.
@@ -161,7 +161,7 @@ def check(name: str, settings: Settings) -> None:
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:
-    """Return the names of settings that are changed and that an environment ignores.
+    """Return the names of settings that are not the defaults but have no effect.
 
     Args:
       name: one of `names()`, or another name that `check` accepts.

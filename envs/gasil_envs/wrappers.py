@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from brax.envs import Env, State, Wrapper
 
-#: From C MuJoCo (mjMAXVAL), for which a larger number means a failed simulation.
+#: C MuJoCo's mjMAXVAL: a larger number means that the simulation has failed.
 _LARGEST = 1e10
 
 
@@ -24,7 +24,7 @@ def truncated(state: State) -> jax.Array:
 
 
 def is_sound(x: jax.Array) -> jax.Array:
-    """Return where numbers are finite and no larger than physics gives: x's shape."""
+    """Return whether each number is finite and below 1e10 in size, bool, x's shape."""
     return jnp.abs(x) < _LARGEST  # False for NaN.
 
 
@@ -44,7 +44,7 @@ class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
     Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
-    limit and not the environment ended the episode, or where the environment says so).
+    limit and not the environment ended the episode, or where the environment sets it).
     """
 
     def __init__(self, env: Env, episode_length: int):
@@ -53,7 +53,7 @@ class EpisodeLimit(Wrapper):
 
     @property
     def unwrapped(self) -> Env:
-        """The environment without wrappers, which need not be a subclass of Brax's."""
+        """The environment without wrappers; it need not be a subclass of `Env`."""
         return getattr(self.env, "unwrapped", self.env)
 
     def reset(self, rng: jax.Array) -> State:
@@ -81,9 +81,9 @@ class EpisodeLimit(Wrapper):
 class RewardDelay(Wrapper):
     """Give the accumulated reward every `delay` steps and at the episode's end.
 
-    Paper, section 5.4. Over an episode, the rewards given sum to the rewards earned.
+    Paper, section 5.4. An episode's sum of rewards is the same as without delay.
     ``info["true_reward"]`` is the reward of each step without delay, which evaluations
-    use; an environment that gives its own keeps it.
+    use; if the environment sets it, its value is kept.
     """
 
     def __init__(self, env: Env, delay: int):
@@ -150,18 +150,18 @@ class ObservationNoise(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and add fresh noise to the observation."""
         noise_key = state.info["noise_key"]
-        # An environment may build on its last observation: it gets its own back.
+        # An environment may use its last observation, so it gets the one without noise.
         state = state.replace(obs=state.info["true_observation"])
         return self._noisy(self.env.step(state, action), noise_key)
 
 
 class FaultyStepEnds(Wrapper):
-    """End an episode in which the physics fails, for the users of other libraries.
+    """End an episode in which the physics fails; for use with other libraries.
 
-    The step has reward 0 and the observation of the step before: no observation and no
-    reward that is not finite, or beyond 1e10, leaves it. An episode whose first
-    observation is such has zeros instead, and ends with its first step. `gasil_jax`
-    does the same in its own rollout.
+    The physics fails if an observation or a reward is not `is_sound`. The step then has
+    reward 0 and the observation of the step before. If the first observation of an
+    episode is not sound, it is replaced by zeros, and the episode ends with its first
+    step. `gasil_jax` does the same in its own rollout.
     """
 
     def reset(self, rng: jax.Array) -> State:
@@ -194,9 +194,9 @@ class FaultyStepEnds(Wrapper):
 class AutoReset(Wrapper):
     """Start the next episode when one has ended, from a random state.
 
-    This is for the tools of Brax and Playground; `gasil_jax` resets in its rollout.
-    ``info["final_observation"]`` keeps the observation that the episode ended with,
-    from which a truncated episode's value is bootstrapped.
+    This is for tools of Brax and Playground; `gasil_jax` resets in its own rollout.
+    ``info["final_observation"]`` is the observation that the episode ended with, from
+    which the value of a truncated episode is bootstrapped.
     """
 
     def reset(self, rng: jax.Array) -> State:
@@ -211,7 +211,7 @@ class AutoReset(Wrapper):
         key, reset_key = jax.random.split(state.info["reset_key"])
         info = dict(state.info)
         del info["reset_key"], info["final_observation"]
-        # `done` is set back: the caller saw it in the state before.
+        # `done` is still that of the last step.
         stepped = self.env.step(state.replace(info=info, done=0.0 * state.done), action)
         fresh = self.env.reset(reset_key)
         done = stepped.done > 0
@@ -229,5 +229,5 @@ class AutoReset(Wrapper):
         )
 
 
-# Facts about the step that ended the episode, which the fresh start must not erase.
+# Entries of info about the episode's last step, which a reset must not overwrite.
 _LAST_STEP_INFO = ("truncation", "true_reward")
