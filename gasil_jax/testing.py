@@ -8,7 +8,6 @@ from gasil_envs.precision import full_precision
 from gasil_jax import schedules, train
 from gasil_jax.config import Config
 from gasil_jax.imitation.interface import Context
-from gasil_jax.networks import Policy, Value
 
 
 @full_precision
@@ -30,18 +29,8 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
     train.check(env, config)
     state = train.init(env, config, key)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
-    # The networks are typed as Any, see `train`.
-    policy: Any = Policy(config.hidden_sizes, env.action_size)
-    value: Any = Value(config.hidden_sizes)
     _, act_key, _, _, _, decompose_key = jax.random.split(state.key, 6)
-    _, batch = train.sample_trajectories(
-        env,
-        config,
-        state,
-        act_key,
-        policy=policy.apply,
-        hyperparameters=hyperparameters,
-    )
+    _, batch = train.sample_trajectories(env, config, state, act_key, hyperparameters)
     history, buffer = train.update_good_trajectories(
         config, state, batch, hyperparameters
     )
@@ -54,14 +43,11 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
         key=decompose_key,
         hyperparameters=hyperparameters,
     )
-    return Context(
-        rollout=rewards.batch,
-        history=rewards.history,
-        good_trajectories=buffer,
-        normalizer=state.normalizer,
-        reward_scale=rewards.scale,
+    return train.make_context(
+        env,
+        config,
+        state,
+        rewards=rewards,
+        buffer=buffer,
         hyperparameters=hyperparameters,
-        config=config,
-        policy=policy.apply,
-        value=value.apply,
     )

@@ -5,7 +5,6 @@ any leaf of `Hyperparameters`, shard it over devices, call it from other JAX cod
 """
 
 import math
-from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -204,13 +203,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
     """
     agent = checked(find_agent(config.agent), config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
-    policy, value = (network.apply for network in _networks(env, config))
     key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(
         state.key, 6
     )
     # Sample policy trajectories.
     environments, batch = sample_trajectories(
-        env, config, state, act_key, policy=policy, hyperparameters=hyperparameters
+        env, config, state, act_key, hyperparameters
     )
     # Update the good-trajectory buffer.
     history, buffer = update_good_trajectories(config, state, batch, hyperparameters)
@@ -225,16 +223,13 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
         key=decompose_key,
         hyperparameters=hyperparameters,
     )
-    context = Context(
-        rollout=rewards.batch,
-        history=rewards.history,
-        good_trajectories=buffer,
-        normalizer=state.normalizer,
-        reward_scale=rewards.scale,
+    context = make_context(
+        env,
+        config,
+        state,
+        rewards=rewards,
+        buffer=buffer,
         hyperparameters=hyperparameters,
-        config=config,
-        policy=policy,
-        value=value,
     )
     # Sample good trajectories, update the discriminator (equation 8) and shape the
     # reward with it (section 4.3); agents without a discriminator do other things here.
@@ -289,8 +284,6 @@ def sample_trajectories(
     config: Config,
     state: TrainState,
     key: jax.Array,
-    *,
-    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     hyperparameters: Hyperparameters,
 ) -> tuple[rollout.EnvironmentStates, Rollout]:
     """Collect one batch of experience with the current policy.
@@ -300,15 +293,15 @@ def sample_trajectories(
       config: sizes of the batch.
       state: with the policy and the running episodes.
       key: random key; consumed.
-      policy: (params, normalized observation) -> mean, log standard deviation.
       hyperparameters: their values in this iteration.
 
     Returns:
       The running episodes after the batch, and the batch, (time, env, ...).
     """
+    policy, _ = _networks(env, config)
     return rollout.collect(
         env,
-        lambda observation: policy(
+        lambda observation: policy.apply(
             state.actor_critic.policy.params,
             normalization.normalize(state.normalizer, observation),
         ),
@@ -434,6 +427,39 @@ def learner_rewards(
         metrics = {**metrics, "reward_scale": scale, "clipped_rewards": clipped}
     rewards = Rewards(batch, history, scale, decomposition, normalizer, healthy)
     return rewards, metrics
+
+
+def make_context(
+    env: Any,
+    config: Config,
+    state: TrainState,
+    *,
+    rewards: Rewards,
+    buffer: good_trajectories.GoodTrajectories,
+    hyperparameters: Hyperparameters,
+) -> Context:
+    """Return the data of an iteration that the agent's functions get.
+
+    Args:
+      env: the environment, for the sizes of the networks.
+      config: the config.
+      state: the state before the iteration.
+      rewards: the batch and the history with the rewards to learn from.
+      buffer: the buffer after the batch.
+      hyperparameters: their values in this iteration.
+    """
+    policy, value = _networks(env, config)
+    return Context(
+        rollout=rewards.batch,
+        history=rewards.history,
+        good_trajectories=buffer,
+        normalizer=state.normalizer,
+        reward_scale=rewards.scale,
+        hyperparameters=hyperparameters,
+        config=config,
+        policy=policy.apply,
+        value=value.apply,
+    )
 
 
 @jax.named_scope("advantages")
