@@ -85,12 +85,12 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
 def _small(figure: Figure, names: Sequence[str]) -> Figure:
     """Return the small version of a figure, of the named panels or the first one.
 
-    It has the presets "tuned" and "decomposed" instead of what a search may not have
-    chosen yet.
+    Instead of what searches choose, which may not be known yet, it uses the presets
+    "tuned" and "decomposed".
 
     Raises:
-      InputError: if the figure has no panel or search of a name, or if only searches
-        are named.
+      InputError: if a name is no panel or search of the figure, or if only searches are
+        named.
     """
     selected = _selected(figure, names or [*figure.panels][:1])
     if not selected.panels:
@@ -129,8 +129,8 @@ def _train(name: str, options: Options) -> None:
 
     def stores() -> tuple[Store, Store]:
         """Return the stores of the figure's runs and of the searches' runs."""
-        # They are made anew because other processes may have added runs. A figure
-        # without searches of its own uses those that are checked in.
+        # They are read again each time, because other processes may have added runs. A
+        # figure without searches uses the choices of other figures' stored searches.
         searched = results if figure.searches else RESULTS
         return Store(results / "runs"), Store(searched / "runs")
 
@@ -148,7 +148,7 @@ def _train(name: str, options: Options) -> None:
             print(f"  {program}")
         return
     if published and not options.quick:
-        # Other pages have some of the same runs.
+        # Other pages may have some of the same runs.
         _write_all_pages()
     else:
         Page(name, stored, searched, figure if options.quick else None).write(results)
@@ -214,7 +214,7 @@ def _report(options: ReportOptions) -> None:
     print(f"in {RESULTS}")
 
 
-#: Commands that are no figures: their options, and what they do.
+#: Commands other than figures, by name: the class of their options, and a function.
 COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "report": (ReportOptions, _report),
     "coverage": (CoverageOptions, _coverage),

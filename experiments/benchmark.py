@@ -10,8 +10,9 @@
 - "scaling": training on 1, 2, 4 ... devices, with as many seeds on each device. A
   perfect ratio is the number of devices.
 
-All rows of a task are compiled first and then timed in turn, again and again, so that a
-ratio compares numbers from the same minutes. A speed is the median of the repeats.
+All rows of a task are compiled first. Then they are timed in turn, several times, so
+that a ratio compares speeds from the same minutes. A speed is the median of the
+repeats.
 """
 
 import dataclasses
@@ -138,7 +139,7 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     began = time.perf_counter()
     advance = rollout.lower((states, _keys(0, count))).compile()
     compile_seconds = time.perf_counter() - began
-    # Not from the start, because most bodies have fallen to the ground after a while.
+    # Timed after some steps, when most bodies lie on the ground, as they do later.
     states, _ = jax.block_until_ready(advance((states, _keys(0, count))))
 
     rollouts = lambda: advance((states, _keys(1, count)))
@@ -240,7 +241,7 @@ def training_row(
 def _train_baseline(
     task: str, num_envs: int, spread: bool, threads: int, pipe: Any
 ) -> None:
-    """Train Stable-Baselines3's PPO in a process of its own, when it is told to."""
+    """Train Stable-Baselines3's PPO in a separate process, when the pipe says "go"."""
     import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.env_util import make_vec_env
@@ -248,7 +249,7 @@ def _train_baseline(
 
     # With more threads than cores, threads wait for each other.
     torch.set_num_threads(threads)
-    # 2048 steps, 10 epochs and minibatches of 64 are its own values, and ours.
+    # 2048 steps, 10 epochs and minibatches of 64 are the defaults there and here.
     kind = SubprocVecEnv if spread else DummyVecEnv
     env = make_vec_env(task, num_envs, vec_env_cls=kind)
     model = PPO("MlpPolicy", env, n_steps=2048 // num_envs, device="cpu")
@@ -270,7 +271,7 @@ def baseline_row(
       env_name: name of the task.
       runs: number of runs that train at once.
       num_envs: number of environments of a run.
-      spread: give each environment a process of its own, not all of a run the same.
+      spread: whether each environment has its own process; otherwise a run is one.
     """
     task = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
     context = multiprocessing.get_context("spawn")
@@ -281,13 +282,13 @@ def baseline_row(
         for _ in range(runs):
             mine, theirs = context.Pipe()
             arguments = (task, num_envs, spread, threads, theirs)
-            # A daemon may not have processes of its own.
+            # A daemon may not start processes.
             process = context.Process(
                 target=_train_baseline, args=arguments, daemon=not spread
             )
             process.start()
             processes.append(process)
-            # Otherwise the end of a process that failed would go unnoticed.
+            # While this end is open, a failed process would leave `recv` waiting.
             theirs.close()
             pipes.append(mine)
         for pipe in pipes:
@@ -295,7 +296,7 @@ def baseline_row(
         for pipe in pipes:
             pipe.send("go")
         seconds = max(pipe.recv() for pipe in pipes)
-        # The next row must not run beside their end.
+        # The next row must not be timed while they still run.
         for process in processes:
             process.join()
         return runs * _BASELINE_STEPS / seconds

@@ -1,6 +1,6 @@
-"""Comparisons of final returns, with their intervals, in numbers and in words.
+"""Comparisons of final returns with their intervals, as numbers and as text.
 
-Verdicts are corrected for the number of comparisons of their family by Holm's method.
+Verdicts are corrected by Holm's method for the number of comparisons in their family.
 """
 
 import dataclasses
@@ -14,10 +14,10 @@ import numpy as np
 from experiments.figures import Comparisons
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
-#: About the probability that any verdict of a family is wrong.
+#: Significance level of a family of verdicts.
 LEVEL = 0.05
 _DRAWS = 10_000
-#: Fewer seeds have no interval, because it would be far too narrow, and no verdict.
+#: With fewer seeds there is no verdict, and no interval, which would be far too narrow.
 FEWEST_SEEDS = 5
 _VERDICTS = ("better", "not clear", "worse")
 #: Scores, (seeds,), by panel and curve.
@@ -58,7 +58,7 @@ def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
 
 @functools.cache
 def _permuted(ours: tuple[float, ...], other: tuple[float, ...]) -> np.ndarray:
-    """Return differences of interquartile means of seeds dealt anew: (draws,)."""
+    """Return differences of interquartile means of permuted seeds: (draws,)."""
     rng = np.random.default_rng(0)
     rows = rng.permuted(np.tile((*ours, *other), (_DRAWS, 1)), axis=1)
     first, second = np.split(rows, [len(ours)], axis=1)
@@ -68,11 +68,12 @@ def _permuted(ours: tuple[float, ...], other: tuple[float, ...]) -> np.ndarray:
 def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     """Return the p-value of a permutation test for two curves, of (seeds,) each.
 
-    It is the share of all ways to deal the seeds to the two curves whose interquartile
-    means are at least as far apart, estimated by random ones. Unlike the bootstrap's it
-    is right for a few seeds too: five against five can have no less than 0.008.
+    It is the share of the ways to divide all seeds between the two curves in which the
+    interquartile means are at least as far apart, estimated by random ways. Unlike the
+    bootstrap's it is valid for few seeds too: for five against five it is at least
+    0.008.
     """
-    # Both orders are the same test, and so have the same random numbers.
+    # The pair in either order is the same test and has the same random numbers.
     pair = sorted([tuple(ours.tolist()), tuple(other.tolist())])
     distance = abs(float(interquartile_mean(ours) - interquartile_mean(other)))
     # Sums in another order differ by rounding.
@@ -81,13 +82,13 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
 
 
 def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
-    """Return the differences of interquartile means whose curves all have scores.
+    """Return the comparisons of a family whose curves all have scores.
 
     The p-value is the percentile bootstrap's: twice the share of draws on the other
-    side of 0. With few seeds that is too small, so the difference of two curves has the
-    larger of it and the permutation test's; differences of differences have the
-    bootstrap's alone. Holm's method multiplies the smallest p-value by the number of
-    comparisons, the next by one less, and so on, and makes none smaller than the one
+    side of 0. With few seeds that is too small. So for two curves it is the larger of
+    the bootstrap's and the permutation test's; for a difference of differences it is
+    the bootstrap's alone. Holm's method multiplies the smallest p-value by the number
+    of comparisons, the next by one less, and so on, and makes none smaller than the one
     before.
     """
     raw = {}
@@ -112,13 +113,12 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
-    """Return the probability of improvement over the panels, in words.
+    """Return the probability of improvement over the panels, as text.
 
     It is the probability that a random seed of `ours` has a higher score than a random
-    seed of `other`, where equal scores count half, averaged over the panels, with the
-    95% percentile bootstrap interval over seeds, drawn within each panel (Agarwal et
-    al. 2021). A score that is not a number, of a seed that ended no episode, is less
-    than all others.
+    seed of `other`, where equal scores count half, averaged over the panels (Agarwal et
+    al. 2021). The 95% percentile bootstrap interval is over seeds, drawn within each
+    panel. A NaN, the score of a seed that ended no episode, is below all other scores.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
 
@@ -141,7 +141,7 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) ->
 
 
 def counted(verdicts: Sequence[str]) -> str:
-    """Return how often there is each verdict, in words."""
+    """Return the count of each verdict as text, such as "better on 2, worse on 1"."""
     words = [word for word in _VERDICTS if word in verdicts]
     return ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
 
@@ -157,10 +157,7 @@ def in_words(middle: float, low: float, high: float) -> str:
 
 
 def interval(scores: np.ndarray) -> str:
-    """Return the interquartile mean of (seeds,) and, if there are enough, its interval.
-
-    The result is text.
-    """
+    """Return as text the interquartile mean of (seeds,), if enough with an interval."""
     middle = float(interquartile_mean(scores))
     if len(scores) < FEWEST_SEEDS:
         return number(middle)
@@ -168,13 +165,13 @@ def interval(scores: np.ndarray) -> str:
 
 
 def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
-    """Return the interquartile mean over the seeds of all tasks, in words.
+    """Return the interquartile mean over the seeds of all tasks, as text.
 
-    Every task counts alike. The 95% interval is the percentile bootstrap's over seeds,
-    drawn within each task.
+    Every task has the same weight. The 95% interval is the percentile bootstrap's over
+    seeds, drawn within each task.
 
     Args:
-      name: what the random numbers are drawn for.
+      name: seeds the random numbers of the bootstrap.
       scores: the scores of each task, (seeds,), in one unit.
     """
     most = math.lcm(*map(len, scores))

@@ -1,9 +1,9 @@
 """Train the runs that are missing in a store, and add them to it.
 
-Runs of the same environment and static settings are members of one compiled program. A
-program is trained in a scratch folder that is named by a hash of everything it trains,
-so that the folder never holds other training. Training that was interrupted there is
-only continued if `Setup.resume` is set.
+Runs with the same environment and static settings are members of one compiled program.
+A program is trained in a scratch folder whose name is a hash of all its settings, so a
+folder never mixes two programs. Interrupted training is only continued if
+`Setup.resume` is set.
 """
 
 import dataclasses
@@ -71,7 +71,7 @@ class Setup:
 def source(commit: str | None) -> dict[str, Any]:
     """Return the checkout's commit, and whether its files are unchanged.
 
-    What experiments write themselves is left out.
+    Files that experiments write do not count as changed.
 
     Args:
       commit: the commit to return if there is no repository.
@@ -113,7 +113,8 @@ class Program:
     @property
     def folder(self) -> pathlib.Path:
         """The program's scratch folder."""
-        # With other physics or evaluations, checkpoints and tables hold other things.
+        # Physics and evaluations are not in a run's key, but checkpoints and tables
+        # depend on them.
         names = [self.setup.physics, str(self.setup.evaluate_episodes)]
         text = " ".join([*names, *(run.key for run in self.runs)])
         return self.setup.runs / hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -128,7 +129,7 @@ class Program:
 
 
 def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
-    """Divide runs into as few programs as possible."""
+    """Group runs into as few programs as possible."""
     groups: dict[Run, list[Run]] = {}
     for run in runs:
         # Only counts decide shapes, so only they may need separate programs.
@@ -145,7 +146,7 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
 def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
     """Return the runs of a shard, the same on each machine.
 
-    A run's key alone decides, so that no run changes its shard when others join.
+    A run's shard depends on its key alone, not on which other runs are missing.
     """
     return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
 
@@ -154,8 +155,8 @@ def train(program: Program) -> dict[Run, Record]:
     """Train a program, or continue its training.
 
     Raises:
-      InputError: if it does not fit the memory or the disk, or if another process works
-        on it.
+      InputError: if it does not fit into memory or on the disk, or if another process
+        trains it.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     run, setup, folder = program.runs[0], program.setup, program.folder
@@ -207,7 +208,7 @@ def train(program: Program) -> dict[Run, Record]:
 
 
 def _provenance(program: Program) -> dict[str, Any]:
-    """Return what a program is trained with, over all sessions of its training."""
+    """Return how a program is trained, over all sessions of interrupted training."""
     setup, path = program.setup, program.folder / "provenance.json"
     devices = jax.devices()[: len(program.runs)]
     now = {
@@ -223,7 +224,7 @@ def _provenance(program: Program) -> dict[str, Any]:
     every = lambda name: ", then ".join(
         dict.fromkeys(str(session[name]) for session in sessions if session[name])
     )
-    # False if a session's checkout was changed, or else None if one is unknown.
+    # False if any session had a changed checkout; otherwise None if any is unknown.
     clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
     commit = every("commit") or None
     return {**now, "device": every("device"), "commit": commit, "clean": clean}
@@ -240,7 +241,7 @@ def record(
       metrics: columns of metrics.csv, (iterations,) each.
       evaluations: columns of evaluations.csv, (evaluations,) each; empty if there were
         none.
-      provenance: what the run was trained with.
+      provenance: how the run was trained, see `Record`.
     """
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
@@ -261,9 +262,9 @@ def record(
 
 
 def begun(missing: Iterable[Run], setup: Setup) -> list[Program]:
-    """Return the programs of the scratch folder that train any of the missing runs.
+    """Return the programs in the scratch folder that train any of the missing runs.
 
-    They may have other runs too, which were stored meanwhile.
+    They may also have runs that have been stored since.
 
     Raises:
       InputError: if a folder's list of runs can't be read.
@@ -272,7 +273,7 @@ def begun(missing: Iterable[Run], setup: Setup) -> list[Program]:
     return [
         program
         for path in sorted(setup.runs.glob(f"*/{_RUNS}"))
-        # With another setup it is other training.
+        # A program with another physics or evaluations has another folder.
         if (program := _listed(path, setup)).folder == path.parent
         and not requested.isdisjoint(program.runs)
     ]
@@ -291,8 +292,8 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
     """Train runs and add them to the store, each program as soon as it has ended.
 
     Raises:
-      InputError: if the scratch folder holds training of these runs that is not to be
-        continued.
+      InputError: if the scratch folder holds training of these runs and `Setup.resume`
+        is not set.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     unfinished = begun(missing, setup)
@@ -306,6 +307,6 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
             f"{', '.join(used)}: continue it with --resume, or name another folder"
         )
     for program in requested:
-        # Another process may have added them meanwhile.
+        # Another process may have added them since.
         if Store(store.folder).missing(program.runs):
             store.add(train(program))

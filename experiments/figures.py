@@ -1,14 +1,14 @@
-"""The table of figures: the curves of each, whose runs are requested from the store.
+"""The table of figures, `FIGURES`: each figure's curves, comparisons and searches.
 
-A new figure is one more row of `FIGURES`, and its page is ``notes/NAME.md``. Its panels
-are a `grid` of tasks, delays and arms: a name, an agent and what the arm changes.
-For example, an ablation with the same settings on all tasks, and many delays:
+To add a figure, add a row to `FIGURES` and the text of its page, ``notes/NAME.md``. Its
+panels are a `grid` of tasks, delays and arms; an `Arm` has a name, an agent and changed
+settings. For example, an ablation with the same settings on all tasks, and many delays:
 
     grid(TASKS, ("ppo", "ppo+gasil", Arm("no bonus", "ppo+gasil", {"alpha": 0.0})),
          (DELAY,), base=None, changes={"num_envs": 64})
     grid(TASKS, PAIR, (1, 5, 20, 100, 1000), panel="{env}", curve="{arm}-{delay}")
 
-The second is drawn over the delay with ``over=("reward_delay", "delay")``.
+With ``over=("reward_delay", "delay")`` the second is drawn over the delay.
 """
 
 import dataclasses
@@ -35,7 +35,7 @@ from gasil_jax.config import Config
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.
 Terms = tuple[tuple[float, str, str], ...]
-#: What is compared: terms by (panel, ours, other), or (panel, ours, other, a panel
+#: Terms to compare with 0, by (panel, ours, other), or by (panel, ours, other, a panel
 #: whose difference is subtracted).
 Comparisons = Mapping[tuple[str, ...], Terms]
 
@@ -48,11 +48,11 @@ class Curve:
       env: name of the task.
       agent: name of the agent.
       changes: hyperparameters and other fields of `Config` to change.
-      reward_delay: the task's reward delay.
-      obs_noise: the task's observation noise.
-      base: the settings that are changed: a preset's by its name, the defaults of
-        `Config` (None), or what a search chose, by a function of task, agent and delay
-        that returns the search.
+      reward_delay: the task's reward delay, in steps.
+      obs_noise: standard deviation of the task's observation noise.
+      base: the settings before the changes: a preset's, by its name; the defaults of
+        `Config`, by None; or what a search chose, by a function of task, agent and
+        delay that returns the search.
       seeds: number of seeds, from seed 0 on.
       total_steps: environment steps per seed.
     """
@@ -68,21 +68,21 @@ class Curve:
 
     @property
     def search(self) -> Search | None:
-        """The search whose choice it uses, if any."""
+        """The search that chooses the settings, or None."""
         if callable(self.base):
             return self.base(self.env, self.agent, self.reward_delay)
         return None
 
     def point(self, searched: Store) -> Point | None:
-        """Return what differs from the default or the preset's values.
+        """Return the settings that differ from the defaults or the preset.
 
-        It is None if the curve's search is not complete in the store `searched`.
+        They are None if the curve's search is not complete in the store `searched`.
         """
         chosen = self.search.chosen(searched) if self.search else {}
         return None if chosen is None else {**chosen, **self.changes}
 
     def runs(self, searched: Store) -> tuple[Run, ...]:
-        """Return its runs, or none if its search is not complete."""
+        """Return the curve's runs, or none if its search is not complete."""
         if (point := self.point(searched)) is None:
             return ()
         config = Config(agent=self.agent)
@@ -108,16 +108,17 @@ class Figure:
 
     Attributes:
       title: title of the page.
-      claim: what the paper says; empty if it says nothing about the matter.
-      panels: the curves of each panel, by their names.
-      favourite: the curve that is compared with each other one of its panel; None
-        compares all with all.
+      claim: the paper's claim; empty if it has none about this.
+      panels: the curves by panel and name.
+      favourite: name of the curve that is compared with each other curve of its panel;
+        None compares each pair of curves.
       comparisons: comparisons to make instead of those with the favourite.
       searches: searches that are trained before the curves, by their names.
-      over: the field of the runs that final returns are drawn over, and its name on
-        the axis; None for learning curves. Curves whose names differ in its value
-        alone are points of one line.
-      early: environment steps whose mean return is compared too, as curve "NAME early".
+      over: a field of `Curve` or `Config` that is the x-axis of final returns, and the
+        axis' label; None for learning curves. Curves whose names differ only in the
+        field's value are points of one line.
+      early: number of first environment steps whose mean return is compared too, as the
+        curve "NAME early".
     """
 
     title: str
@@ -137,12 +138,12 @@ class Figure:
         ]
 
     def names(self, panels: Iterable[str] | None = None) -> list[str]:
-        """Return the names of the curves of panels, each once; by default of all."""
+        """Return the names of the curves of panels, each once; default all panels."""
         chosen = self.panels if panels is None else panels
         return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
 
     def point_of(self, panel: str, name: str) -> tuple[str, Any]:
-        """Return the line that a curve is a point of, and its place on the axis."""
+        """Return the name of the line that a curve belongs to, and its x value."""
         if self.over is None:
             return name, None
         curve = self.panels[panel][name]
@@ -150,13 +151,13 @@ class Figure:
         return name.replace(f"-{value}", "", 1), value
 
     def rival(self, panel: str, name: str) -> str | None:
-        """Return the favourite's curve at the place of another curve, if it has one."""
+        """Return the favourite's curve at the x value of a curve, or None."""
         place = (self.favourite, self.point_of(panel, name)[1])
         curves = (x for x in self.panels[panel] if self.point_of(panel, x) == place)
         return next((x for x in curves if x != name), None)
 
     def compared(self) -> Comparisons:
-        """Return everything that its page compares: one family of tests."""
+        """Return all comparisons of the figure's page: one family of tests."""
         if self.comparisons is not None:
             return self.comparisons
         compared: dict[tuple[str, ...], Terms] = {}
@@ -172,7 +173,9 @@ class Figure:
         return compared
 
     def requested(self, searched: Store) -> list[Run]:
-        """Return all its runs that are known so far.
+        """Return all runs of the figure that are known so far.
+
+        Runs that depend on the result of an incomplete search are not known yet.
 
         Args:
           searched: the store of the searches' runs.
@@ -235,7 +238,7 @@ def grid(
 
 
 def joined(grids: Iterable[Panels]) -> Panels:
-    """Return the panels of several grids; those of the same name are one."""
+    """Merge the panels of several grids: panels with the same name become one."""
     panels: dict[str, dict[str, Curve]] = {}
     for name, curves in itertools.chain(*(panels.items() for panels in grids)):
         panels.setdefault(name, {}).update(curves)
@@ -259,8 +262,8 @@ def _noise_comparisons() -> Comparisons:
     return compared
 
 
-#: The values of the paper's figure 8, and the one that is compared with the ends that
-#: the paper names.
+#: The values in the paper's figure 8; and the middle one, with the too small and too
+#: large ones that the paper names and that are compared with it.
 _VALUES = {
     "buffer_steps": (500, 1000, 2000, 5000, 10000),
     "discriminator_updates": (1, 5, 10, 20),
@@ -269,7 +272,7 @@ _MIDDLE = {"buffer_steps": (1000, (500, 5000)), "discriminator_updates": (5, (1,
 
 
 def _ends(panels: Panels) -> Comparisons:
-    """Compare the value in the middle with both ends of figure 8's panels."""
+    """Compare the middle value with both ends in each panel of figure 8."""
     return {
         (panel, f"{middle}", f"{end}"): difference(panel, f"{middle}", f"{end}")
         for panel in panels
@@ -297,7 +300,7 @@ _SCHEDULED = Arm(
     {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
 )
 _PAPERS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
-#: Adaptive imitation, and without one of its parts at a time.
+#: Adaptive imitation as a whole, and with one part at a time removed.
 _PARTS = [
     Arm("whole", ADAPTIVE),
     Arm("rewards not decomposed", ADAPTIVE, {"decompose_rewards": False}),
@@ -308,13 +311,13 @@ _PARTS = [
     ),
     Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
 ]
-#: The forms of the discriminator's bonus that don't pay for staying up.
+#: PPO+GASIL with forms of the bonus that don't favour long episodes.
 _LOGIT, _CENTERED = (
     Arm(f"ppo+gasil ({form})", "ppo+gasil", {"bonus": form})
     for form in ("logit", "centered")
 )
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
-#: Changes of the preset `scaled` by the dimension of an action, by the arms' names.
+#: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _LAMBDA: Point = {"gae_lambda": 0.95}
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
     "lambda 0.95": lambda size: _LAMBDA,
@@ -356,7 +359,7 @@ _DELAYED = (
 
 
 def _usual_delay(env: str, agent: str, delay: int) -> Search:
-    """Return the search for the usual delay, at every delay."""
+    """Return the search with a delay of `DELAY`, whatever the delay is."""
     return Search(env, agent, DELAY)
 
 

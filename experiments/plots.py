@@ -57,8 +57,8 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         for x, name in zip(handles, names, strict=True)
     }
     if count > 1 and len(handle_of) > 3:
-        # So many names would hide the curves.
-        # At this size a letter is about 0.07 inches wide.
+        # So many names would hide the curves, so the legend is below the panels. At
+        # this font size a letter is about 0.07 inches wide.
         width = 0.5 + 0.07 * max(map(len, handle_of))
         fitting = max(1, min(4, int(size[0] / width)))
         below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
@@ -75,7 +75,7 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
 def _colors(figure: Figure) -> dict[str, Any]:
     """Return the color of each curve's name, the same in all panels.
 
-    Values, and more names than there are colors, are dark to light.
+    If the names are numbers, or more than there are colors, they go from dark to light.
     """
     names = figure.names()
     if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
@@ -116,7 +116,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> Non
 
 
 def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
-    """Draw final returns over a setting: a line for the curves that differ in it."""
+    """Draw final returns over a setting; a line joins curves that differ only in it."""
     curves = figure.panels[panel]
     color_of = _with_free_colors(dict.fromkeys(x.agent for *_, x in figure.curves()))
     lines: dict[str, dict[Any, str]] = {}
@@ -136,7 +136,7 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
         middle = np.array([interquartile_mean(x) for x in finals])
         low, high = np.array([bootstrap_interval(x) for x in finals]).T
         axes.errorbar(
-            # Shifted sideways, so that no interval hides another.
+            # Each line is shifted sideways, so that no interval hides another.
             np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
             middle,
             [middle - low, high - middle],

@@ -1,4 +1,4 @@
-"""The random layouts that the point mass' layout was chosen from.
+"""The random layouts among which the point mass' layout was chosen.
 
 The paper prints no coordinates, so PPO and PPO+GASIL were trained in layouts 0 to 127,
 which are drawn at random, and then with new seeds in sixteen of the eighteen in which
@@ -21,8 +21,8 @@ from experiments.search import PAIR
 from experiments.store import RESULTS
 from gasil_envs.point_mass import Layout, PointMass
 
-# Added to the standard error, so that a small lead does not count however alike the
-# seeds are.
+# Added to the standard error, so that a small lead does not count even if all seeds
+# have almost the same return.
 _MARGIN = 0.2
 
 

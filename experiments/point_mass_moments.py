@@ -1,10 +1,10 @@
 """The point mass' layout, and what agents learn there (paper, figures 2, 3 and 4).
 
-One seed of PPO and one of PPO+GASIL are trained and drawn at several moments of
-training: episodes of the policy, the trajectories in the buffer, and the
-discriminator's reward. An arrow is the action that the discriminator rewards most at a
-position, of 16 directions at full speed, with every object still there. The higher the
-reward, the stronger is the arrow's color.
+One seed of PPO and one of PPO+GASIL are trained. At several moments of training these
+are drawn: episodes of the policy, the trajectories in the buffer, and the
+discriminator's reward. An arrow shows, of 16 directions at full speed, the action with
+the highest reward at a position while no object is collected. The higher the reward,
+the more opaque is the arrow.
 """
 
 import dataclasses
@@ -29,7 +29,7 @@ from gasil_jax.imitation import adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
-#: Shares of training at the moments; most happens early.
+#: The moments, as shares of training; most of the learning is early.
 SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
 #: The columns of each agent; PPO has no discriminator.
 _COLUMNS = {

@@ -1,11 +1,11 @@
 """Time of each part of a training iteration: ``python -m experiments profile``.
 
-One iteration of the program that `gasil_jax.run` trains with is traced. XLA remembers
-the named scopes that each of its operations was written in, which say what part it
-belongs to. An operation's time is its median times its number, so that other processes
-hardly matter. Tracing makes tiny operations look longer, those of physics above all.
+One iteration of the program that `gasil_jax.run` trains with is traced. XLA records the
+named scopes of each operation, which say to which part it belongs. An operation's time
+is its median duration times its number of executions, so other processes have little
+effect. Tracing makes tiny operations look longer, above all those of physics.
 
-All seeds are on one device. For the time of one core start it on one, ``taskset -c 0``.
+All seeds are on one device. To measure one CPU core, start it with ``taskset -c 0``.
 """
 
 import collections
@@ -76,9 +76,10 @@ class Options:
 
 
 def operations(program: str) -> dict[str, str]:
-    """Return the part of each operation of a compiled program's text, by its name.
+    """Return the part of each operation in the text of a compiled program, by its name.
 
-    One that XLA added itself belongs to what most of its neighbours belong to.
+    An operation without scopes, which XLA added, belongs to the most frequent part of
+    its block.
     """
     blocks: list[dict[str, str | None]] = [{}]
     for line in program.splitlines():
@@ -104,13 +105,13 @@ def operations(program: str) -> dict[str, str]:
 def seconds_of_parts(planes: Sequence[Any], program: str) -> dict[str, float]:
     """Return the seconds that each part of a program takes in a trace of it.
 
-    On a GPU these are the times of its kernels, which run one after the other.
+    On a GPU they are the times of its kernels, which run one after the other.
 
     Args:
       planes: the planes of a `jax.profiler.ProfileData`.
       program: the text of the compiled program.
     """
-    # A GPU's kernel has its operation's name with _ for other characters.
+    # A GPU kernel has the name of its operation, with _ instead of punctuation.
     plain = lambda name: re.sub(r"\W", "_", name)
     on_gpu = [plane for plane in planes if plane.name.startswith("/device:GPU")]
     times = collections.defaultdict(list)
@@ -123,7 +124,7 @@ def seconds_of_parts(planes: Sequence[Any], program: str) -> dict[str, float]:
         if durations := times.pop(plain(name), None):
             totals[part] += float(np.median(durations)) * len(durations) * 1e-9
     if on_gpu:
-        # Copies, and products of matrices that a library computes.
+        # Copies, and matrix products computed by a library.
         totals[_REST] += sum(map(sum, times.values())) * 1e-9
     return totals
 
@@ -142,7 +143,7 @@ def run(options: Options) -> None:
     """Print the table."""
     command_line.check_least(options, seeds=1, iterations=1, repeats=1)
     devices.use_devices(options.settings, 1, options.seeds)
-    # A cached program may have the functions of an earlier version.
+    # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
     with command_line.input_checked():
         delay = options.settings.reward_delay
@@ -154,7 +155,7 @@ def run(options: Options) -> None:
             env, config, range(options.seeds), devices=jax.devices()[:1]
         )
     states, compiled = members.compile()
-    advance: Any = compiled  # It has a text too.
+    advance: Any = compiled  # Its declared type lacks `as_text`.
     newest, seconds = [states], []
 
     def iterate() -> Any:

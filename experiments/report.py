@@ -1,6 +1,6 @@
-"""The pages of figures and their tables, all made from the stored runs.
+"""The pages of figures with their tables and plots, made from the stored runs.
 
-A page is ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, filled in.
+A page is the text of ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, filled in.
 """
 
 import csv
@@ -48,7 +48,7 @@ from gasil_jax.figures.statistics import interquartile_mean
 from gasil_jax.host import output_file
 
 NOTES = pathlib.Path(__file__).parent / "notes"
-#: Others' mean returns after about 1M steps, each with the file that it stands in.
+#: Mean returns that others have published, after about 1M steps, with their sources.
 PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 
 _READING = """## How to read this
@@ -71,7 +71,7 @@ seed of the second, where equal ones count half, averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table in Markdown; without rows nothing."""
+    """Return a table in Markdown, or an empty text if there are no rows."""
     lines = [head, ["---"] * len(head), *rows]
     if len(lines) == 2:
         return ""
@@ -85,7 +85,7 @@ def point_in_words(point: Mapping[str, Any]) -> str:
 
 
 def changed(config: Config) -> dict[str, Any]:
-    """Return the settings of a config that are not the defaults."""
+    """Return the settings of a config that differ from the defaults."""
     default = Config(agent=config.agent)
     values = lambda config: {**vars(config), **vars(config.hyperparameters)}
     mine, defaults = values(config), values(default)
@@ -95,7 +95,7 @@ def changed(config: Config) -> dict[str, Any]:
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """The stored runs of a curve, of all or only a part of its seeds."""
+    """The stored runs of a curve, which may be only some of its seeds."""
 
     curve: Curve
     point: Mapping[str, Any]
@@ -108,7 +108,7 @@ class Results:
 
     @property
     def seeds_in_words(self) -> str:
-        """How many seeds there are, in words."""
+        """The number of stored seeds as text, such as "8 of 10"."""
         of = "" if self.complete else f" of {self.curve.seeds}"
         return f"{len(self.records)}{of}"
 
@@ -125,7 +125,10 @@ class Results:
 
     @property
     def evaluated_in_words(self) -> str:
-        """The interquartile mean of `evaluated`, and how many if not all seeds were."""
+        """The interquartile mean of `evaluated` as text.
+
+        If not all stored seeds were evaluated, the number of evaluated ones follows.
+        """
         if not len(self.evaluated):
             return ""
         count = len(self.evaluated)
@@ -133,7 +136,7 @@ class Results:
         return f"{number(float(interquartile_mean(self.evaluated)))}{of}"
 
     def provenance(self) -> str:
-        """Return physics, versions, devices and commits of the seeds, in words."""
+        """Return physics, versions, devices and commits of the seeds as text."""
         seeds_of: dict[str, list[int]] = {}
         for run, record in self.records.items():
             by = record.provenance
@@ -152,20 +155,20 @@ class Results:
 
 
 def _ranges(numbers: Sequence[int]) -> str:
-    """Return increasing numbers in words: 0 to 4, 7."""
+    """Return increasing numbers as text, such as "0 to 4, 7"."""
     steps = [i for i in range(1, len(numbers)) if numbers[i] > numbers[i - 1] + 1]
     runs = [numbers[i:j] for i, j in itertools.pairwise([0, *steps, len(numbers)])]
     return ", ".join(f"{x[0]} to {x[-1]}" if len(x) > 1 else f"{x[0]}" for x in runs)
 
 
 class Page:
-    """The page of a figure; `SLOTS` names the methods that slots of its note may name.
+    """The page of a figure; `SLOTS` are the methods that slots in its text may name.
 
     Args:
       name: name of the figure.
-      store: store of its runs.
-      searched: store of the searches' runs; default the same.
-      figure: a figure without a note to use instead of the one of that name.
+      store: store of the figure's runs.
+      searched: store of the searches' runs; default `store`.
+      figure: a figure to use instead of the one with that name; its page is one table.
     """
 
     SLOTS = (
@@ -217,7 +220,7 @@ class Page:
         return markdown_table(head, rows)
 
     def returns(self, *panels: str) -> str:
-        """Return final returns without intervals: a row a curve, a column a panel.
+        """Return final returns without intervals: a row per curve, a column per panel.
 
         Args:
           *panels: the panels.
@@ -235,7 +238,7 @@ class Page:
         return markdown_table(["agent", *panels], rows)
 
     def differences(self) -> str:
-        """Return every comparison of the page, each in a line."""
+        """Return all comparisons of the page, one per line."""
         lines = []
         for (panel, ours, other, *less), comparison in self.comparisons.items():
             more = f", less that of {less[0]}" if less else ""
@@ -254,9 +257,10 @@ class Page:
         return self._tally(self.scores, self.comparisons, panels)
 
     def evaluated(self) -> str:
-        """Return the tally of the last policies' mean actions, a family of its own.
+        """Return the tally of evaluated returns, which are a separate family of tests.
 
-        Their returns are over the seeds that were evaluated, if these are enough.
+        They are the returns of the last policies' mean actions, over the seeds that
+        were evaluated, if these are enough.
         """
         scores = {
             key: results.evaluated
@@ -290,13 +294,13 @@ class Page:
         return "\n".join(lines)
 
     def aggregate(self, unit: str = "ppo") -> str:
-        """Return each curve's return over all tasks, in units of one dense curve's.
+        """Return each curve's return over all tasks, relative to one dense curve's.
 
         A seed's return is divided by the interquartile mean of the curve `unit` in the
-        panel of the same task with dense rewards. Then every task counts alike in the
-        interquartile mean over all seeds of all tasks; its 95% interval is the
+        panel of the same task with dense rewards. All tasks have the same weight in the
+        interquartile mean over all seeds of all tasks. Its 95% interval is the
         percentile bootstrap's over seeds, drawn within each task; the unit is not
-        drawn anew. The curves must have scores on all of these tasks, dense or delayed.
+        resampled. A curve without scores on all of the tasks is left out.
         """
         panels_of: dict[str, list[str]] = {}
         for panel, curves in self.figure.panels.items():
@@ -323,7 +327,7 @@ class Page:
         return self.scores[panel, name] / float(interquartile_mean(dense))
 
     def grids(self) -> str:
-        """Return a table of what the searches draw from and the values beyond."""
+        """Return a table of the searches' grids and the values beyond them."""
         rows = []
         for name, beyond in BEYOND.items():
             agents = [agent for agent in AGENTS if name in SPACES[agent]]
@@ -334,11 +338,11 @@ class Page:
         return markdown_table(["hyperparameter", "grid", "beyond", "agents"], rows)
 
     def protocol(self) -> str:
-        """Return how a search chooses its point, in words."""
+        """Return the text that says how a search chooses its point."""
         return PROTOCOL
 
     def searches(self) -> str:
-        """Return the results of the figure's searches."""
+        """Return a table of the results of the figure's searches."""
         few, more = len(SEEDS), len(FINALIST_SEEDS)
         head = ["task", "points", "best point", f"its mean of {more} seeds"]
         head += [f"all points' median of {few} seeds", "worst"]
@@ -356,7 +360,7 @@ class Page:
         return markdown_table(head, rows)
 
     def importance(self) -> str:
-        """Return how much each hyperparameter matters to each agent."""
+        """Return a table of how much each hyperparameter matters to each agent."""
         shares = {x: importance(x, self.searched) for x in AGENTS}
         names = list(dict.fromkeys(name for x in shares.values() for name in x))
         rows = [
@@ -367,7 +371,7 @@ class Page:
         return markdown_table(["agent", *names], rows)
 
     def ranks(self, name: str) -> str:
-        """Return which values of a hyperparameter do well on each task.
+        """Return a table of the mean rank of a hyperparameter's values on each task.
 
         Args:
           name: the hyperparameter.
@@ -384,7 +388,7 @@ class Page:
         return markdown_table([f"{name}:", *(f"{value:g}" for value in values)], rows)
 
     def published(self, rewards: str, *names: str) -> str:
-        """Return others' published returns beside those of some of our curves.
+        """Return a table of returns that others have published, and of our curves'.
 
         Args:
           rewards: "dense" or "delayed".
@@ -406,7 +410,7 @@ class Page:
         return markdown_table(columns, rows)
 
     def settings(self) -> str:
-        """Return what each curve was trained with, beyond the default values."""
+        """Return a table of each curve's settings that are not the defaults."""
         rows = []
         for names, results in self.results.items():
             config = next(iter(results.records)).config
@@ -420,10 +424,10 @@ class Page:
         return markdown_table(head, rows)
 
     def value(self, slot: str, *arguments: str) -> str:
-        """Return what stands in a slot.
+        """Return the text of a slot.
 
         Raises:
-          InputError: if there is no such slot, or nothing to stand in it.
+          InputError: if there is no such slot, or it does not take these arguments.
         """
         if slot not in self.SLOTS:
             raise self._no_slot(slot, *arguments)
@@ -477,11 +481,11 @@ class Page:
 
 
 def fill(note: str, value: Callable[..., str]) -> str:
-    """Fill the slots of a note, {{NAME ARGUMENTS}}, with what `value` returns."""
+    """Fill the slots of a text, {{NAME ARGUMENTS}}, with the results of `value`."""
     return re.sub(r"{{(.+?)}}", lambda x: value(*shlex.split(x[1])), note)
 
 
 def fill_blocks(text: str, value: Callable[..., str]) -> str:
-    """Replace what is between ``<!-- begin SLOT -->`` and ``<!-- end -->``."""
+    """Replace the text between ``<!-- begin SLOT -->`` and ``<!-- end -->``."""
     block = re.compile(r"(<!-- begin (.+?) -->\n).*?(<!-- end -->)", re.DOTALL)
     return block.sub(lambda x: f"{x[1]}\n{value(*shlex.split(x[2]))}\n\n{x[3]}", text)

@@ -1,12 +1,12 @@
-"""The plan: what is searched, alike for every agent, and how much of it is stored.
+"""The searches of hyperparameters, and how many of all planned runs are stored.
 
 Episodes are staggered and rewards are normalized. Every agent is searched with the same
-number of points on every task, dense and delayed, with two seeds of the search's own.
-Where the best point has a value at an end of its grid, the next value beyond is tried
-too. The best points of all these are trained with more seeds before one is chosen,
-because two seeds decide little on tasks whose outcomes are bimodal. So the same runs
-give the best point of each task, which is the paper's protocol, and the best single
-point for all delayed tasks. Figures train the chosen points with seeds of their own.
+number of points on every task, dense and delayed, with two seeds. If the best point has
+a value at an end of its grid, the next value beyond is tried too. The best of all these
+points are trained with more seeds before one is chosen, because two seeds decide little
+on tasks with bimodal outcomes. So the same runs give the best point of each task, which
+is the paper's protocol, and the best single point for all delayed tasks. Figures train
+the chosen points with other seeds than the searches.
 """
 
 import dataclasses
@@ -28,15 +28,15 @@ Space = Mapping[str, tuple[Any, ...]]
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 #: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
-#: The agents of the figures that compare two, and the one beyond the paper.
+#: The two agents that most figures compare, and the adaptive one.
 PAIR, ADAPTIVE = ("ppo", "ppo+gasil"), "ppo+gasil-adaptive"
 #: Steps of a run in a search.
 STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
-#: Points of each agent's search; their seeds.
+#: Number of points of each agent's search, and their seeds.
 _POINTS, SEEDS = 12, range(1000, 1002)
-#: The number of best points that are trained with more seeds; all their seeds.
+#: Number of best points that are trained with more seeds, and all their seeds.
 _FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
-#: How a search chooses, in words.
+#: How a search chooses its point, for the pages.
 PROTOCOL = (
     f"For every agent {_POINTS} points are drawn, the same on all tasks, and each is "
     f"trained on each task with {len(SEEDS)} seeds. Where the best of them has a value "
@@ -45,7 +45,7 @@ PROTOCOL = (
     "best of these is chosen, each time by the mean return over the last fifth of "
     "training."
 )
-#: Every agent's hyperparameters, and those of one or two.
+#: The values for every agent, and those for some.
 _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
     "gae_lambda": (0.95, 0.98, 0.995),
@@ -58,7 +58,7 @@ _DISCRIMINATOR: Space = {
     "discriminator_learning_rate": (2e-5, 1e-4, 3e-4),
     "buffer_steps": (1000, 10_000),
 }
-#: What each agent's search draws from, in increasing order.
+#: The values that each agent's search draws from, in increasing order.
 SPACES: Mapping[str, Space] = {
     "ppo": _SHARED,
     "ppo+bc": {**_SHARED, "behavior_cloning_coefficient": (0.01, 0.1, 0.3, 1.0)},
@@ -74,7 +74,7 @@ SPACES: Mapping[str, Space] = {
 }
 AGENTS = tuple(SPACES)
 #: The next value below and above each grid, or None if none is tried. The buffer's size
-#: has a figure of its own.
+#: is studied in the figure "hyperparameters".
 BEYOND: Mapping[str, tuple[Any, Any]] = {
     "learning_rate": (3e-5, 1.2e-3),
     "gae_lambda": (0.9, None),
@@ -93,8 +93,8 @@ BEYOND: Mapping[str, tuple[Any, Any]] = {
 def draw(agent: str) -> tuple[Point, ...]:
     """Return the points of an agent's search, all different.
 
-    Each value of a hyperparameter is equally often among them, or once more than
-    another; which values meet is random.
+    Each value of a hyperparameter occurs equally often, or once more than another. The
+    combinations are random.
     """
     rng = np.random.default_rng(zlib.crc32(agent.encode()))
     rows: list[tuple[Any, ...]] = []
@@ -128,8 +128,8 @@ class Search:
       env: name of the environment.
       agent: name of the agent.
       reward_delay: the environment's reward delay.
-      decompose_rewards: decompose rewards where they are delayed, even if the agent
-        does not by itself, as adaptive imitation does.
+      decompose_rewards: whether to decompose delayed rewards; adaptive imitation does
+        so in any case.
     """
 
     env: str
@@ -187,7 +187,7 @@ class Search:
         return (*drawn, *beyond(self.agent, best))
 
     def finalists(self, store: Store) -> tuple[Point, ...]:
-        """Return the best points, best first, or none if runs of others are missing."""
+        """Return the best points, best first, or none if runs of any are missing."""
         points = self.points(store)
         scores = self.scores(points, store)
         # Until the drawn points are stored, those beyond are unknown.
@@ -237,8 +237,8 @@ CELLS = tuple((env, delay) for delay in (DELAY, 1) for env in TASKS)
 def searches(env: str, reward_delay: int) -> dict[str, Search]:
     """Return the searches on a task by the names of their curves.
 
-    Beside the agents there is PPO with decomposed rewards: what it shares with
-    `ppo+gasil-adaptive` is no merit of imitation.
+    They are those of all agents and, if rewards are delayed, of PPO on decomposed
+    rewards: the control that shows what `ppo+gasil-adaptive` gains without imitation.
     """
     by_name = {agent: Search(env, agent, reward_delay) for agent in AGENTS}
     if reward_delay > 1:
@@ -252,7 +252,7 @@ class SingleSetting(Search):
     """The search of one agent for one point for all tasks, at one reward delay."""
 
     def chosen(self, store: Store) -> Point | None:
-        """Return the drawn point of the best mean rank, or None if runs are missing.
+        """Return the drawn point with the best mean rank, or None if runs are missing.
 
         Points are ranked within each task, because returns of tasks have different
         units.
@@ -267,11 +267,11 @@ class SingleSetting(Search):
 
 
 def importance(agent: str, store: Store) -> dict[str, float]:
-    """Return how much of its points' variance each hyperparameter explains alone.
+    """Return the share of the scores' variance that each hyperparameter explains alone.
 
-    It is the mean of `statistics.importance` over the tasks, dense and delayed, whose
-    drawn points are all stored and all ended an episode, or 0 if that is negative;
-    empty if there is none.
+    It is the mean of `statistics.importance` over tasks, dense and delayed, or 0 if
+    that is negative. Only tasks count whose drawn points are all stored and all ended
+    an episode; without such a task the result is empty.
     """
     points, shares = draw(agent), []
     for env, delay in CELLS:
@@ -290,11 +290,11 @@ def importance(agent: str, store: Store) -> dict[str, float]:
 def mean_ranks(
     name: str, env: str, reward_delay: int, store: Store
 ) -> dict[Any, float]:
-    """Return how well points with each value of a hyperparameter do on a task.
+    """Return the mean rank, by value of a hyperparameter, of points on a task.
 
-    An agent's drawn points are ranked from 0, the worst, to 1. The result is the mean
-    rank of the points with a value, over the agents whose drawn points are all stored
-    and whose search has the hyperparameter; empty if there is none.
+    An agent's drawn points are ranked from 0, the worst, to 1. The mean is over the
+    points with the value, of all agents whose search has the hyperparameter and whose
+    drawn points are all stored. Without such an agent the result is empty.
     """
     ranks: dict[Any, list[float]] = {}
     for search in searches(env, reward_delay).values():
@@ -308,10 +308,10 @@ def mean_ranks(
 
 
 class Coverage(NamedTuple):
-    """How many runs of an agent on a task are stored and planned.
+    """The numbers of stored and planned runs of an agent on a task.
 
-    A search plans the points beyond and the best points' other seeds only when it knows
-    them, and a search that is incomplete has no final runs yet.
+    Points beyond the grid and the further seeds of the best points are only planned
+    once they are known. An incomplete search has no final runs yet.
     """
 
     name: str
@@ -328,7 +328,7 @@ class Coverage(NamedTuple):
 
 
 def coverage(store: Store, curves: Iterable[Any]) -> list[Coverage]:
-    """Return what is stored of the plan, for each task, delay and agent.
+    """Return the coverage of each task, delay and agent.
 
     Args:
       store: the store of all runs.

@@ -1,7 +1,8 @@
-"""The store of runs. It holds each run once, by the settings that decide its numbers.
+"""The store of runs: each run is stored once, by the settings that decide its numbers.
 
 Each task has one file, TASK.npz, with plain arrays and one JSON text. Figures, tables
-and searches query the store for runs. A run does not record what it was trained for.
+and searches ask the store for runs. A run does not record for which figure it was
+trained.
 """
 
 import dataclasses
@@ -32,7 +33,7 @@ RESULTS = pathlib.Path(__file__).parent / "results"
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The simulator (mjx or mujoco) and the device do not belong to them, because they
+    The physics engine (mjx or mujoco) and the device are not among them, because they
     compute the same thing in different ways. A record says which were used.
     """
 
@@ -76,7 +77,10 @@ def _tuples(value: Any) -> Any:
 
 
 def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `Run`'s fields without its seed; newer `Config` fields have defaults."""
+    """Return a `Run`'s fields without its seed.
+
+    Fields of `Config` that are newer than the stored run have their defaults.
+    """
     values = {name: _tuples(value) for name, value in fields["config"].items()}
     kind = hyperparameters_of(values["agent"])
     values["hyperparameters"] = kind(**values["hyperparameters"])
@@ -114,7 +118,8 @@ class Record:
         """Return the mean return between two fractions of training.
 
         The mean is over the rows whose middle lies between them, because a row may end
-        just beyond a round fraction. If there is none, it is the row in the middle.
+        just after a round fraction. If there is no such row, it is the row at the
+        middle of the two fractions.
         """
         ends = self.env_steps / self.env_steps[-1]
         middle = (np.concatenate([[0.0], ends[:-1]]) + ends) / 2
@@ -129,15 +134,15 @@ class Record:
     def final(self) -> float:
         """The mean return over the last tenth of training.
 
-        If no episode ended in it (many environments in step rarely end theirs), it is
-        the return of the last part in which one ended; NaN if none ever did.
+        If no episode ended in that time, which is possible without staggered episodes,
+        it is the return of the last part in which one ended; NaN if none ever did.
         """
         ended = self.episode_return[np.isfinite(self.episode_return)]
         last = self.part(0.9, 1.0)
         return float(ended[-1]) if np.isnan(last) and len(ended) else last
 
 
-#: Fields of a record, by the array of a file that holds their lengths.
+#: Fields of a record, by the name of the array that stores their lengths.
 _TABLES = {
     "rows": ("env_steps", "episode_return", "episode_length"),
     "evaluations": ("evaluation_steps", "evaluation_return"),
@@ -145,7 +150,10 @@ _TABLES = {
 
 
 def _rounded(name: str, values: np.ndarray) -> np.ndarray:
-    """Round to six significant digits, which float32 keeps; seeds differ far more."""
+    """Round to six significant digits, which float32 can hold.
+
+    The differences between seeds are far larger.
+    """
     if name.endswith("_steps"):
         return values.astype(np.uint32)
     return np.array([float(f"{value:.6g}") for value in values], np.float32)
@@ -210,7 +218,7 @@ class Store:
         self._records: dict[str, dict[Run, Record]] = {}
 
     def _path(self, env: str) -> pathlib.Path:
-        # One of brax.envs, "brax:ant", or a class of one's own, "my_tasks:Line".
+        # A name may have a colon: "brax:ant", or a user's "my_tasks:Line".
         return self.folder / f"{env.replace(':', '-')}.npz"
 
     def _of(self, env: str) -> dict[Run, Record]:
@@ -230,9 +238,10 @@ class Store:
         return [run for run in dict.fromkeys(runs) if run not in self]
 
     def add(self, records: Mapping[Run, Record]) -> int:
-        """Add the runs that are not stored yet, and return how many these are.
+        """Add the runs that are not stored yet, and return their number.
 
-        Several processes may add runs at once: a file is locked, read and written.
+        Several processes may add runs at once: the folder is locked while a file is
+        read and written.
         """
         added = 0
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -249,11 +258,11 @@ class Store:
 
 
 def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
-    """Add the runs of another store, and return how many are new and how many it has.
+    """Add the runs of another store; return how many are new, and how many it has.
 
     Args:
-      source: folder of the other store, or of the results that it is in.
-      target: the store that the runs are added to; what it has stays as it is.
+      source: folder of the other store, or the folder of results that contains it.
+      target: the store that the runs are added to; its own runs are not changed.
 
     Raises:
       InputError: if there are no runs in the folder.

@@ -1,6 +1,6 @@
-"""The page of all claims, and the blocks of the README that are generated.
+"""The page of all claims, and the generated blocks of the README.
 
-A claim's verdict follows from the comparisons of its figure's page.
+A claim's verdict is computed from the comparisons on its figure's page.
 """
 
 import json
@@ -19,21 +19,21 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
-#: A comparison of a page, and the verdict that the claim expects of it.
+#: The key of a comparison of a page, and the verdict that a claim expects.
 _Expected = tuple[tuple[str, ...], str]
 _OPPOSITE = {"better": "worse", "worse": "better"}
 
 
 class Claim(NamedTuple):
-    """A claim, and what must be seen for it to hold.
+    """A claim, and the verdicts with which it holds.
 
     Attributes:
-      words: what is claimed.
-      figure: the figure whose comparisons decide.
-      cases: what is expected in each case, such as a task, by its name. A case agrees
-        if all of its comparisons have the expected verdict.
-      needed: the number of cases that must agree for the claim to hold; fewer are a
-        part of it.
+      words: the claim as text.
+      figure: name of the figure whose comparisons decide.
+      cases: the expected verdicts by case, such as a task. A case agrees if all of its
+        comparisons have the expected verdict.
+      needed: the number of cases that must agree for the claim to hold. If fewer agree,
+        it holds in part.
     """
 
     words: str
@@ -116,14 +116,14 @@ CLAIMS = (
 class Summary:
     """The page of all claims and the README's blocks, from one store."""
 
-    #: The methods that slots may name; others name a figure and one of its slots.
+    #: The methods that slots may name. Other slots are a figure's name and its slot.
     SLOTS = ("claims", "figures")
 
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
 
     def verdict(self, claim: Claim) -> str:
-        """Return whether a claim holds, in words, as far as its curves are complete."""
+        """Return as text whether a claim holds, judged by the complete curves."""
         compared = self.pages[claim.figure].comparisons
         measured = {
             case: all(compared[key].verdict == verdict for key, verdict in expected)
@@ -163,7 +163,7 @@ class Summary:
         return "\n".join(f"- [{page.figure.title}]({name}.md)" for name, page in pages)
 
     def value(self, name: str, *arguments: str) -> str:
-        """Return what stands in a slot: one of these, or a figure's name and its slot.
+        """Return the text of a slot: a method in `SLOTS`, or a figure's name and slot.
 
         Raises:
           InputError: if there is no such slot.
@@ -182,10 +182,10 @@ class Summary:
         return report.fill((report.NOTES / "README.md").read_text(), self.value)
 
     def tuned(self) -> str:
-        """Return the presets' rows, with what complete searches chose, as JSON.
+        """Return the tuned presets as JSON, updated by what complete searches chose.
 
-        Rows of decomposed rewards have no earlier search to fall back on. There an
-        incomplete search gives its best point so far.
+        For decomposed rewards there are no rows of earlier searches, so an incomplete
+        search gives its best point so far.
         """
         rows = json.loads(presets.TUNED.read_text())
         for page in self.pages.values():

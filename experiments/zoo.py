@@ -1,8 +1,8 @@
 """The trained policies that the package comes with: ``python -m experiments zoo RUN``.
 
-Of each run the seed with the highest return in training is taken and scored in
-Gymnasium. It replaces the task's policy if its score is higher. The table in
-docs/zoo.md is written from the policies.
+From each run, the policy of the seed with the highest return in training is scored in
+Gymnasium. It replaces the package's policy for the task if its score is higher. The
+table in docs/zoo.md is written from the policies.
 """
 
 import dataclasses
@@ -37,7 +37,15 @@ class Options:
 
 
 def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
-    """Score the best policy of a run, keep it if it is its task's best, and say so.
+    """Score the best policy of a run, and keep it if it is the best on its task.
+
+    Args:
+      folder: folder of the run.
+      episodes: number of episodes of the score.
+      zoo: folder of the package's policies.
+
+    Returns:
+      A line of text with the score and what was done.
 
     Raises:
       InputError: if it is not the folder of a finished run on a locomotion task, or
@@ -98,8 +106,7 @@ def table() -> str:
         about = numpy_policy.about(f"{numpy_policy.ZOO_PREFIX}{name}")
         score = f"{about['mean']:,.0f} ± {about['deviation']:,.0f}"
         steps = f"{about['env_steps']:,}"
-        # Older policies of adaptive imitation do not say so.
-        agent = about["agent"] + " (decomposed)" * about.get("decompose_rewards", False)
+        agent = about["agent"] + " (decomposed)" * about["decompose_rewards"]
         rows.append([f"`zoo:{name}`", agent, steps, score])
     head = ["policy", "trained with", "steps", "return in Gymnasium"]
     return report.markdown_table(head, rows)
