@@ -20,7 +20,6 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, command_line, metrics_files, run_folder
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.interval import Interval
 from gasil_jax.host.members import Members
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
 from gasil_jax.host.progress import Progress
@@ -179,21 +178,22 @@ class _Checkpoints:
         self, root: pathlib.Path, schedule: CheckpointSchedule, members: Members
     ):
         self.root, self._keep, self._members = root, schedule.keep, members
-        # Without an interval the clock decides.
         self._interval = None
         if schedule.every is not None:
-            self._interval = Interval.of_steps(schedule.every, members.config)
+            self._interval = math.ceil(schedule.every / members.config.batch_steps)
         self._saved_at = time.monotonic()
 
     def iterations_left(self, done: int) -> float:
-        """Return the iterations to the next checkpoint; infinity if by the clock."""
-        return self._interval.iterations_left(done) if self._interval else math.inf
+        """Return the iterations to the next checkpoint; infinity if time decides."""
+        if self._interval is None:
+            return math.inf
+        return self._interval - done % self._interval
 
     def is_due(self, done: int) -> bool:
-        """Return whether a checkpoint is due after `done` iterations."""
+        """Return whether to write a checkpoint after `done` iterations."""
         if self._interval is None:
             return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        return self._interval.is_due(done)
+        return done % self._interval == 0
 
     def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
         """Write a checkpoint, and delete those that are not to be kept."""

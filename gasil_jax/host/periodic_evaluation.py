@@ -5,6 +5,7 @@ evaluation, with the mean, lowest and highest return of its episodes and their m
 length. Evaluations do not change training, not by a single bit.
 """
 
+import math
 import pathlib
 import time
 from collections.abc import Mapping, Sequence
@@ -15,7 +16,6 @@ import numpy as np
 
 from gasil_jax.evaluation import evaluate
 from gasil_jax.host import metrics_files
-from gasil_jax.host.interval import Interval
 from gasil_jax.host.members import Members
 from gasil_jax.host.trackers import Tracker, log_evaluation
 from gasil_jax.train import TrainState
@@ -90,7 +90,7 @@ class PeriodicEvaluation:
             )
 
         self.seconds = 0.0
-        self._interval = Interval.of_steps(schedule.every, members.config)
+        self._interval = math.ceil(schedule.every / members.config.batch_steps)
         self._members, self._labels, self._trackers = members, labels, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
@@ -98,12 +98,12 @@ class PeriodicEvaluation:
 
     def iterations_left(self, done: int) -> int:
         """Return the iterations from `done` to the next evaluation, at least one."""
-        return self._interval.iterations_left(done)
+        return self._interval - done % self._interval
 
     def is_due(self, done: int) -> bool:
-        """Return whether an evaluation is due after `done` iterations."""
+        """Return whether to evaluate after `done` iterations."""
         last = self._members.config.num_iterations
-        return self._interval.is_due(done) or done == last
+        return done % self._interval == 0 or done == last
 
     def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
         """Evaluate the policies, write the scores and log them to the trackers.
