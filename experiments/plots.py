@@ -158,5 +158,5 @@ def save_png(picture: Picture, path: pathlib.Path, dpi: int = 80) -> None:
         picture.savefig(buffer, format="png", dpi=dpi)
         image = Image.open(buffer).convert("RGB").quantize(256)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with output_file.whole(path) as partial:
+    with output_file.atomic(path) as partial:
         image.save(partial, optimize=True)

@@ -476,7 +476,7 @@ class Page:
         results.mkdir(parents=True, exist_ok=True)
         if self.results:
             plots.save_png(self.picture(), results / f"{self.name}.png")
-        with output_file.whole(results / f"{self.name}.md") as partial:
+        with output_file.atomic(results / f"{self.name}.md") as partial:
             partial.write_text(self.text())
 
 

@@ -180,7 +180,7 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
             columns = [getattr(records[run], name) for run in runs]
             arrays[lengths] = np.array(list(map(len, columns)))
             arrays[name] = _rounded(name, np.concatenate(columns))
-    with output_file.whole(path) as partial:
+    with output_file.atomic(path) as partial:
         np.savez_compressed(partial, allow_pickle=False, **arrays)
 
 

@@ -210,5 +210,5 @@ class Summary:
             (README, text),
             (presets.TUNED, self.tuned()),
         ):
-            with output_file.whole(path) as partial:
+            with output_file.atomic(path) as partial:
                 partial.write_text(content)

@@ -94,7 +94,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         **{x: v if x in ("low", "high") else v[None] for x, v in weights.items()},
     }
     zoo.mkdir(exist_ok=True)
-    with output_file.whole(path) as partial, partial.open("wb") as file:
+    with output_file.atomic(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, **arrays)
     return words
 
@@ -115,7 +115,7 @@ def table() -> str:
 def write_table() -> None:
     """Write the table into docs/zoo.md."""
     text = report.fill_blocks(TABLE.read_text(), lambda name: {"zoo": table}[name]())
-    with output_file.whole(TABLE) as partial:
+    with output_file.atomic(TABLE) as partial:
         partial.write_text(text)
 
 

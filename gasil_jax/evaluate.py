@@ -170,7 +170,7 @@ def _write(
     path: pathlib.Path, seeds: Sequence[int], scores: Mapping[str, np.ndarray]
 ) -> None:
     """Write a row for each episode."""
-    with output_file.whole(path) as partial, partial.open("w", newline="") as file:
+    with output_file.atomic(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["seed", "episode", *scores])
         for index, seed in enumerate(seeds):

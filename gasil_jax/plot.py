@@ -171,7 +171,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     output_file.check(options.out, (".png", ".pdf", ".svg"))
     runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
     output_file.make_parent(options.out)
-    with output_file.whole(options.out) as partial:
+    with output_file.atomic(options.out) as partial:
         draw(runs, partial)
     print("run                             seeds  interquartile mean  95% interval")
     for run in runs:

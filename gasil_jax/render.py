@@ -287,7 +287,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     try:
         with (
             announced("render", f"drawing {options.out}"),
-            output_file.whole(options.out) as partial,
+            output_file.atomic(options.out) as partial,
         ):
             num_frames = save(env, states, size, partial)
     except pictures.NoOpenGL as error:

@@ -83,7 +83,7 @@ def _write_results(
     if options.evaluate_every is not None:
         evaluations = read("evaluations.csv", ("mean",))
     title = f"{options.env}, {config.agent}"
-    with output_file.whole(folder / "learning_curve.png") as partial:
+    with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(partial, steps, returns, title, evaluations=evaluations)
     final = metrics_files.final_returns(returns)
     policy_file.save(folder / "policy.npz", outcome.states, env, seeds, final)

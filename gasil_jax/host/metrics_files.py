@@ -65,7 +65,7 @@ def _version(package: str) -> str | None:
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file; if that fails, none is left."""
     text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
-    with output_file.whole(path) as partial:
+    with output_file.atomic(path) as partial:
         partial.write_text(text + "\n")
 
 

@@ -1,4 +1,4 @@
-"""Check output files beforehand, and write each of them completely or not at all."""
+"""Check the paths of output files, and write files atomically."""
 
 import contextlib
 import pathlib
@@ -14,7 +14,7 @@ def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
 
 
 def _reason(error: OSError) -> str:
-    # Errors that libraries raise may have no `strerror`, and several lines.
+    # A library's error may have no `strerror`, and a message of several lines.
     return error.strerror or str(error).partition("\n")[0]
 
 
@@ -27,7 +27,7 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 
 def make_parent(path: pathlib.Path) -> None:
-    """Create the folder of a file.
+    """Create the folder of a file, and check that a file can be written in it.
 
     Raises:
       InputError: if it can't be created or written to.
@@ -42,16 +42,16 @@ def make_parent(path: pathlib.Path) -> None:
 
 
 def _partial(path: pathlib.Path) -> pathlib.Path:
-    # Not the process number, because processes on several hosts may have the same.
+    # A process number is not unique: processes on several hosts may share the folder.
     return path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
 
 
 @contextlib.contextmanager
-def whole(path: pathlib.Path) -> Iterator[pathlib.Path]:
+def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary path beside the file, which is renamed to it at the end.
 
-    No reader therefore sees half a file, and several processes may write the same one.
-    If the block raises an error, nothing is left.
+    A reader never sees a half written file, and several processes may write the same
+    file. If the block raises an error, the temporary file is deleted.
 
     Raises:
       OSError: if it can't be written; the message is one line with the path.

@@ -31,5 +31,5 @@ def save(
         "final_return": np.asarray(final_return, np.float64),
         **policy.weights(states, env),
     }
-    with output_file.whole(path) as partial, partial.open("wb") as file:
+    with output_file.atomic(path) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)

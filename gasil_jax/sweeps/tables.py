@@ -206,7 +206,7 @@ def write(
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     names = sorted({name for point in points for name in point})
     with (
-        output_file.whole(folder / "results.csv") as partial,
+        output_file.atomic(folder / "results.csv") as partial,
         partial.open("w", newline="") as file,
     ):
         writer = csv.writer(file)
@@ -218,7 +218,7 @@ def write(
                 cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
                 bad = int(diverged[index, position])
                 writer.writerow([index, seed, *own, *cells, bad])
-    with output_file.whole(folder / "curves.npz") as partial:
+    with output_file.atomic(folder / "curves.npz") as partial:
         np.savez_compressed(partial, **curves)
     trainings = [training for part in parts for training in part.trainings()]
     sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
@@ -252,10 +252,10 @@ def write(
     }
     metrics_files.write_json(folder / "summary.json", summary)
     chosen = summary["best_by_mean"]
-    with output_file.whole(folder / "sweep.png") as partial:
+    with output_file.atomic(folder / "sweep.png") as partial:
         plotting.final_returns(partial, _labels(points), final, chosen)
     if varied:
-        with output_file.whole(folder / "hyperparameters.png") as partial:
+        with output_file.atomic(folder / "hyperparameters.png") as partial:
             plotting.marginals(
                 partial,
                 varied,
