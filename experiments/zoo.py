@@ -51,10 +51,10 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
       InputError: if it is not the folder of a finished run on a locomotion task, or
         none of its seeds has a return.
     """
-    described = run_folder.read(folder)
-    delay = described["settings"].reward_delay
+    description = run_folder.read(folder)
+    delay = description["settings"].reward_delay
     with command_line.input_checked():
-        env = environments.make_env(described["env"])
+        env = environments.make_env(description["env"])
         saved = npz.read(folder / "policy.npz")
     if not environments.is_locomotion(env):
         raise InputError(f"run is {folder}: it must be of a locomotion task")
@@ -70,17 +70,17 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         num_episodes=episodes,
     )["episode_return"]
     about = {
-        "env": described["env"],
+        "env": description["env"],
         "reward_delay": delay,
-        "agent": described["config"].agent,
-        "decompose_rewards": described["config"].decompose_rewards,
+        "agent": description["config"].agent,
+        "decompose_rewards": description["config"].decompose_rewards,
         "seed": seed,
-        "env_steps": described["config"].total_steps,
+        "env_steps": description["config"].total_steps,
         "mean": round(float(returns.mean()), 1),
         "deviation": round(float(returns.std()), 1),
         "episodes": episodes,
     }
-    path = zoo / f"{name_of(described['env'], delay)}.npz"
+    path = zoo / f"{name_of(description['env'], delay)}.npz"
     words = f"{path.stem}: {about['mean']} in Gymnasium"
     if path.exists():
         before = json.loads(str(npz.read(path)["about"]))["mean"]

@@ -60,14 +60,14 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     Raises:
       InputError: if it is not the folder of a run, or if no episode has ended in it.
     """
-    described = run_folder.read(folder)
-    if "points" in described:
+    description = run_folder.read(folder)
+    if "points" in description:
         raise InputError(
             f"run is {folder}, a sweep: its plots are sweep.png and "
             "hyperparameters.png, and its curves are in curves.npz"
         )
     read_table = lambda name, column: metrics_files.read_metrics(
-        folder / name, ("seed",), described["seeds"], (column,), unfinished=True
+        folder / name, ("seed",), description["seeds"], (column,), unfinished=True
     )
     evaluations = None
     if (folder / "evaluations.csv").is_file():
@@ -80,9 +80,9 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
-    default = f"{described['env']}, {described['config'].agent}"
+    default = f"{description['env']}, {description['config'].agent}"
     return Curves(
-        env=described["env"],
+        env=description["env"],
         label=label or default,
         env_steps=env_steps,
         returns=means,

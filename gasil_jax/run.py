@@ -44,8 +44,8 @@ def train(
       ValueError: if the run to continue does not fit the options.
     """
     write = lambda: write_config(options, folder)
-    # What describes a run that has begun is replaced only when it continues.
-    if not run_folder.is_described(folder):
+    # A run that is continued keeps its config.json until its checkpoint is restored.
+    if not run_folder.has_run(folder):
         write()
     title = f"{options.env} {options.config.agent}"
     labels = {"seed": seeds_of(options)}

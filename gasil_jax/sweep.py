@@ -29,7 +29,7 @@ from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
-from gasil_jax.host.run_folder import Begun
+from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables
 from gasil_jax.sweeps.points import Point, check_saved, kinds, make_points
 from gasil_jax.sweeps.shards import Program
@@ -84,8 +84,8 @@ def train(
       ValueError: if the sweep to continue does not fit the options.
     """
     write = lambda: run_options.write_config(options, folder, points=points)
-    # What describes a sweep that has begun is replaced only when it continues.
-    if not run_folder.is_described(folder):
+    # A sweep that is continued keeps its config.json until its checkpoint is restored.
+    if not run_folder.has_run(folder):
         write()
 
     def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
@@ -133,12 +133,12 @@ def _main(arguments: Sequence[str] | None) -> None:
         shard = shards.parse(given.shard)
         folder = _shard_folder(shard, given.out)
         resumed = None
-        if given.resume and run_folder.is_described(folder):
-            resumed = Begun(folder, run_folder.read(folder))
+        if given.resume and run_folder.has_run(folder):
+            resumed = StoredRun(folder, run_folder.read(folder))
         _train_shard(arguments, shard, folder, resumed)
         return
     resumed = run_options.resumed_run(arguments)
-    if resumed is not None and (text := resumed.described.get("shard")):
+    if resumed is not None and (text := resumed.description.get("shard")):
         _train_shard(arguments, shards.parse(text), resumed.folder, resumed)
     else:
         options = run_options.parse(Options, arguments, _PROGRAM, resumed)
@@ -158,17 +158,21 @@ def _placement(
     return parser.parse_known_args(arguments)
 
 
-def _points(options: Options, begun: Sequence[Begun]) -> list[dict[str, Any]]:
-    """Return the points, which what has begun of the sweep has in its config.json too.
+def _points(options: Options, stored: Sequence[StoredRun]) -> list[dict[str, Any]]:
+    """Return the points of a sweep.
 
-    Those of config.json are taken if the file that listed the points is gone.
+    If the file that listed them is gone, they are read from a config.json.
+
+    Args:
+      options: the options.
+      stored: the sweep, or those of its shards that exist.
     """
     file = options.points_file
     if file is not None and not pathlib.Path(file).exists():
-        for folder, described in begun:
-            if described.get("points_file") == file:
-                points = list(described["points"])
-                check_saved(points, described["config"], folder / "config.json")
+        for folder, description in stored:
+            if description.get("points_file") == file:
+                points = list(description["points"])
+                check_saved(points, description["config"], folder / "config.json")
                 return points
     return make_points(
         options.grid, options.random, file, options.first_seed, options.config.agent
@@ -176,19 +180,19 @@ def _points(options: Options, begun: Sequence[Begun]) -> list[dict[str, Any]]:
 
 
 def plan(
-    options: Options, begun: Sequence[Begun] = ()
+    options: Options, stored: Sequence[StoredRun] = ()
 ) -> tuple[list[dict[str, Any]], list[Program]]:
     """Return all points and programs of a sweep, checked.
 
     Args:
       options: the options.
-      begun: the sweep, or those of its shards, that have begun.
+      stored: the sweep, or those of its shards that exist.
 
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
     """
     run_options.check(options)
-    points = _points(options, begun)
+    points = _points(options, stored)
     unused = run_options.unused_fields(options.config)
     for point in points:
         if name := next((name for name in point if name in unused), None):
@@ -212,9 +216,9 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     return [program for program in programs if program.number in left]
 
 
-def _refuse_other_points(points: Sequence[Point], resumed: Begun) -> None:
-    """Raise `InputError` if the sweep that is continued has other points."""
-    if list(resumed.described["points"]) != list(points):
+def _refuse_other_points(points: Sequence[Point], resumed: StoredRun) -> None:
+    """Raise `InputError` if a sweep is continued with other points."""
+    if list(resumed.description["points"]) != list(points):
         raise InputError(
             f"out is {resumed.folder}, where a sweep of other points has begun: name "
             "the same points or another folder"
@@ -222,14 +226,14 @@ def _refuse_other_points(points: Sequence[Point], resumed: Begun) -> None:
 
 
 def _plan_without_launcher(
-    options: Options, resumed: Begun | None, others: Sequence[Begun] = ()
+    options: Options, resumed: StoredRun | None, others: Sequence[StoredRun] = ()
 ) -> tuple[list[dict[str, Any]], list[Program]]:
-    """Return what `plan` does; refuse other points than before, and --shards.
+    """Return what `plan` returns, for a sweep or a shard in this process.
 
     Args:
-      options: the options, of a sweep or a shard.
-      resumed: the sweep or the shard that is continued, if any.
-      others: the sweep's other shards that have begun.
+      options: the options of the sweep or shard.
+      resumed: the sweep or shard to continue, if any.
+      others: the other shards of the sweep that exist.
     """
     points, programs = plan(options, [resumed, *others] if resumed else others)
     if resumed is not None:
@@ -241,7 +245,7 @@ def _plan_without_launcher(
     return points, programs
 
 
-def _train_whole(options: Options, resumed: Begun | None) -> None:
+def _train_whole(options: Options, resumed: StoredRun | None) -> None:
     points, programs = _plan_without_launcher(options, resumed)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
@@ -268,7 +272,7 @@ def _refuse_other_sweep(
     shard_folder: pathlib.Path,
     *,
     points: Sequence[Point],
-    others: Sequence[Begun],
+    others: Sequence[StoredRun],
 ) -> None:
     """Raise `InputError` if other shards are of another sweep.
 
@@ -276,18 +280,19 @@ def _refuse_other_sweep(
       options: options of this shard.
       shard_folder: folder of this shard.
       points: points of the sweep.
-      others: the other shards that have begun.
+      others: the other shards of the sweep that exist.
     """
     if not others:
         return
     now = {**vars(options), "points": tuple(points)}
     with command_line.input_checked():
         now |= run_folder.expert_hash(options.config)
-    for folder, described in others:
+    for folder, description in others:
         # A shard may have been continued to more total_steps than this one yet.
-        config = described["config"].replace(total_steps=options.config.total_steps)
+        config = description["config"].replace(total_steps=options.config.total_steps)
         merging.refuse_different(
-            Begun(folder, {**described, "config": config}), Begun(shard_folder, now)
+            StoredRun(folder, {**description, "config": config}),
+            StoredRun(shard_folder, now),
         )
 
 
@@ -295,13 +300,13 @@ def _train_shard(
     arguments: Sequence[str] | None,
     shard: shards.Shard,
     shard_folder: pathlib.Path,
-    resumed: Begun | None,
+    resumed: StoredRun | None,
 ) -> None:
-    """Train a shard in its own folder or, if it has begun, continue it."""
+    """Train a shard in its own folder, or continue it if it is stored there."""
     options = run_options.parse(Options, arguments, _PROGRAM, resumed)
     options = dataclasses.replace(options, out=shard_folder)
-    begun = merging.begun_shards(shard_folder.parent)
-    others = [other for other in begun if other.folder != shard_folder]
+    every = merging.stored_shards(shard_folder.parent)
+    others = [other for other in every if other.folder != shard_folder]
     points, programs = _plan_without_launcher(options, resumed, others)
     _refuse_other_sweep(options, shard_folder, points=points, others=others)
     programs = shards.cut_evenly(programs, shard)
@@ -330,8 +335,7 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
         raise InputError(f"{given}--launcher needs --shards, 1 or more")
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
-    begun = merging.begun_shards(shards.root(options.out))
-    points, programs = plan(options, begun)
+    points, programs = plan(options, merging.stored_shards(shards.root(options.out)))
     last = shards.Shard(options.shards, options.shards)
     shards.cut_evenly(programs, last)  # Refuses more shards than members.
     shards.refuse_whole(options.out)

@@ -106,42 +106,43 @@ def fit(
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
     interruption = Interruption()
-    describe: Callable[[], None] = lambda: None
+    write_description: Callable[[], None] = lambda: None
     with contextlib.ExitStack() as stack:
         if folder is None:
             # Ctrl-C ends training at once, because there is nothing to save.
-            where = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
+            path = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         else:
-            described = {
+            description = {
                 "seeds": tuple(members.seeds),
                 "evaluate_every": evaluate_every,
                 "evaluate_episodes": evaluate_episodes if evaluate_every else None,
                 **run_folder.flat(vars(config)),
                 **run_folder.expert_hash(config),
             }
-            where = pathlib.Path(folder)
-            describe = stack.enter_context(_opened(where, described, resume))
+            path = pathlib.Path(folder)
+            write_description = stack.enter_context(_opened(path, description, resume))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
-            where,
+            path,
             {"seed": members.seeds},
             schedule=schedule,
             progress=Progress("fit", config.total_steps, shown=False),
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,
-            on_restored=describe,
+            on_restored=write_description,
         )
-        metrics = _table(where / "metrics.csv", members.num_members)
+        metrics = _table(path / "metrics.csv", members.num_members)
         if folder is not None:
             final = metrics_files.final_returns(metrics["episode_return"])
-            path = where / "policy.npz"
-            policy_file.save(path, outcome.states, env, members.seeds, final)
+            policy_file.save(
+                path / "policy.npz", outcome.states, env, members.seeds, final
+            )
         return FitResult(
             outcome.states,
             metrics,
-            _table(where / "evaluations.csv", members.num_members),
+            _table(path / "evaluations.csv", members.num_members),
         )
 
 
@@ -168,40 +169,38 @@ def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
 
 @contextlib.contextmanager
 def _opened(
-    folder: pathlib.Path, described: Mapping[str, Any], resume: bool
+    folder: pathlib.Path, description: Mapping[str, Any], resume: bool
 ) -> Iterator[Callable[[], None]]:
-    """Create and lock a folder of `fit`, and write down what is trained in it.
+    """Create and lock a folder of `fit`, and write fit.json if training begins.
 
-    It yields a function that writes it down anew, when training continues.
+    Yields a function that writes fit.json, to call when training continues.
 
     Raises:
-      ValueError: if it can't be written, is in use, or holds something else.
+      ValueError: if the folder can't be written, is in use, or holds something else.
     """
     path = folder / _DESCRIPTION
     with contextlib.ExitStack() as stack:
         run_folder.create(folder, option="folder")
         stack.enter_context(run_folder.lock(folder, option="folder"))
-        begun = path.is_file()
-        if begun and not resume:
+        # JSON has no functions.
+        now = {x: "a function" if callable(y) else y for x, y in description.items()}
+        write = lambda: metrics_files.write_json(path, now)
+        if not path.is_file():
+            run_folder.refuse_used(folder, option="folder")
+            write()
+        elif not resume:
             raise ValueError(
                 f"folder is {folder}, where training has begun: give resume=True or "
                 "another folder"
             )
-        if not begun:
-            run_folder.refuse_used(folder, option="folder")
-        # A function has no other form in JSON.
-        now = {x: "a function" if callable(y) else y for x, y in described.items()}
-        if begun:
-            before = _described(path)
+        else:
+            before = _read_description(path)
             if changes := run_folder.differences(before, now):
                 raise ValueError(
                     f"resume continues with {folder}, where {'; '.join(changes)}: "
                     "only total_steps may differ, and grow"
                 )
             run_folder.refuse_other_expert(before, now, folder)
-        write = lambda: metrics_files.write_json(path, now)
-        if not begun:
-            write()
         try:
             yield write
         except Interrupted as interrupted:
@@ -209,22 +208,22 @@ def _opened(
             raise
 
 
-def _described(path: pathlib.Path) -> dict[str, Any]:
-    """Return what fit.json says of the training that has begun in its folder.
+def _read_description(path: pathlib.Path) -> dict[str, Any]:
+    """Return the content of fit.json.
 
     Raises:
       ValueError: if it is damaged, or does not say how the policies were evaluated.
     """
-    described = json_reader.read(path, dict[str, Any])
-    # Older versions wrote nothing of evaluations. Their table tells if there were any.
+    description = json_reader.read(path, dict[str, Any])
+    # Older versions did not write these two, even if they evaluated policies.
     names = ("evaluate_every", "evaluate_episodes")
-    missing = [name for name in names if name not in described]
+    missing = [name for name in names if name not in description]
     if missing and path.with_name("evaluations.csv").exists():
         raise ValueError(
             f"{path} is of an older version: add {' and '.join(missing)}, the numbers "
             "that its policies were evaluated with"
         )
-    return dict.fromkeys(missing) | described
+    return dict.fromkeys(missing) | description
 
 
 def _table(path: pathlib.Path, num_members: int) -> dict[str, np.ndarray]:

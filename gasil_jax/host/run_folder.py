@@ -1,4 +1,4 @@
-"""Create, lock, describe and read the folder of a run."""
+"""Create, lock, write and read the folder of a run, and its config.json."""
 
 import contextlib
 import dataclasses
@@ -37,7 +37,7 @@ def check(out: pathlib.Path, resume: bool) -> None:
     """
     if out.is_dir():
         with lock(create(out)):
-            if resume and is_described(out):
+            if resume and has_run(out):
                 _refuse_without_checkpoints(out)
             else:
                 refuse_used(out)
@@ -177,22 +177,22 @@ def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
         message = (
             f"{option} is {folder}, which is not empty: name a new or an empty folder"
         )
-        if is_described(folder) and option == "out":
+        if has_run(folder) and option == "out":
             message += ", or continue the run in it with --resume"
         raise InputError(message)
 
 
-def is_described(folder: pathlib.Path) -> bool:
-    """Return whether a run has begun in the folder."""
+def has_run(folder: pathlib.Path) -> bool:
+    """Return whether the folder holds a run, sweep or shard, finished or not."""
     return (folder / _CONFIG).is_file()
 
 
-def describe(folder: pathlib.Path, content: Mapping[str, Any]) -> None:
-    """Write config.json."""
-    metrics_files.write_json(folder / _CONFIG, content)
+def write_description(folder: pathlib.Path, description: Mapping[str, Any]) -> None:
+    """Write config.json, the description of a run, sweep or shard."""
+    metrics_files.write_json(folder / _CONFIG, description)
 
 
-class _Described(TypedDict, total=False):
+class _Description(TypedDict, total=False):
     """The content of config.json, of a run or a sweep."""
 
     env: Required[str]
@@ -239,31 +239,31 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     """
     path = folder / _CONFIG
     try:
-        described = json_reader.read(path, _Described)
+        description = json_reader.read(path, _Description)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}{_what_else(folder)}") from None
     try:
-        if "points" in described:
+        if "points" in description:
             for name in ("share_counts", "shard"):
-                if name not in described:
+                if name not in description:
                     raise ValueError(f"{name} is missing")
-        validate(described["config"])
-        check_seeds(described["seeds"], described["first_seed"])
+        validate(description["config"])
+        check_seeds(description["seeds"], description["first_seed"])
     except ValueError as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None
-    return described
+    return description
 
 
-class Begun(NamedTuple):
-    """A run, a sweep or a shard that has begun.
+class StoredRun(NamedTuple):
+    """A run, sweep or shard that is stored in a folder and may be unfinished.
 
     Attributes:
-      folder: its folder.
-      described: the content of its config.json, from `read`.
+      folder: the folder.
+      description: the content of its config.json, from `read`.
     """
 
     folder: pathlib.Path
-    described: Mapping[str, Any]
+    description: Mapping[str, Any]
 
 
 #: The largest number of seeds; their keys are numbered up to 2**32.
@@ -279,9 +279,11 @@ def check_seeds(seeds: int, first_seed: int) -> None:
         raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
 
 
-def seeds_of(described: Mapping[str, Any]) -> range:
+def seeds_of(description: Mapping[str, Any]) -> range:
     """Return the absolute numbers of a run's or sweep's seeds, from its config.json."""
-    return range(described["first_seed"], described["first_seed"] + described["seeds"])
+    return range(
+        description["first_seed"], description["first_seed"] + description["seeds"]
+    )
 
 
 #: The field of config.json and fit.json that holds what `expert_hash` returns.
@@ -352,10 +354,10 @@ def refuse_other_expert(
         )
 
 
-def flat(described: Mapping[str, Any]) -> dict[str, Any]:
+def flat(description: Mapping[str, Any]) -> dict[str, Any]:
     """Return every field by its own name, including those of nested dataclasses."""
     fields: dict[str, Any] = {}
-    for name, value in described.items():
+    for name, value in description.items():
         if dataclasses.is_dataclass(value):
             own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             fields |= flat(own)

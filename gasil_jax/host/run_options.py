@@ -22,7 +22,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.host.run_folder import Begun
+from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.imitation import find_agent, unused
 
 
@@ -88,7 +88,7 @@ def parse(
     kind: type[T],
     arguments: Sequence[str] | None,
     program: str,
-    resumed: Begun | None = None,
+    resumed: StoredRun | None = None,
 ) -> T:
     """Return the command line's options, on top of the preset that they name.
 
@@ -103,7 +103,7 @@ def parse(
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if resumed is not None:
-        stored = _stored(kind, resumed)
+        stored = _stored_options(kind, resumed)
         options = command_line.parse(kind, arguments, program, stored)
         _refuse_changes(options, stored, resumed)
         return options
@@ -119,52 +119,52 @@ def parse(
     return command_line.parse(kind, arguments, program, default)
 
 
-def _stored(kind: type[T], begun: Begun) -> T:
-    """Return the options of a run that has begun.
+def _stored_options(kind: type[T], run: StoredRun) -> T:
+    """Return the options that a stored run was started with.
 
     Raises:
-      InputError: if another program has written them.
+      InputError: if its config.json was written by another program.
     """
-    folder, described = begun
+    folder, description = run
     fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
-    # An option with the default None or False may be newer than the run.
+    # An older version may have written the run, without options that exist now.
     newer = {
         f.name: f.default for f in fields if f.default is None or f.default is False
     }
     names = {f.name for f in fields}
-    missing = names - set(newer) - set(described)
+    missing = names - set(newer) - set(description)
     others = {"out", "points", run_folder.EXPERT_HASH}
-    if ("points" in described) != ("grid" in names):
-        command = "sweep" if "points" in described else "run"
+    if ("points" in description) != ("grid" in names):
+        command = "sweep" if "points" in description else "run"
         raise InputError(
             f"out is {folder}, a {command}: continue it with python -m "
             f"gasil_jax.{command}"
         )
-    if missing or set(described) - names - others:
+    if missing or set(description) - names - others:
         raise InputError(f"out is {folder}, which another program has written")
-    stored = {**newer, **described}
+    stored = {**newer, **description}
     values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
     return kind(**values)
 
 
-def _refuse_changes(options: Options, stored: Options, begun: Begun) -> None:
-    """Raise `InputError` if a run was begun with other settings than these.
+def _refuse_changes(options: Options, stored: Options, run: StoredRun) -> None:
+    """Raise `InputError` if the options to continue a run with differ from its own.
 
     Args:
       options: the options to continue with.
-      stored: the options of the run.
-      begun: the run.
+      stored: the options that the run was started with.
+      run: the run.
     """
     if changed := run_folder.differences(vars(stored), vars(options)):
         raise InputError(
-            f"resume continues the run in {begun.folder}, where {'; '.join(changed)}: "
+            f"resume continues the run in {run.folder}, where {'; '.join(changed)}: "
             "only total_steps may change, and grow, and checkpoint_every, "
             "keep_checkpoints, devices and log"
         )
     with command_line.input_checked():
         expert = run_folder.expert_hash(options.config)
     now = {"expert": options.config.expert, **expert}
-    run_folder.refuse_other_expert(begun.described, now, begun.folder)
+    run_folder.refuse_other_expert(run.description, now, run.folder)
 
 
 def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
@@ -190,7 +190,7 @@ def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
     return kind(env=tyro.MISSING, config=Config(agent=agent))
 
 
-def resumed_run(arguments: Sequence[str] | None) -> Begun | None:
+def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
     """Return the run that --resume continues, or None if there is none.
 
     Raises:
@@ -202,8 +202,8 @@ def resumed_run(arguments: Sequence[str] | None) -> Begun | None:
         return None
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
-    if run_folder.is_described(given.out):
-        return Begun(given.out, run_folder.read(given.out))
+    if run_folder.has_run(given.out):
+        return StoredRun(given.out, run_folder.read(given.out))
     if given.env is None:
         raise InputError(
             f"out is {given.out}, which holds no run to continue: to begin one there, "
@@ -348,10 +348,10 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     out = options.out
     folder = run_folder.create_new(name) if out is None else run_folder.create(out)
     with run_folder.lock(folder):
-        if options.resume and run_folder.is_described(folder):
+        if options.resume and run_folder.has_run(folder):
             # Another process may have written to it since the options were parsed.
-            begun = Begun(folder, run_folder.read(folder))
-            _refuse_changes(options, _stored(type(options), begun), begun)
+            run = StoredRun(folder, run_folder.read(folder))
+            _refuse_changes(options, _stored_options(type(options), run), run)
         else:
             run_folder.refuse_used(folder)
         try:
@@ -366,9 +366,11 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     """Write every option to config.json, the config's fields under "config"."""
-    described = {f.name: getattr(options, f.name) for f in dataclasses.fields(options)}
-    described |= run_folder.expert_hash(options.config)
-    run_folder.describe(folder, described | {"out": str(folder)} | more)
+    description = {
+        f.name: getattr(options, f.name) for f in dataclasses.fields(options)
+    }
+    description |= run_folder.expert_hash(options.config)
+    run_folder.write_description(folder, description | {"out": str(folder)} | more)
 
 
 def make_env(options: Options) -> Any:

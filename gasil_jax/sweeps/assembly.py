@@ -162,9 +162,9 @@ def train(
                 with progress.aside("starting the trackers"):
                     # A program of a sweep may have other values than the base.
                     own = dataclasses.replace(options, config=job.program.config)
-                    described = run_folder.flat(vars(own))
+                    description = run_folder.flat(vars(own))
                     following = trackers.make(
-                        options.log, job.folder, run_name=job.name, config=described
+                        options.log, job.folder, run_name=job.name, config=description
                     )
                 members = make_members(
                     env,

@@ -6,7 +6,7 @@ from typing import Any
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
-from gasil_jax.host.run_folder import Begun
+from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.sweeps import shards, tables
 
 
@@ -14,19 +14,19 @@ def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
     """Return the folders of the shards in a folder, or the folder if it is a shard."""
     inside = shards.root(folder)
     paths = sorted(inside.iterdir()) if inside.is_dir() else [folder]
-    described = [path for path in paths if run_folder.is_described(path)]
-    if not described:
+    shard_folders = [path for path in paths if run_folder.has_run(path)]
+    if not shard_folders:
         raise InputError(f"folder is {folder}: it must hold shards or be one")
-    return described
+    return shard_folders
 
 
-def _comparable(described: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: x for name, x in described.items() if name != "shard"}
+def _comparable(description: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: x for name, x in description.items() if name != "shard"}
 
 
-def refuse_different(first: Begun, other: Begun) -> None:
+def refuse_different(first: StoredRun, other: StoredRun) -> None:
     """Raise `InputError` if two shards are not of one sweep with one expert."""
-    before, now = _comparable(first.described), _comparable(other.described)
+    before, now = _comparable(first.description), _comparable(other.description)
     # total_steps may not grow here.
     changed = run_folder.differences(before, now)
     changed = changed or run_folder.differences(now, before)
@@ -35,19 +35,19 @@ def refuse_different(first: Begun, other: Begun) -> None:
             f"{other.folder} is of another sweep than {first.folder}: "
             f"{'; '.join(changed)}"
         )
-    own = run_folder.flat(other.described)
-    run_folder.refuse_other_expert(first.described, own, first.folder)
+    own = run_folder.flat(other.description)
+    run_folder.refuse_other_expert(first.description, own, first.folder)
 
 
-def _read(folder: pathlib.Path) -> Begun:
-    described = run_folder.read(folder)
-    if not isinstance(described.get("shard"), str) or "points" not in described:
+def _read(folder: pathlib.Path) -> StoredRun:
+    description = run_folder.read(folder)
+    if not isinstance(description.get("shard"), str) or "points" not in description:
         raise InputError(f"folder is {folder}: it must be of a sweep's shard")
-    return Begun(folder, described)
+    return StoredRun(folder, description)
 
 
-def begun_shards(inside: pathlib.Path) -> list[Begun]:
-    """Return the shards of a sweep that have begun.
+def stored_shards(inside: pathlib.Path) -> list[StoredRun]:
+    """Return the shards of a sweep that exist, which may be unfinished.
 
     Args:
       inside: the folder that holds the shards, which may be missing.
@@ -56,24 +56,24 @@ def begun_shards(inside: pathlib.Path) -> list[Begun]:
       InputError: if one of them is damaged.
     """
     paths = sorted(inside.glob("*-of-*"))
-    return [_read(path) for path in paths if run_folder.is_described(path)]
+    return [_read(path) for path in paths if run_folder.has_run(path)]
 
 
-def _read_all(folders: Sequence[pathlib.Path]) -> list[Begun]:
+def _read_all(folders: Sequence[pathlib.Path]) -> list[StoredRun]:
     """Return the shards in order, after checking that they make one sweep."""
     paths = [path for folder in folders for path in _shard_folders(folder)]
     first, *others = every = [_read(path) for path in dict.fromkeys(paths)]
     for other in others:
         refuse_different(first, other)
-    begun: dict[shards.Shard, Begun] = {}
+    stored: dict[shards.Shard, StoredRun] = {}
     for each in every:
-        shard = shards.parse(each.described["shard"])
-        if shard in begun:
+        shard = shards.parse(each.description["shard"])
+        if shard in stored:
             raise InputError(
-                f"shard {shard} is there twice: {begun[shard].folder}, {each.folder}"
+                f"shard {shard} is there twice: {stored[shard].folder}, {each.folder}"
             )
-        begun[shard] = each
-    counts = {shard.count for shard in begun}
+        stored[shard] = each
+    counts = {shard.count for shard in stored}
     if len(counts) > 1:
         raise InputError(
             f"there are shards of {' and of '.join(map(str, sorted(counts)))}: name "
@@ -81,19 +81,19 @@ def _read_all(folders: Sequence[pathlib.Path]) -> list[Begun]:
         )
     count = counts.pop()
     expected = [shards.Shard(number, count) for number in range(1, count + 1)]
-    missing = [str(shard) for shard in expected if shard not in begun]
+    missing = [str(shard) for shard in expected if shard not in stored]
     if missing:
         raise InputError(f"missing: shards {', '.join(missing)}, which have not begun")
-    return [begun[shard] for shard in expected]
+    return [stored[shard] for shard in expected]
 
 
-def _refuse_used(out: pathlib.Path, shard: Begun) -> None:
+def _refuse_used(out: pathlib.Path, shard: StoredRun) -> None:
     """Refuse a folder that holds anything but earlier tables of the same shards."""
-    if run_folder.is_described(out):
-        earlier, now = run_folder.read(out), shard.described
+    if run_folder.has_run(out):
+        earlier, now = run_folder.read(out), shard.description
         # The shards may have been continued to more total_steps since.
         if run_folder.differences(_comparable(earlier), _comparable(now)):
-            refuse_different(Begun(out, earlier), shard)
+            refuse_different(StoredRun(out, earlier), shard)
         # A single run has no points, and a sweep that was not merged has programs.
         used = "points" not in earlier or (out / "programs").is_dir()
     else:
@@ -114,12 +114,12 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
         holds something else.
     """
     every = _read_all(folders)
-    described = every[0].described
-    points = described["points"]
-    seeds = run_folder.seeds_of(described)
-    parts = [tables.Trained.described(*shard) for shard in every]
+    description = every[0].description
+    points = description["points"]
+    seeds = run_folder.seeds_of(description)
+    parts = [tables.Trained.from_description(*shard) for shard in every]
     unfinished = [
-        shard.described["shard"]
+        shard.description["shard"]
         for part, shard in zip(parts, every, strict=True)
         if part.unfinished()
     ]
@@ -131,5 +131,5 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
     with run_folder.lock(out):
         _refuse_used(out, every[0])
         own = {"shard": None, "resume": False, "out": str(out)}
-        run_folder.describe(out, {**described, **own})
+        run_folder.write_description(out, {**description, **own})
         return tables.write(out, points, seeds, parts)

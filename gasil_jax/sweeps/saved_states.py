@@ -54,33 +54,33 @@ class Saved(NamedTuple):
 
 
 def find(
-    folder: pathlib.Path, described: Mapping[str, Any], point: int | None
+    folder: pathlib.Path, description: Mapping[str, Any], point: int | None
 ) -> Saved:
     """Return where the states of a run, or of a sweep's point, are saved.
 
     Args:
       folder: folder of the run, sweep or shard.
-      described: its config.json, from `run_folder.read`.
+      description: its config.json, from `run_folder.read`.
       point: number of a sweep's point; default the best by mean.
 
     Raises:
       InputError: if the folder has no such point.
     """
-    if "points" in described:
-        return _of_sweep(folder, described, _checked(folder, described, point))
+    if "points" in description:
+        return _of_sweep(folder, description, _checked(folder, description, point))
     if point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    config, seeds = described["config"], run_folder.seeds_of(described)
+    config, seeds = description["config"], run_folder.seeds_of(description)
     # A run is a sweep of one point, in one program.
     (program,) = shards.programs(config, [{}], seeds)
     return Saved(folder / "checkpoints", program, range(len(seeds)))
 
 
 def _checked(
-    folder: pathlib.Path, described: Mapping[str, Any], point: int | None
+    folder: pathlib.Path, description: Mapping[str, Any], point: int | None
 ) -> int:
     """Return the requested point, or the best by mean for None."""
-    points: Sequence[Point] = described["points"]
+    points: Sequence[Point] = description["points"]
     if point is None:
         with contextlib.suppress(FileNotFoundError):
             point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
@@ -96,22 +96,24 @@ def _checked(
     return point
 
 
-def _of_sweep(folder: pathlib.Path, described: Mapping[str, Any], point: int) -> Saved:
+def _of_sweep(
+    folder: pathlib.Path, description: Mapping[str, Any], point: int
+) -> Saved:
     """Return where the states of a sweep's point are saved."""
     if shards.root(folder).is_dir():
         raise InputError(
             f"run is {folder}, whose members are in its shards: name one of "
             f"{shards.root(folder)}"
         )
-    program, indices = _with_point(folder, described, point)
+    program, indices = _with_point(folder, description, point)
     return Saved(program.folder(folder) / "checkpoints", program, indices)
 
 
 def _with_point(
-    folder: pathlib.Path, described: Mapping[str, Any], point: int
+    folder: pathlib.Path, description: Mapping[str, Any], point: int
 ) -> tuple[Program, list[int]]:
     """Return the program that trains a point, and the indices of its members."""
-    for program in Trained.described(folder, described).programs:
+    for program in Trained.from_description(folder, description).programs:
         indices = [i for i, (index, _) in enumerate(program.members) if index == point]
         if indices:
             return program, indices
@@ -138,8 +140,8 @@ def load(
         seed, or if "best" is requested of a point that shares its checkpoints with
         other points.
     """
-    described = run_folder.read(folder)
-    saved = find(folder, described, point)
+    description = run_folder.read(folder)
+    saved = find(folder, description, point)
     chosen, damages = checkpoint.latest(saved.root)
     for damage in damages:
         print(f"warning: {damage}", file=sys.stderr)
@@ -154,9 +156,9 @@ def load(
     if chosen is None:
         scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    settings = dataclasses.asdict(described["settings"])
+    settings = dataclasses.asdict(description["settings"])
     with command_line.input_checked():
-        env = environments.make_env(described["env"], **settings)
+        env = environments.make_env(description["env"], **settings)
         # The leaves of all members have the same shapes.
         init = lambda seed: train.init(
             env, config, jax.random.key(seed), saved.program.hyperparameters[0]

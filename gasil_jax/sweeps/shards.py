@@ -127,7 +127,7 @@ def name(folder: pathlib.Path, shard: Shard | None) -> str:
 
 def refuse_whole(out: pathlib.Path) -> None:
     """Raise `InputError` if the folder holds a run or sweep without shards."""
-    if run_folder.is_described(out) and not root(out).is_dir():
+    if run_folder.has_run(out) and not root(out).is_dir():
         raise InputError(
             f"out is {out}, which holds a run that is not in shards: name another "
             "folder"

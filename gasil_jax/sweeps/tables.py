@@ -88,19 +88,26 @@ class Trained:
     programs: Sequence[Program]
 
     @classmethod
-    def described(cls, folder: pathlib.Path, content: Mapping[str, Any]) -> "Trained":
+    def from_description(
+        cls, folder: pathlib.Path, description: Mapping[str, Any]
+    ) -> "Trained":
         """Return the programs of a folder, from its config.json (`run_folder.read`).
 
         Raises:
           InputError: if its points can't be trained.
         """
-        check_saved(content["points"], content["config"], folder / "config.json")
-        seeds = run_folder.seeds_of(content)
-        programs = shards.programs(
-            content["config"], content["points"], seeds, content["share_counts"]
+        check_saved(
+            description["points"], description["config"], folder / "config.json"
         )
-        if content["shard"] is not None:
-            programs = shards.cut_evenly(programs, shards.parse(content["shard"]))
+        seeds = run_folder.seeds_of(description)
+        programs = shards.programs(
+            description["config"],
+            description["points"],
+            seeds,
+            description["share_counts"],
+        )
+        if description["shard"] is not None:
+            programs = shards.cut_evenly(programs, shards.parse(description["shard"]))
         return cls(folder, programs)
 
     def unfinished(self) -> list[int]:

@@ -198,7 +198,7 @@ def test_a_run_without_its_module_says_so(tmp_path, capsys, monkeypatch):
     assert evaluate.main([str(tmp_path)]) == 2
     message = "error: agent 'gone:OWN' can't be imported: No module named 'gone'\n"
     assert capsys.readouterr().err == message
-    run_folder.describe(tmp_path, described | {"config": config})
+    run_folder.write_description(tmp_path, described | {"config": config})
     assert run_folder.read(tmp_path)["config"] == config
 
 
