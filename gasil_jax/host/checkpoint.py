@@ -6,10 +6,10 @@ a folder of checkpoints. Each checkpoint is a folder named by its iteration:
     00000490/state/          the state, written by Orbax
     00000490/manifest.json   SHA-256 of each of its files, and a record
 
-A checkpoint is written under another name, and renamed once it is complete and on the
-disk. A process may therefore be killed at any moment without harm to older checkpoints.
-The hashes reveal later damage. A damaged checkpoint is renamed to 00000490.damaged when
-training continues from an older one.
+A checkpoint is written to 00000490.partial, which is renamed once it is complete and
+flushed to the disk, so that killing the process never damages a checkpoint. The hashes
+reveal later damage. A damaged checkpoint is renamed to 00000490.damaged when training
+continues from an older one.
 """
 
 import contextlib
@@ -31,9 +31,9 @@ from gasil_jax.host import json_reader
 
 _STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
 _DAMAGED = ".damaged"
-#: The errors of reading what is not whole. Others, such as those of a network's file
-#: system, say nothing about the checkpoint.
-_NOT_WHOLE = (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError)
+#: Errors of reading a damaged checkpoint. Other errors, such as those of a network file
+#: system, do not mean that it is damaged.
+_DAMAGE_ERRORS = (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError)
 
 
 def _is_key(leaf: Any) -> bool:
@@ -59,7 +59,7 @@ def save(folder: pathlib.Path, state: Any) -> None:
 def restore(folder: pathlib.Path, like: Any) -> Any:
     """Read a state that `save` wrote, as NumPy arrays and random keys.
 
-    All members together may be too large for one device.
+    They are not put on a device, which may be too small for all members together.
 
     Args:
       folder: the folder that `save` wrote to.
@@ -125,25 +125,25 @@ def write(
     Raises:
       WriteError: if the disk is full or the folder can't be written.
     """
-    whole = root / f"{iteration:08d}"
+    folder = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
     try:
         with contextlib.suppress(ValueError):
-            read(whole)
+            read(folder)
             return
         root.mkdir(parents=True, exist_ok=True)
-        # Remove what a killed process has left.
+        # A killed process may have left it.
         shutil.rmtree(partial, ignore_errors=True)
         partial.mkdir()
         save(partial / _STATE, state)
         manifest = {"files": _hashes(partial), "record": record}
         (partial / _MANIFEST).write_text(json.dumps(manifest, allow_nan=False))
         for path in [*partial.rglob("*"), partial]:
-            _to_disk(path)
-        shutil.rmtree(whole, ignore_errors=True)  # damaged
-        partial.rename(whole)
-        _to_disk(root)
-    # Orbax reports a full disk as an error of several types.
+            _flush(path)
+        shutil.rmtree(folder, ignore_errors=True)  # A damaged checkpoint.
+        partial.rename(folder)
+        _flush(root)
+    # Orbax raises errors of several types if the disk is full.
     except Exception as error:
         shutil.rmtree(partial, ignore_errors=True)
         reason = str(error).splitlines()[0][:300] if str(error) else repr(error)
@@ -151,6 +151,7 @@ def write(
 
 
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
+    """Return the SHA-256 of each file in a folder, by its relative path."""
     hashes = {}
     for path in sorted(folder.rglob("*")):
         if path.is_file() and path.name != _MANIFEST:
@@ -160,7 +161,8 @@ def _hashes(folder: pathlib.Path) -> dict[str, str]:
     return hashes
 
 
-def _to_disk(path: pathlib.Path) -> None:
+def _flush(path: pathlib.Path) -> None:
+    """Make the operating system write a file or a folder's entries to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -169,7 +171,7 @@ def _to_disk(path: pathlib.Path) -> None:
 
 
 def _folders(root: pathlib.Path) -> list[pathlib.Path]:
-    """Return the folders of all finished checkpoints, oldest first, even if damaged."""
+    """Return the folders of all checkpoints, oldest first, including damaged ones."""
     if not root.is_dir():
         return []
     return sorted(
@@ -178,7 +180,7 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
 
 
 class _Record(TypedDict, total=False):
-    """What training records in a checkpoint."""
+    """The record in manifest.json, as `driver` writes it."""
 
     metrics_size: int
     evaluations_size: int
@@ -202,7 +204,7 @@ def read(folder: pathlib.Path) -> Checkpoint:
     try:
         manifest = json_reader.read(folder / _MANIFEST, _Manifest)
         hashes = _hashes(folder)
-    except _NOT_WHOLE as error:
+    except _DAMAGE_ERRORS as error:
         raise ValueError(f"{folder} is damaged: {error}") from None
     files, record = manifest["files"], manifest["record"]
     if hashes != files:
@@ -215,13 +217,13 @@ def read(folder: pathlib.Path) -> Checkpoint:
 
 def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
     """Return the newest undamaged checkpoint, and the errors of damaged newer ones."""
-    damages: list[str] = []
+    errors: list[str] = []
     for folder in reversed(_folders(root)):
         try:
-            return read(folder), damages
+            return read(folder), errors
         except ValueError as error:
-            damages.append(str(error))
-    return None, damages
+            errors.append(str(error))
+    return None, errors
 
 
 def best(root: pathlib.Path) -> Checkpoint | None:
@@ -234,7 +236,7 @@ def best(root: pathlib.Path) -> Checkpoint | None:
 
 
 def best_score(root: pathlib.Path) -> float:
-    """Return the highest "score" of all records, or minus infinity without scores."""
+    """Return the highest recorded "score", or minus infinity if there is none."""
     return max(_scores(_folders(root)).values(), default=-math.inf)
 
 
@@ -242,7 +244,7 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
     """Return the scores of the checkpoints that have one."""
     scores = {}
     for folder in folders:
-        with contextlib.suppress(*_NOT_WHOLE):
+        with contextlib.suppress(*_DAMAGE_ERRORS):
             record = json_reader.read(folder / _MANIFEST, _Manifest)["record"]
             if record.get("score") is not None:
                 scores[folder] = record["score"]
@@ -250,30 +252,31 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:
-    """Rename the checkpoints after an iteration, so that they no longer count.
+    """Rename the checkpoints after an iteration to NAME.damaged.
 
-    Checkpoints newer than the newest undamaged one are damaged. Training that continues
-    from it writes them again; until then `prune` would keep them as the newest.
+    They are newer than the newest undamaged checkpoint. If they kept their names,
+    `prune` would keep them instead of undamaged ones.
     """
     for folder in _folders(root):
         if int(folder.name) > newer_than:
-            other, number = folder.with_name(f"{folder.name}{_DAMAGED}"), 1
-            while other.exists():
+            renamed, number = folder.with_name(f"{folder.name}{_DAMAGED}"), 1
+            while renamed.exists():
                 number += 1
-                other = folder.with_name(f"{folder.name}{_DAMAGED}.{number}")
-            folder.rename(other)
+                renamed = folder.with_name(f"{folder.name}{_DAMAGED}.{number}")
+            folder.rename(renamed)
 
 
 def delete_partial(root: pathlib.Path) -> None:
-    """Delete what killed processes have half written; no other process may write."""
+    """Delete the partial checkpoints of killed processes; none may be writing now."""
     for folder in root.glob(f"*{_PARTIAL}"):
         shutil.rmtree(folder, ignore_errors=True)
 
 
 def prune(root: pathlib.Path, keep: int) -> None:
-    """Delete all but the newest `keep` and the best one, as far as that is possible.
+    """Delete all checkpoints but the newest `keep` and the best one.
 
-    What can't be deleted is left; `delete_partial` deletes it when training continues.
+    A checkpoint that can't be deleted is left. `delete_partial` deletes it when
+    training continues.
     """
     try:
         folders = _folders(root)
@@ -284,7 +287,7 @@ def prune(root: pathlib.Path, keep: int) -> None:
     if scores:
         kept.add(max(scores, key=scores.__getitem__))
     for folder in set(folders) - kept:
-        # A checkpoint that is half deleted must not look like a damaged one.
+        # Renamed first, so that a half deleted checkpoint does not count as damaged.
         partial = folder.with_name(f"{folder.name}{_PARTIAL}")
         shutil.rmtree(partial, ignore_errors=True)
         with contextlib.suppress(OSError):

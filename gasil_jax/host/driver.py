@@ -1,8 +1,8 @@
-"""Train members in chunks: logged, saved, evaluated, interruptible.
+"""Train members in chunks; log, save and evaluate them between chunks.
 
-The folder gets metrics.csv, checkpoints/ and, if policies are evaluated during
-training, evaluations.csv. A checkpoint records the sizes of the two tables. Training
-that continues from it cuts the tables to these sizes and writes the same rows again.
+`drive` writes metrics.csv, checkpoints/ and, if policies are evaluated during training,
+evaluations.csv. A checkpoint records the sizes of the two tables. Training that
+continues from it cuts the tables to these sizes and writes the same rows again.
 """
 
 import dataclasses
@@ -26,9 +26,9 @@ from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker, log
 from gasil_jax.train import TrainState
 
-# The time between two calls of the compiled program. The display is updated and Ctrl-C
-# takes effect at this rate.
-_SECONDS_OF_A_CHUNK = 5.0
+# Largest duration of a chunk. The progress display is updated, and Ctrl-C takes effect,
+# after each chunk.
+_SECONDS_PER_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 
@@ -50,7 +50,7 @@ class CheckpointSchedule:
 
 @dataclasses.dataclass(frozen=True)
 class FitProgress:
-    """What training has come to after a chunk of iterations.
+    """The progress of training after a chunk of iterations.
 
     Attributes:
       iteration: number of iterations so far.
@@ -104,14 +104,14 @@ class Outcome:
 
 
 class _Tables:
-    """The files metrics.csv and evaluations.csv, and the trackers that get the same.
+    """Writes metrics to metrics.csv, scores to evaluations.csv, and both to trackers.
 
     Args:
       members: the members that are trained.
       folder: the folder of the files.
       labels: columns that identify the members, (members,) each.
       evaluation_schedule: the times of evaluations; None for none.
-      trackers: trackers that get the same numbers.
+      trackers: trackers that also get the metrics and scores.
       record: record of the checkpoint that training continues from; None without one.
 
     Attributes:
@@ -150,7 +150,7 @@ class _Tables:
         log(self._trackers, self._labels, metrics)
 
     def sizes(self) -> dict[str, int]:
-        """Write everything to the disk; return each file's size for a record."""
+        """Write everything to the disk; return each file's size in bytes, by name."""
         sizes = {"metrics_size": self._metrics.size()}
         if self.evaluation is not None:
             sizes["evaluations_size"] = self.evaluation.size()
@@ -166,7 +166,7 @@ class _Tables:
 
 
 class _Checkpoints:
-    """Writes the checkpoints of a run when they are due.
+    """Writes the checkpoints of members, and decides when.
 
     Args:
       root: the folder of the checkpoints.
@@ -196,7 +196,7 @@ class _Checkpoints:
         return done % self._interval == 0
 
     def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
-        """Write a checkpoint, and delete those that are not to be kept."""
+        """Write a checkpoint, and delete older ones that need not be kept."""
         if not self._keep:
             return
         checkpoint.write(self.root, done, self._members.trim(states), record)
@@ -209,16 +209,22 @@ def _restored(
 ) -> tuple[Any, int, Mapping[str, Any] | None]:
     """Return states, iteration and record of the newest undamaged checkpoint.
 
-    Without one they are None, 0 and None. Newer, damaged checkpoints are set aside with
-    a warning, and those that are half written are deleted.
+    Without one they are None, 0 and None. Newer, damaged checkpoints are renamed with a
+    warning, and partial ones are deleted.
+
+    Args:
+      members: the members to train.
+      root: the folder of the checkpoints.
+      progress: the progress display.
+      tables: names of the tables whose sizes the checkpoint must have recorded.
 
     Raises:
-      InputError: if the checkpoint is of another state or has not seen a table, or if
-        there is none although the folder holds the results of training that has ended.
+      InputError: if the checkpoint has another state or no size of a table, or if there
+        is none although the folder holds the results of training that has ended.
     """
     folder = root.parent
     with progress.aside("reading the checkpoints"):
-        newest, damages = checkpoint.latest(root)
+        newest, errors = checkpoint.latest(root)
     for name in [f"{table}_size" for table in tables]:
         if newest is not None and name not in newest.record:
             raise InputError(
@@ -226,21 +232,21 @@ def _restored(
                 "for example without evaluate_every"
             )
     if newest is None and run_folder.has_results(folder):
-        why = f" ({damages[0]})" if damages else ""
+        why = f" ({errors[0]})" if errors else ""
         raise InputError(
             f"{folder} holds the results of training that has ended, and no undamaged "
             f"checkpoint to continue from{why}: name another folder"
         )
-    for damage in damages:
-        instead = "starting anew" if newest is None else f"using {newest.folder.name}"
-        print(f"warning: {damage}; {instead}", file=sys.stderr)
+    for error in errors:
+        start = "the beginning" if newest is None else newest.folder.name
+        print(f"warning: {error}; training starts from {start}", file=sys.stderr)
     checkpoint.delete_partial(root)
     checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
     if newest is None:
-        if not damages and (folder / "metrics.csv").exists():
+        if not errors and (folder / "metrics.csv").exists():
             print(
-                f"warning: {folder} has no checkpoint: starting anew, the old "
-                "tables are kept under other names",
+                f"warning: {folder} has no checkpoint: training starts from the "
+                "beginning, and the old tables are kept under other names",
                 file=sys.stderr,
             )
         return None, 0, None
@@ -251,7 +257,7 @@ def _restored(
 
 
 def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Return the size to cut a table to; None if there is no table yet.
+    """Return the size in bytes to cut a table to; None if there is no table yet.
 
     Args:
       path: the table, such as metrics.csv.
@@ -290,12 +296,12 @@ def drive(
       steps_before: environment steps that `progress` has already counted.
       trackers: trackers that also get the metrics; they are closed at the end.
       callback: called after each chunk; if it returns true, training ends there.
-      on_restored: called when it is certain that training can begin or continue.
+      on_restored: called once training can begin or continue without an error.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint is of another state or has not seen a table, if a
-        table is damaged, or if the folder holds results but no undamaged checkpoint.
+      InputError: if the checkpoint has another state or no size of a table, if a table
+        is damaged, or if the folder holds results but no undamaged checkpoint.
       OSError: if the folder can't be written, or if the disk is full.
     """
     config, last = members.config, members.config.num_iterations
@@ -325,13 +331,12 @@ def drive(
     progress.phase("training", steps_before + steps_of(first))
     started = time.monotonic()
     done, seconds_per_iteration = first, math.inf
-    # The returns since the last checkpoint, and the score of the current policies.
+    # The returns since the last checkpoint, and the evaluation of the current policies.
     returns: list[np.ndarray] = []
-    evaluated: float | None = None
+    evaluation_score: float | None = None
 
     def save() -> None:
-        # With evaluations, a checkpoint whose policies were not evaluated has no score.
-        score = _mean(returns) if evaluation is None else evaluated
+        score = _mean(returns) if evaluation is None else evaluation_score
         with progress.aside("saving a checkpoint"):
             checkpoints.save(done, states, tables.sizes() | {"score": score})
 
@@ -348,7 +353,7 @@ def drive(
         count = min(
             members.chunk,
             last - done,
-            max(1, int(_SECONDS_OF_A_CHUNK / seconds_per_iteration)),
+            max(1, int(_SECONDS_PER_CHUNK / seconds_per_iteration)),
             checkpoints.iterations_left(done),
             math.inf if evaluation is None else evaluation.iterations_left(done),
         )
@@ -365,14 +370,14 @@ def drive(
                 "an update was undone because a number in it was not finite: see "
                 "skipped_updates in metrics.csv"
             )
-        due, evaluated, scores = checkpoints.is_due(done), None, None
+        save_now, evaluation_score, scores = checkpoints.is_due(done), None, None
         if evaluation is not None and evaluation.is_due(done):
             with progress.aside("evaluating the policies"):
                 scores = evaluation.score(states, done)
-            evaluated = float(scores["mean"].mean(dtype=np.float64))
-            due |= evaluated > best_score
-            best_score = max(best_score, evaluated)
-        if due:
+            evaluation_score = float(scores["mean"].mean(dtype=np.float64))
+            save_now |= evaluation_score > best_score
+            best_score = max(best_score, evaluation_score)
+        if save_now:
             save()
             returns = []
         if callback is not None:

@@ -327,7 +327,10 @@ def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
     (out / "summary.json").unlink()
     (out / "policy.npz").unlink()
     assert run.main(["--resume", "--out", str(out)]) == 0
-    assert "has no checkpoint: starting anew" in capsys.readouterr().err
+    assert (
+        "has no checkpoint: training starts from the beginning"
+        in capsys.readouterr().err
+    )
     assert (out / "metrics.csv").read_bytes() == before[out / "metrics.csv"]
     assert (out / "metrics-cut-1.csv").exists()
 
@@ -399,9 +402,9 @@ def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_used(damage, tmp
         checkpoint.write(root, i, state, {"score": float(i), "metrics_size": 5})
     damage(root / "00000002")
     assert checkpoint.best(root).iteration == 1
-    newest, damages = checkpoint.latest(root)
+    newest, errors = checkpoint.latest(root)
     assert newest.iteration == 1
-    assert len(damages) == 1 and "00000002 is damaged" in damages[0]
+    assert len(errors) == 1 and "00000002 is damaged" in errors[0]
     np.testing.assert_array_equal(newest.restore(states[1])["x"], states[1]["x"])
     # Written again, it is whole.
     checkpoint.write(root, 2, states[2], {"score": None})
@@ -419,7 +422,7 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     flip_a_bit(out / "checkpoints" / last)
     assert run.main(["--resume", "--out", str(out)]) == 0
     told = capsys.readouterr().err
-    assert f"{last} is damaged" in told and "using 00000200" in told
+    assert f"{last} is damaged" in told and "starts from 00000200" in told
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
     assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
     assert (out / "checkpoints" / f"{last}.damaged").is_dir()
@@ -501,8 +504,8 @@ def test_a_full_disk_in_mid_run_leaves_the_last_checkpoint(whole, tmp_path):
     status, _, err = finish(child)
     assert status == 1, err
     assert err.splitlines()[-1].startswith("error: ") and "Traceback" not in err
-    newest, damages = checkpoint.latest(out / "checkpoints")
-    assert newest is not None and damages == []
+    newest, errors = checkpoint.latest(out / "checkpoints")
+    assert newest is not None and errors == []
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
 
