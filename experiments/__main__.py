@@ -116,7 +116,7 @@ def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then write its page."""
     setup, results, figure = options.setup, options.results, FIGURES[name]
     shard = shards.parse(options.shard)
-    command_line.check_least(setup, devices=1, evaluate_episodes=0)
+    command_line.check_minimum(setup, devices=1, evaluate_episodes=0)
     published = results.resolve() == RESULTS.resolve()
     if options.quick and not published:
         raise InputError(

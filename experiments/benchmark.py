@@ -360,7 +360,7 @@ def run(options: Options) -> None:
             )
     if (fewest := min(options.num_envs, default=0)) < 1:
         raise InputError(f"num_envs is {fewest}: it must be 1 or more")
-    command_line.check_least(
+    command_line.check_minimum(
         options, repeats=1, seeds=1, iterations=1, devices=1, training_envs=1
     )
     count = options.devices or available_cores()

@@ -142,7 +142,7 @@ def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> 
 
 def run(options: Options) -> None:
     """Draw the layout; train one seed of both agents and draw a row for each moment."""
-    command_line.check_least(options, total_steps=1)
+    command_line.check_minimum(options, total_steps=1)
     path = options.out / "point_mass_moments.png"
     output_file.make_parent(path)
     jax.config.update("jax_default_matmul_precision", "highest")

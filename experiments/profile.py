@@ -141,7 +141,7 @@ def trace(call: Any, program: str) -> dict[str, float]:
 
 def run(options: Options) -> None:
     """Print the table."""
-    command_line.check_least(options, seeds=1, iterations=1, repeats=1)
+    command_line.check_minimum(options, seeds=1, iterations=1, repeats=1)
     devices.use_devices(options.settings, 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)

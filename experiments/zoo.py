@@ -121,7 +121,7 @@ def write_table() -> None:
 
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
-    command_line.check_least(options, episodes=1)
+    command_line.check_minimum(options, episodes=1)
     if not options.runs:
         raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:

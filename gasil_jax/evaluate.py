@@ -128,7 +128,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
-    command_line.check_least(options, episodes=1)
+    command_line.check_minimum(options, episodes=1)
     command_line.check_key(options.key)
     if options.out is not None:
         output_file.check(options.out, (".csv",))

@@ -257,7 +257,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"out is {options.out}: an .mp4 needs the package imageio-ffmpeg (pip "
             'install "gasil_jax[render]"); a .gif or .png needs nothing'
         )
-    command_line.check_least(options, steps=1)
+    command_line.check_minimum(options, steps=1)
     for name in ("width", "height"):
         if not 1 <= getattr(options, name) <= _LARGEST_SIZE:
             raise InputError(

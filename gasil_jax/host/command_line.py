@@ -1,4 +1,4 @@
-"""Parse a command line into a dataclass; turn errors into a line and a status."""
+"""Parse command lines into dataclasses; turn errors into messages and exit statuses."""
 
 import contextlib
 import dataclasses
@@ -39,7 +39,7 @@ def input_checked() -> Iterator[None]:
 
 @_REGISTRY.primitive_rule
 def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
-    # A command line gives points; an Optax schedule can only be given in Python.
+    # On a command line a schedule is a list of points; only Python takes a function.
     if info.type != Schedule:
         return None
 
@@ -62,17 +62,17 @@ def _schedule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec | None:
     )
 
 
-def whole_number(word: str) -> int:
-    """Return the whole number that a word stands for, also one written as 1e6.
+def whole_number(text: str) -> int:
+    """Return the whole number in a text, which may be written as 1e6.
 
     Raises:
-      ValueError: if the word is not a whole number.
+      ValueError: if the text is not a whole number.
     """
     try:
-        return int(word)
+        return int(text)
     except ValueError:
         with contextlib.suppress(ValueError):
-            if (number := float(word)).is_integer():
+            if (number := float(text)).is_integer():
                 return int(number)
         raise
 
@@ -101,13 +101,13 @@ def parse(
     program: str,
     default: T | None = None,
 ) -> T:
-    """Return the options of a command line; print the help and exit if it says --help.
+    """Return the options of a command line. With --help, print the help and exit.
 
     Args:
       options: the dataclass of the options.
-      arguments: the command line; default the one that the program was started with.
+      arguments: the command line; default that of this process.
       program: name of the module that was started.
-      default: the values of options that are not given; default the dataclass' own.
+      default: the values of options that are not given; default the dataclass's own.
 
     Raises:
       InputError: if tyro rejects the command line; the message is one line.
@@ -131,11 +131,15 @@ def parse(
 
 
 def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
-    """Refuse what tyro would take silently or refuse in other words.
+    """Check for mistakes that tyro accepts or reports with an unclear message.
 
     Args:
       kinds: the types of all options, by name.
       arguments: the command line.
+
+    Raises:
+      InputError: if an option is unknown, is an on/off option with a value, or is a
+        list option that is given twice.
     """
     given = set()
     for argument, following in itertools.zip_longest(arguments, arguments[1:]):
@@ -155,32 +159,33 @@ def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
                 f"{name} is {following!r}: it takes no value, {flag} turns it on and "
                 f"--no-{flag.removeprefix('--')} off"
             )
-        # The last one would stand for all.
+        # tyro would use only the last list.
         if get_origin(kinds.get(name)) is tuple and name in given:
             raise InputError(f"{name} is given twice: put all values after one {flag}")
         given.add(name)
 
 
 def _flags(kind: Any, default: Any = None) -> Iterator[tuple[str, Any]]:
-    """Yield names and types of a dataclass' fields, nested dataclasses' included.
+    """Yield the names and types of a dataclass's fields, including nested ones.
 
     Args:
-      kind: the class.
-      default: an instance; a nested value may be of a class derived from the declared.
+      kind: the dataclass.
+      default: an instance, or None. The class of a nested dataclass is taken from it,
+        because it may be derived from the declared one.
     """
     for name, hint in get_type_hints(kind).items():
         if dataclasses.is_dataclass(hint):
             nested = getattr(default, name, None)
-            own = type(nested) if dataclasses.is_dataclass(nested) else hint
-            yield from _flags(own, nested)
+            actual = type(nested) if dataclasses.is_dataclass(nested) else hint
+            yield from _flags(actual, nested)
         else:
             yield name, hint
 
 
-def _in_one_line(refusal: str) -> str:
-    """Return the text of tyro's framed message without its frame, title and hints."""
-    text = re.sub(r"\x1b\[[0-9;]*m", "", refusal)
-    # The frame is of lines, ASCII or blanks, depending on the terminal's encoding.
+def _in_one_line(printed: str) -> str:
+    """Return tyro's error message in one line, without its frame, title and hints."""
+    text = re.sub(r"\x1b\[[0-9;]*m", "", printed)
+    # The terminal's encoding decides whether the frame is of lines, ASCII or blanks.
     lines = [line.strip(" │╭╮╰╯─|+") for line in text.splitlines()]
     _title, *rest = [line for line in lines if line.strip("-")]
     message = " ".join(" ".join(rest).split())
@@ -192,7 +197,7 @@ def _in_one_line(refusal: str) -> str:
     if unparsed := re.match(
         r"Error parsing --([\w-]+): Could not find valid parse .*\['(.*)'\]", message
     ):
-        # A narrow frame breaks a line behind a comma.
+        # In a narrow frame tyro breaks a line after a comma.
         name, value = unparsed[1].replace("-", "_"), unparsed[2].replace(", ", ",")
         return f"{name} is {value!r}: it must be whole numbers, separated by spaces"
     number = re.match(
@@ -209,40 +214,40 @@ def _in_one_line(refusal: str) -> str:
 
 
 def note(text: str) -> None:
-    """Print a line to stderr about something that is allowed but may surprise."""
+    """Print a line to stderr about something that is allowed but may be a mistake."""
     print(f"note: {text}", file=sys.stderr)
 
 
-def check_least(options: Any, **least: int) -> None:
-    """Check that numbers are not below their lowest allowed values; None is allowed.
+def check_minimum(options: Any, **minimum: int) -> None:
+    """Check that fields are not below their lowest allowed values; None is allowed.
 
     Args:
       options: a dataclass.
-      least: the lowest allowed value of each field to check, by name.
+      **minimum: the lowest allowed value of each field to check, by name.
 
     Raises:
       InputError: if a number is too low.
     """
-    for name, low in least.items():
+    for name, low in minimum.items():
         value = getattr(options, name)
         if value is not None and value < low:
             raise InputError(f"{name} is {value}: it must be {low} or more")
 
 
 def check_key(key: int) -> None:
-    """Raise `InputError` unless both JAX and Gymnasium take the number as a seed."""
+    """Raise `InputError` unless both JAX and Gymnasium accept the number as a seed."""
     if not 0 <= key < 2**32:
         raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
 
 
 def exit_status(work: Callable[[], int | None]) -> int:
-    """Do the work of a command line, print its errors and return its exit status.
+    """Call the function of a command, print its errors and return the exit status.
 
     Returns:
-      The status that the work returns, or 0 if it returns none; 1 if a folder or file
-      can't be read or written, or if a program that it started failed; 2 for bad input,
-      which includes a file name that is too long; 128 plus the signal's number if it
-      was interrupted.
+      The status that the function returns, or 0 if it returns None; 1 if a folder or
+      file can't be read or written, or if a program that it started failed; 2 for bad
+      input, which includes a file name that is too long; 128 plus the signal's number
+      if it was interrupted.
     """
     try:
         return work() or 0
@@ -253,7 +258,7 @@ def exit_status(work: Callable[[], int | None]) -> int:
     except Interrupted as interrupted:
         print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
         return 128 + interrupted.signal
-    # Ctrl-C outside of training, or a second one during it.
+    # Ctrl-C outside of training, or for the second time during it.
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return 128 + signal.SIGINT

@@ -24,12 +24,12 @@ from gasil_jax.imitation import expert
 _LOCK = ".lock"
 _PROBE = ".writable-"
 _CONFIG = "config.json"
-#: The errors of file systems without locks.
+#: Errors of locking on a file system without locks.
 _NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
 
 
 def check(out: pathlib.Path, resume: bool) -> None:
-    """Check that a run can use the folder; leaves nothing but a lock file.
+    """Check that a run can use the folder. Writes nothing but a lock file.
 
     Raises:
       InputError: if it can't be written, if another process uses it, if it is not
@@ -53,8 +53,8 @@ def check(out: pathlib.Path, resume: bool) -> None:
 
 
 def _refuse_without_checkpoints(out: pathlib.Path) -> None:
-    """Refuse to replace the results of training whose checkpoints are gone."""
-    # Of a run, or of each program of a sweep.
+    """Raise `InputError` if training has ended and its checkpoints are gone."""
+    # A run has one metrics.csv, a sweep one for each program.
     for folder in (path.parent for path in out.rglob("metrics.csv")):
         if has_results(folder) and not any((folder / "checkpoints").glob("*")):
             raise InputError(
@@ -64,7 +64,7 @@ def _refuse_without_checkpoints(out: pathlib.Path) -> None:
 
 
 def has_results(folder: pathlib.Path) -> bool:
-    """Return whether training in the folder, of a run or a program, has ended."""
+    """Return whether the training of the run or program in the folder has ended."""
     names = ("summary.json", "training.json", "policy.npz")
     return any((folder / name).exists() for name in names)
 
@@ -109,8 +109,8 @@ def create_new(name: str) -> pathlib.Path:
 
 
 @functools.cache
-def _tell_of_no_locks(folder: pathlib.Path, why: str) -> None:
-    """Print a note, once for each folder."""
+def _note_missing_locks(folder: pathlib.Path, why: str) -> None:
+    """Print a note that a folder can't be locked, once for each folder."""
     command_line.note(
         f"{folder} is on a file system without locks ({why}): make sure that no other "
         "process writes to it"
@@ -139,7 +139,7 @@ def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
         except OSError as error:
             if error.errno not in _NO_LOCKS:
                 raise
-            _tell_of_no_locks(folder, str(error.strerror))
+            _note_missing_locks(folder, str(error.strerror))
         file.truncate(0)
         file.write(f"process {os.getpid()} on {socket.gethostname()}")
         file.flush()
@@ -169,8 +169,8 @@ def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]
 def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
     """Raise `InputError` unless the folder is empty.
 
-    The lock file does not count, nor does the file by which another process tests for a
-    moment whether it can write.
+    The lock file is ignored, and so is the folder that `create` makes for a moment to
+    test whether it can write.
     """
     names = (path.name for path in folder.iterdir())
     if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
@@ -219,8 +219,8 @@ class _Description(TypedDict, total=False):
     shards: int | None
 
 
-def _what_else(folder: pathlib.Path) -> str:
-    """Return what a folder without config.json is, for an error message."""
+def _why_no_run(folder: pathlib.Path) -> str:
+    """Return why a folder has no config.json, for an error message."""
     if not folder.exists():
         return ", which does not exist: it must be the folder of a run"
     if (folder / "fit.json").is_file():
@@ -241,7 +241,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     try:
         description = json_reader.read(path, _Description)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"run is {folder}{_what_else(folder)}") from None
+        raise InputError(f"run is {folder}{_why_no_run(folder)}") from None
     try:
         if "points" in description:
             for name in ("share_counts", "shard"):
@@ -266,12 +266,12 @@ class StoredRun(NamedTuple):
     description: Mapping[str, Any]
 
 
-#: The largest number of seeds; their keys are numbered up to 2**32.
+#: The largest number of seeds. Their absolute numbers are below 2**32.
 _MOST_SEEDS = 2**20
 
 
 def check_seeds(seeds: int, first_seed: int) -> None:
-    """Raise `InputError` unless there can be so many seeds, from the first one on."""
+    """Raise `InputError` if the number of seeds or the first seed is out of range."""
     if not 1 <= seeds <= _MOST_SEEDS:
         raise InputError(f"seeds is {seeds}: it must be from 1 to {_MOST_SEEDS:,}")
     last = 2**32 - seeds
@@ -289,7 +289,7 @@ def seeds_of(description: Mapping[str, Any]) -> range:
 #: The field of config.json and fit.json that holds what `expert_hash` returns.
 EXPERT_HASH = "expert_sha256"
 #: Options that may differ between a run and its continuation.
-_FREE = (
+_MAY_DIFFER = (
     "out",
     "resume",
     "checkpoint_every",
@@ -304,11 +304,11 @@ _FREE = (
 
 
 def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
-    """Return the fields that differ from the run, but must not in its continuation.
+    """Return the fields in which a run must not differ from its continuation, but does.
 
     Args:
-      before: content of the run's config.json, from `read`.
-      now: the same of the continuation; its "total_steps" may be larger.
+      before: description of the run, from `read`.
+      now: description of its continuation, whose "total_steps" may be larger.
 
     Returns:
       "NAME was A, is B" for each of these fields.
@@ -317,13 +317,13 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     for name, old in flat(before).items():
         new = requested.get(name)
         grown = name == "total_steps" and new is not None and new >= old
-        if old != new and not grown and name not in _FREE:
+        if old != new and not grown and name not in _MAY_DIFFER:
             changes.append(f"{name} was {old}, is {new}")
     return changes
 
 
 def expert_hash(config: Config) -> dict[str, str]:
-    """Return the hash of the expert's trajectories as a field; none without an expert.
+    """Return the hash of the expert's trajectories as a field, or {} without an expert.
 
     Raises:
       ValueError: if the expert can't be read.
@@ -342,8 +342,8 @@ def refuse_other_expert(
     """Raise `InputError` if the expert's trajectories are not those of a run.
 
     Args:
-      before: content of the run's config.json or fit.json; of an older version it may
-        lack the hash.
+      before: content of the run's config.json or fit.json. It has no hash if an older
+        version wrote it.
       now: the field "expert" of the config to continue with, and its `expert_hash`.
       folder: folder of the run.
     """

@@ -1,4 +1,4 @@
-"""The options of a run: parse them on top of a preset, check them, write them down."""
+"""The options of a run: parse them with a preset, check them, write config.json."""
 
 import argparse
 import contextlib
@@ -90,14 +90,14 @@ def parse(
     program: str,
     resumed: StoredRun | None = None,
 ) -> T:
-    """Return the command line's options, on top of the preset that they name.
+    """Return the options of a command line; its preset decides what is not given.
 
     Args:
       kind: the class of the options.
-      arguments: the command line; default the one that the program was started with.
+      arguments: the command line; default that of this process.
       program: name of the module that was started.
-      resumed: the run to continue. Its own options are then the defaults, and the
-        preset is not used.
+      resumed: the run to continue. Its options are then the defaults, and the preset is
+        not used.
 
     Raises:
       InputError: if a flag or a value is unknown, or differs from the run's.
@@ -107,7 +107,8 @@ def parse(
         options = command_line.parse(kind, arguments, program, stored)
         _refuse_changes(options, stored, resumed)
         return options
-    given = command_line.parse(kind, arguments, program, _of_agent(kind, arguments))
+    default = _defaults_of_agent(kind, arguments)
+    given = command_line.parse(kind, arguments, program, default)
     with command_line.input_checked():
         config = presets.preset(
             given.env,
@@ -167,12 +168,14 @@ def _refuse_changes(options: Options, stored: Options, run: StoredRun) -> None:
     run_folder.refuse_other_expert(run.description, now, run.folder)
 
 
-def _of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
-    """Return default options with the agent that is given, whose numbers are flags.
+def _defaults_of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
+    """Return default options with the agent that the command line names.
+
+    The agent's own hyperparameters are then options, too.
 
     Raises:
-      InputError: if there is no such agent, or if the name of a number of its own is an
-        option's.
+      InputError: if there is no such agent, or if one of its hyperparameters has the
+        name of another option.
     """
     first = _first_arguments(arguments)
     agent = Config.agent if first is None or first.agent is None else first.agent
@@ -194,8 +197,8 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
     """Return the run that --resume continues, or None if there is none.
 
     Raises:
-      InputError: if --resume is given without --out, or without --env where no run is,
-        or if the run's config.json is damaged.
+      InputError: if --resume is given without --out, if it is given without --env and
+        the folder holds no run, or if the run's config.json is damaged.
     """
     given = _first_arguments(arguments)
     if given is None or not given.resume:
@@ -213,7 +216,10 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
 
 
 def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
-    """Parse what decides the other options; None leaves errors to the full parser."""
+    """Return the options that decide the defaults of others, or None after an error.
+
+    The parser of all options reports the error.
+    """
     parser = argparse.ArgumentParser(
         add_help=False, allow_abbrev=False, exit_on_error=False
     )
@@ -238,7 +244,7 @@ def check(options: Options) -> None:
         presets.check(options.preset)
         validate(options.config)
         trackers.check(options.log)
-    command_line.check_least(
+    command_line.check_minimum(
         options,
         devices=1,
         checkpoint_every=1,
@@ -269,8 +275,8 @@ def unused_fields(config: Config) -> dict[str, str]:
     return fields
 
 
-def tell_without_effect(options: Options, num_members: int) -> None:
-    """Print a note for each option that differs from its default without effect.
+def note_options_without_effect(options: Options, num_members: int) -> None:
+    """Print a note for each option that was changed but has no effect.
 
     Args:
       options: options that `check` accepts.
@@ -299,8 +305,8 @@ def tell_without_effect(options: Options, num_members: int) -> None:
         )
 
 
-def tell_if_untuned(options: Options) -> None:
-    """Print a note if the default preset has nothing for the agent on the task."""
+def note_if_untuned(options: Options) -> None:
+    """Print a note if the preset has no values for the agent on the task."""
     agent, delay = options.config.agent, options.settings.reward_delay
     if not presets.has_overrides(options.env, agent, options.preset, delay):
         rewards = "delayed" if delay > 1 else "dense"
@@ -312,23 +318,19 @@ def tell_if_untuned(options: Options) -> None:
 
 
 def seeds_of(options: Options) -> range:
-    """Return the seeds' absolute numbers; every point of a sweep has the same ones."""
+    """Return the seeds' absolute numbers, the same for every point of a sweep."""
     return run_folder.seeds_of(vars(options))
 
 
 def evaluation_schedule(options: Options) -> EvaluationSchedule | None:
-    """Return when policies are evaluated during training; None for never."""
+    """Return the times of evaluations during training; None without evaluations."""
     if options.evaluate_every is None:
         return None
     return EvaluationSchedule(options.evaluate_every, options.evaluate_episodes or 10)
 
 
 def check_out(options: Options) -> None:
-    """Check that the run folder can be used, before anything is built for it.
-
-    Raises:
-      InputError: if it can't.
-    """
+    """Raise `InputError` if the run folder can't be used. Builds nothing."""
     if options.out is not None:
         run_folder.check(options.out, options.resume)
 
@@ -357,15 +359,15 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
         try:
             yield folder
         except Interrupted as interrupted:
-            where = shlex.quote(str(folder))
+            quoted = shlex.quote(str(folder))
             interrupted.add_note(
-                f"continue with: python -m {program} --resume --out {where}"
+                f"continue with: python -m {program} --resume --out {quoted}"
             )
             raise
 
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
-    """Write every option to config.json, the config's fields under "config"."""
+    """Write config.json: every option, and further fields that are given."""
     description = {
         f.name: getattr(options, f.name) for f in dataclasses.fields(options)
     }
@@ -391,7 +393,7 @@ def make_env(options: Options) -> Any:
 
 
 def _trace(env: Any, config: Config) -> None:
-    """Trace the start and one iteration of an agent of one's own, without running them.
+    """Trace the first state and one iteration of a custom agent, without running them.
 
     Raises:
       InputError: if that raises an error, or if a shape or dtype in its state changes.

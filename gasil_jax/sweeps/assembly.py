@@ -98,13 +98,13 @@ def prepare(
             options.keep_checkpoints + 1,
             written=sum(map(resources.size_of_checkpoints, folders)),
         )
-    run_options.tell_if_untuned(options)
-    run_options.tell_without_effect(options, num_members)
-    tell_if_no_episode_ends(env, [program.config for program in programs])
+    run_options.note_if_untuned(options)
+    run_options.note_options_without_effect(options, num_members)
+    note_if_no_episode_ends(env, [program.config for program in programs])
     return env
 
 
-def tell_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
+def note_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
     """Print a note if no episode can end within the steps of an environment."""
     for config in configs:
         steps = config.num_iterations * config.num_steps

@@ -212,14 +212,14 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
     env = gasil_jax.make_env("point_mass")
     # 3 iterations of 16 steps in each environment; an episode has 50.
     short = gasil_jax.Config(total_steps=40, num_envs=1, batch_steps=16)
-    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50), short])
+    assembly.note_if_no_episode_ends(env, [short.replace(total_steps=50), short])
     (line,) = capsys.readouterr().err.splitlines()
     assert "no return will be known: each of 1 environments takes 48 steps" in line
-    assembly.tell_if_no_episode_ends(env, [short.replace(total_steps=50)])
+    assembly.note_if_no_episode_ends(env, [short.replace(total_steps=50)])
     # Where episodes may end early, they may end within few steps.
     monopod = types.SimpleNamespace(episode_length=1000)
     monopod.unwrapped = monopod
-    assembly.tell_if_no_episode_ends(monopod, [short])
+    assembly.note_if_no_episode_ends(monopod, [short])
     assert capsys.readouterr().err == ""
     for name, task in locomotion.TASKS.items():
         ends = locomotion.Locomotion.ends_early.fget(types.SimpleNamespace(task=task))
@@ -255,7 +255,7 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
     words = ["--env", "point_mass", *arguments.split()]
     options = run_options.parse(run_options.Options, words, "gasil_jax.run")
     run_options.check(options)
-    run_options.tell_without_effect(options, options.seeds)
+    run_options.note_options_without_effect(options, options.seeds)
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == len(messages)
     assert all(message in line for message, line in zip(messages, lines, strict=True))
@@ -274,7 +274,7 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
 )
 def test_a_task_without_a_tuned_preset_is_told(arguments, message, capsys):
     words = ["--env", *arguments.split()]
-    run_options.tell_if_untuned(
+    run_options.note_if_untuned(
         run_options.parse(run_options.Options, words, "gasil_jax.run")
     )
     lines = capsys.readouterr().err.splitlines()
