@@ -124,7 +124,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _main(arguments: Sequence[str] | None) -> None:
-    given, others = _placement(arguments)
+    given, others = _process_options(arguments)
     if given.launcher is not None:
         options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
@@ -145,15 +145,16 @@ def _main(arguments: Sequence[str] | None) -> None:
         _train_whole(options, resumed)
 
 
-def _placement(
+def _process_options(
     arguments: Sequence[str] | None,
 ) -> tuple[argparse.Namespace, list[str]]:
-    """Return --resume and the options that say where training runs, and the others."""
+    """Return the options that decide which process trains what, and other arguments.
+
+    The parser of all options reports a wrong or a missing value.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    # The full parser reports a value.
     parser.add_argument("--resume", nargs="?", const=True, default=False)
     for name in ("--shard", "--launcher", "--shards", "--out"):
-        # The full parser reports a missing value.
         parser.add_argument(name, nargs="?")
     return parser.parse_known_args(arguments)
 
@@ -212,8 +213,7 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     """Return the programs that are not yet trained to their end in the folder `out`."""
     if options.out is None:
         return list(programs)
-    left = tables.Trained(options.out, programs).unfinished()
-    return [program for program in programs if program.number in left]
+    return tables.Trained(options.out, programs).unfinished()
 
 
 def _refuse_other_points(points: Sequence[Point], resumed: StoredRun) -> None:
@@ -225,7 +225,7 @@ def _refuse_other_points(points: Sequence[Point], resumed: StoredRun) -> None:
         )
 
 
-def _plan_without_launcher(
+def _plan_here(
     options: Options, resumed: StoredRun | None, others: Sequence[StoredRun] = ()
 ) -> tuple[list[dict[str, Any]], list[Program]]:
     """Return what `plan` returns, for a sweep or a shard in this process.
@@ -246,7 +246,7 @@ def _plan_without_launcher(
 
 
 def _train_whole(options: Options, resumed: StoredRun | None) -> None:
-    points, programs = _plan_without_launcher(options, resumed)
+    points, programs = _plan_here(options, resumed)
     if options.out is not None and options.resume:
         shards.refuse_sharded(options.out)
     run_options.check_out(options)
@@ -259,11 +259,15 @@ def _train_whole(options: Options, resumed: StoredRun | None) -> None:
 
 
 def _shard_folder(shard: shards.Shard, out: str | None) -> pathlib.Path:
-    """Return the folder of a shard of the sweep in `out`, which must fit it."""
+    """Return the folder of a shard of the sweep in `out`.
+
+    Raises:
+      InputError: if `out` is missing, or holds another kind of sweep.
+    """
     if out is None:
         raise InputError("shard needs --out and the folder of the whole sweep")
-    shards.refuse_whole(pathlib.Path(out))
-    shards.refuse_recut(pathlib.Path(out), shard)
+    shards.refuse_unsharded(pathlib.Path(out))
+    shards.refuse_other_count(pathlib.Path(out), shard)
     return shard.folder(pathlib.Path(out))
 
 
@@ -288,7 +292,7 @@ def _refuse_other_sweep(
     with command_line.input_checked():
         now |= run_folder.expert_hash(options.config)
     for folder, description in others:
-        # A shard may have been continued to more total_steps than this one yet.
+        # Shards are continued to more total_steps one after another.
         config = description["config"].replace(total_steps=options.config.total_steps)
         merging.refuse_different(
             StoredRun(folder, {**description, "config": config}),
@@ -307,7 +311,7 @@ def _train_shard(
     options = dataclasses.replace(options, out=shard_folder)
     every = merging.stored_shards(shard_folder.parent)
     others = [other for other in every if other.folder != shard_folder]
-    points, programs = _plan_without_launcher(options, resumed, others)
+    points, programs = _plan_here(options, resumed, others)
     _refuse_other_sweep(options, shard_folder, points=points, others=others)
     programs = shards.cut_evenly(programs, shard)
     trained = tables.Trained(shard_folder, programs)
@@ -326,7 +330,7 @@ def _train_shard(
 
 
 def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
-    """Let the launcher run a command for each shard, then merge the shards."""
+    """Train all shards with a launcher, one command for each, then merge them."""
     launch.check(launcher)
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")
@@ -338,14 +342,14 @@ def _launch(options: Options, launcher: str, others: Sequence[str]) -> None:
     points, programs = plan(options, merging.stored_shards(shards.root(options.out)))
     last = shards.Shard(options.shards, options.shards)
     shards.cut_evenly(programs, last)  # Refuses more shards than members.
-    shards.refuse_whole(options.out)
-    shards.refuse_recut(options.out, last)
+    shards.refuse_unsharded(options.out)
+    shards.refuse_other_count(options.out, last)
     shards.refuse_used(options.out, options.resume)
     every = [shards.Shard(number, last.count) for number in range(1, last.count + 1)]
-    # A job that is run again after its process died continues.
-    where = ["--resume", "--out", str(options.out.absolute())]
+    # With --resume a job that is run again continues from its checkpoint.
+    resumed = ["--resume", "--out", str(options.out.absolute())]
     jobs = {
-        f"shard {shard}": [*others, *where, "--shard", str(shard)] for shard in every
+        f"shard {shard}": [*others, *resumed, "--shard", str(shard)] for shard in every
     }
     try:
         launch.LAUNCHERS[launcher](_PROGRAM, jobs, options.devices)

@@ -38,7 +38,7 @@ class Job:
       folder: folder of its metrics.csv and checkpoints, created if it is missing.
       labels: columns that identify the members in the tables, (members,) each.
       name: name of the program's run in trackers.
-      finished: whether it is already trained to its end.
+      finished: whether it is trained to its end, so that it is skipped.
     """
 
     program: Program
@@ -135,8 +135,8 @@ def train(
       jobs: the jobs in order, including finished ones.
       title: title of the progress display.
       on_finished: called when a job has been trained to its end.
-      on_restored: called for each job when it is certain that its training can begin or
-        continue.
+      on_restored: called for each job once its training can begin or continue without
+        an error.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
@@ -160,11 +160,13 @@ def train(
                     raise Interrupted(interruption.signal)
                 job.folder.mkdir(parents=True, exist_ok=True)
                 with progress.aside("starting the trackers"):
-                    # A program of a sweep may have other values than the base.
+                    # The points of a program may change fields of the config.
                     own = dataclasses.replace(options, config=job.program.config)
-                    description = run_folder.flat(vars(own))
-                    following = trackers.make(
-                        options.log, job.folder, run_name=job.name, config=description
+                    job_trackers = trackers.make(
+                        options.log,
+                        job.folder,
+                        run_name=job.name,
+                        config=run_folder.flat(vars(own)),
                     )
                 members = make_members(
                     env,
@@ -181,7 +183,7 @@ def train(
                     progress=progress,
                     interruption=interruption,
                     steps_before=steps_before,
-                    trackers=following,
+                    trackers=job_trackers,
                     on_restored=on_restored,
                 )
                 on_finished(job, members, outcome)

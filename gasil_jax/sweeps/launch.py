@@ -1,9 +1,8 @@
 """Launchers that run a sweep's shards: ``python -m gasil_jax.sweep --launcher ray``.
 
-A launcher gets a command line for each job and runs each job in its own process. If a
-process dies, it runs the job again, which then continues from its checkpoint. It
-returns when all jobs are done. To add a launcher, write a function and add it to
-`LAUNCHERS`.
+A launcher is a function that gets the arguments of each job, and runs each job in its
+own process. It runs a job again if its process dies; the job then continues from its
+checkpoint. It returns when all jobs are done. To add a launcher, add it to `LAUNCHERS`.
 """
 
 import contextlib
@@ -16,9 +15,9 @@ from typing import Any
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host.interruption import Interrupted, Interruption
 
-#: How often a job is run again after its process died.
+#: The largest number of times that a job is run again after its process died.
 RETRIES = 3
-_SECONDS_BETWEEN_LOOKS = 1.0
+_SECONDS_BETWEEN_POLLS = 1.0
 _BAD_INPUT = 2
 
 Jobs = Mapping[str, Sequence[str]]
@@ -33,17 +32,21 @@ def check(name: str) -> None:
         _ray_package()
 
 
-def _refuse_failed(failed: Mapping[str, str], num_jobs: int) -> None:
-    """Raise an error with the failed jobs and their reasons, if there are any.
+def _raise_failures(failed: Mapping[str, str], num_jobs: int) -> None:
+    """Raise an error if jobs have failed.
+
+    Args:
+      failed: why jobs have failed, by the job's name.
+      num_jobs: number of all jobs.
 
     Raises:
       ChildProcessError: if jobs have failed.
-      InputError: if all jobs refused their input.
+      InputError: if all jobs have failed because of bad input.
     """
     if failed:
         jobs = ", ".join(f"{name} ({why})" for name, why in failed.items())
         if list(failed.values()) == [f"status {_BAD_INPUT}"] * num_jobs:
-            raise InputError(f"{jobs} refused what they were given, see above")
+            raise InputError(f"{jobs}: bad input, see above")
         raise ChildProcessError(
             f"{jobs} failed; the others are done. Continue with the same command and "
             "--resume"
@@ -60,7 +63,7 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
-      InputError: if all jobs refused their input.
+      InputError: if all jobs have failed because of bad input.
       Interrupted: if a signal was received; it was passed on to the running job.
     """
     failed = {}
@@ -71,17 +74,17 @@ def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
                 break
         if status:
             failed[name] = f"status {status}"
-    _refuse_failed(failed, len(jobs))
+    _raise_failures(failed, len(jobs))
 
 
 def _run_process(command: Sequence[str]) -> int:
     """Run a command and return its exit status, negative if a signal killed it."""
     with Interruption() as interruption:
-        # The child has its own session, so that Ctrl-C reaches it only from here.
+        # In its own session the child gets no Ctrl-C but the signal that is sent below.
         child = subprocess.Popen(command, start_new_session=True)
         while True:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                status = child.wait(_SECONDS_BETWEEN_LOOKS)
+                status = child.wait(_SECONDS_BETWEEN_POLLS)
                 break
             if interruption.signal is not None:
                 child.send_signal(interruption.signal)
@@ -121,15 +124,15 @@ def _ray_package() -> Any:
 
 @contextlib.contextmanager
 def _connected(ray: Any) -> Iterator[None]:
-    """Connect to the cluster of RAY_ADDRESS, an existing one, or else a new one."""
-    began = not ray.is_initialized()
-    if began:
-        ray.init()
+    """Connect to a Ray cluster: RAY_ADDRESS's, else a running one, else a new one."""
+    if ray.is_initialized():
+        yield
+        return
+    ray.init()
     try:
         yield
     finally:
-        if began:
-            ray.shutdown()
+        ray.shutdown()
 
 
 def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
@@ -146,7 +149,8 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
-      InputError: if no node has that many CPUs, or if all jobs refused their input.
+      InputError: if no node has that many CPUs, or if all jobs have failed because of
+        bad input.
       Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     ray = _ray_package()
@@ -183,16 +187,16 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
             else:
                 if status:
                     failed[name] = f"status {status}"
-    _refuse_failed(failed, len(jobs))
+    _raise_failures(failed, len(jobs))
 
 
 def _wait(ray: Any, references: list[Any]) -> None:
-    """Wait until all tasks are done; pass a signal on to them."""
+    """Wait until all tasks are done; pass a signal that is received on to them."""
     with Interruption() as interruption:
         pending = references
         while pending and interruption.signal is None:
             _, pending = ray.wait(
-                pending, num_returns=len(pending), timeout=_SECONDS_BETWEEN_LOOKS
+                pending, num_returns=len(pending), timeout=_SECONDS_BETWEEN_POLLS
             )
         if interruption.signal is not None:
             for reference in pending:

@@ -1,4 +1,4 @@
-"""Merge the shards of a sweep: write the sweep's tables; shards are only read."""
+"""Merge the shards of a sweep: read the shards and write the tables of the sweep."""
 
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ def _comparable(description: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def refuse_different(first: StoredRun, other: StoredRun) -> None:
-    """Raise `InputError` if two shards are not of one sweep with one expert."""
+    """Raise `InputError` if two shards are of different sweeps or experts."""
     before, now = _comparable(first.description), _comparable(other.description)
     # total_steps may not grow here.
     changed = run_folder.differences(before, now)
@@ -35,8 +35,8 @@ def refuse_different(first: StoredRun, other: StoredRun) -> None:
             f"{other.folder} is of another sweep than {first.folder}: "
             f"{'; '.join(changed)}"
         )
-    own = run_folder.flat(other.description)
-    run_folder.refuse_other_expert(first.description, own, first.folder)
+    fields = run_folder.flat(other.description)
+    run_folder.refuse_other_expert(first.description, fields, first.folder)
 
 
 def _read(folder: pathlib.Path) -> StoredRun:
@@ -60,7 +60,7 @@ def stored_shards(inside: pathlib.Path) -> list[StoredRun]:
 
 
 def _read_all(folders: Sequence[pathlib.Path]) -> list[StoredRun]:
-    """Return the shards in order, after checking that they make one sweep."""
+    """Return the shards in order, after checking that they are all of one sweep."""
     paths = [path for folder in folders for path in _shard_folders(folder)]
     first, *others = every = [_read(path) for path in dict.fromkeys(paths)]
     for other in others:
@@ -88,7 +88,7 @@ def _read_all(folders: Sequence[pathlib.Path]) -> list[StoredRun]:
 
 
 def _refuse_used(out: pathlib.Path, shard: StoredRun) -> None:
-    """Refuse a folder that holds anything but earlier tables of the same shards."""
+    """Raise `InputError` if `out` holds more than earlier tables of the same shards."""
     if run_folder.has_run(out):
         earlier, now = run_folder.read(out), shard.description
         # The shards may have been continued to more total_steps since.

@@ -1,4 +1,4 @@
-"""Read or draw the points of a sweep: values of hyperparameters and counts, by name."""
+"""Read or draw the points of a sweep. A point holds changed settings, by name."""
 
 import contextlib
 import itertools
@@ -90,10 +90,10 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
     for point in points:
         if not isinstance(point, dict):
             raise InputError(f"points_file is {path}: {point!r} is not a point")
-        with _naming(f"points_file is {path}"):
+        with _errors_name(f"points_file is {path}"):
             check_point(point, agent)
     allowed = kinds(agent)
-    with _naming(f"points_file is {path}"):
+    with _errors_name(f"points_file is {path}"):
         read = [
             {name: allowed[name](value) for name, value in point.items()}
             for point in points
@@ -105,12 +105,13 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
 
 
 @contextlib.contextmanager
-def _naming(where: str) -> Iterator[None]:
+def _errors_name(source: str) -> Iterator[None]:
+    """Turn an error in a point into an `InputError` that names the source."""
     try:
         yield
     # A whole number that is too large for a float is an OverflowError.
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{where}: {error}") from None
+        raise InputError(f"{source}: {error}") from None
 
 
 def check_point(point: Point, agent: str) -> None:
@@ -129,7 +130,7 @@ def check_point(point: Point, agent: str) -> None:
 
 def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> None:
     """Raise `InputError` if the points in a config.json do not fit its config."""
-    with _naming(f"{path} is damaged or of another program: points"):
+    with _errors_name(f"{path} is damaged or of another program: points"):
         for point in points:
             check_point(point, config.agent)
             validate(config.replace(**point))
@@ -158,11 +159,11 @@ def make_points(
         `PAPER_RANGES`.
 
     Raises:
-      InputError: if nothing varies, or if something that is named can't.
+      InputError: if nothing varies, or if a name or value is not allowed.
     """
     if points_file is not None:
         if grid or random is not None:
-            raise InputError("points_file stands in place of grid and random")
+            raise InputError("points_file can't be combined with grid or random")
         return read_points(pathlib.Path(points_file), agent)
     values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, agent)
     if random is None:

@@ -29,7 +29,7 @@ from gasil_jax.sweeps.tables import Trained
 
 
 class _Summary(TypedDict):
-    """What is read of a sweep's summary.json."""
+    """The field of a sweep's summary.json that is read here."""
 
     best_by_mean: int | None
 
@@ -67,7 +67,8 @@ def find(
       InputError: if the folder has no such point.
     """
     if "points" in description:
-        return _of_sweep(folder, description, _checked(folder, description, point))
+        point = _checked_point(folder, description, point)
+        return _find_point(folder, description, point)
     if point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
     config, seeds = description["config"], run_folder.seeds_of(description)
@@ -76,7 +77,7 @@ def find(
     return Saved(folder / "checkpoints", program, range(len(seeds)))
 
 
-def _checked(
+def _checked_point(
     folder: pathlib.Path, description: Mapping[str, Any], point: int | None
 ) -> int:
     """Return the requested point, or the best by mean for None."""
@@ -96,7 +97,7 @@ def _checked(
     return point
 
 
-def _of_sweep(
+def _find_point(
     folder: pathlib.Path, description: Mapping[str, Any], point: int
 ) -> Saved:
     """Return where the states of a sweep's point are saved."""
@@ -105,18 +106,10 @@ def _of_sweep(
             f"run is {folder}, whose members are in its shards: name one of "
             f"{shards.root(folder)}"
         )
-    program, indices = _with_point(folder, description, point)
-    return Saved(program.folder(folder) / "checkpoints", program, indices)
-
-
-def _with_point(
-    folder: pathlib.Path, description: Mapping[str, Any], point: int
-) -> tuple[Program, list[int]]:
-    """Return the program that trains a point, and the indices of its members."""
     for program in Trained.from_description(folder, description).programs:
         indices = [i for i, (index, _) in enumerate(program.members) if index == point]
         if indices:
-            return program, indices
+            return Saved(program.folder(folder) / "checkpoints", program, indices)
     raise InputError(f"point is {point}: it is not in {folder}, a shard of its sweep")
 
 

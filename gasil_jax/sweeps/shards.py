@@ -1,9 +1,9 @@
-"""Divide a sweep into programs, which compile once, and shards, which run separately.
+"""Divide a sweep into programs, each compiled once, and shards, each run separately.
 
 A member is a point with a seed. The members of a program differ in `Hyperparameters`
-alone. Two hyperparameters are counts; points that differ in these have separate
-programs, unless `share_counts` is set. A shard is one of n nearly equal parts of all
-members. Members are taken program by program, so that a shard compiles few programs.
+alone. Points that differ in a hyperparameter that is a count have separate programs,
+unless `share_counts` is set. A shard is one of n nearly equal parts of all members. It
+takes members program by program, so that it compiles few programs.
 """
 
 import dataclasses
@@ -16,7 +16,8 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.sweeps.points import Point
 
-#: Hyperparameters that decide shapes; a program's config has their largest values.
+#: Hyperparameters that are counts. A program's config has their largest values, which
+#: decide shapes.
 COUNTS = tuple(x for x, allowed in ranges(Hyperparameters).items() if allowed.whole)
 
 
@@ -112,7 +113,7 @@ def root(sweep: pathlib.Path) -> pathlib.Path:
 
 
 def name(folder: pathlib.Path, shard: Shard | None) -> str:
-    """Return the name of a sweep, its folder's, or SWEEP-3-of-8 of one of its shards.
+    """Return the name of a sweep or shard in trackers: SWEEP, or SWEEP-3-of-8.
 
     Args:
       folder: folder of the sweep or the shard.
@@ -120,12 +121,12 @@ def name(folder: pathlib.Path, shard: Shard | None) -> str:
     """
     folder = folder.absolute()
     sweep = folder.parent.parent
-    # A shard's folder may have been moved out of its sweep's.
+    # A shard's folder may have been copied out of the folder of its sweep.
     inside = shard is not None and folder == shard.folder(sweep)
     return f"{sweep.name}-{folder.name}" if inside else folder.name
 
 
-def refuse_whole(out: pathlib.Path) -> None:
+def refuse_unsharded(out: pathlib.Path) -> None:
     """Raise `InputError` if the folder holds a run or sweep without shards."""
     if run_folder.has_run(out) and not root(out).is_dir():
         raise InputError(
@@ -134,11 +135,10 @@ def refuse_whole(out: pathlib.Path) -> None:
         )
 
 
-def refuse_recut(out: pathlib.Path, shard: Shard) -> None:
+def refuse_other_count(out: pathlib.Path, shard: Shard) -> None:
     """Raise `InputError` if the folder holds a sweep with another number of shards."""
-    inside = root(out)
-    cuts = {path.name.split("-of-")[-1] for path in inside.glob("*-of-*")}
-    others = cuts - {str(shard.count)}
+    counts = {path.name.split("-of-")[-1] for path in root(out).glob("*-of-*")}
+    others = counts - {str(shard.count)}
     if others:
         raise InputError(
             f"shard is {shard}: {out} holds a sweep that is cut into {min(others)} "
@@ -174,7 +174,7 @@ def refuse_used(out: pathlib.Path, resume: bool) -> None:
 
 
 def parse(text: str) -> Shard:
-    """Return the shard that a text such as "3/8" names.
+    """Return the shard with a name such as "3/8".
 
     Args:
       text: NUMBER/COUNT.
@@ -194,7 +194,7 @@ def parse(text: str) -> Shard:
 def cut_evenly(whole: Sequence[Program], shard: Shard) -> list[Program]:
     """Return the programs that a shard trains, each with the shard's members only.
 
-    Sizes of shards differ by at most one member. Each member is in exactly one shard.
+    The sizes of shards differ by one member at most. Each member is in one shard.
 
     Raises:
       InputError: if there are more shards than members.

@@ -31,7 +31,7 @@ Member = tuple[int, int]
 
 
 def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> None:
-    """Record that a program is trained to its end.
+    """Write training.json, which marks a program as trained to its end.
 
     Args:
       folder: folder of the sweep or shard.
@@ -77,7 +77,7 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
 
 @dataclasses.dataclass(frozen=True)
 class Trained:
-    """A folder and the programs that are trained in it, of a whole sweep or a shard.
+    """The folder of a sweep or a shard, and the programs that are trained in it.
 
     Attributes:
       folder: folder of the sweep or shard.
@@ -110,10 +110,10 @@ class Trained:
             programs = shards.cut_evenly(programs, shards.parse(description["shard"]))
         return cls(folder, programs)
 
-    def unfinished(self) -> list[int]:
-        """Return the numbers of the programs that are not trained to their end."""
+    def unfinished(self) -> list[Program]:
+        """Return the programs that are not trained to their end."""
         return [
-            program.number
+            program
             for program in self.programs
             if read_training(self.folder, program) is None
         ]
@@ -180,9 +180,9 @@ def write(
 ) -> dict[str, Any]:
     """Write results.csv, curves.npz, summary.json and the plots; return the summary.
 
-    A cell of results.csv is empty if the point keeps the sweep's own value.
-    hyperparameters.png is written if a hyperparameter varies among the points that have
-    a final return.
+    A cell of results.csv is empty where a point does not change the sweep's value.
+    hyperparameters.png is written only if a hyperparameter varies among the points that
+    have a final return.
 
     Args:
       folder: folder to write to.
@@ -234,7 +234,7 @@ def write(
     ended = [i for i in range(len(points)) if math.isfinite(mean[i])]
     varied = _varied(parts, names, ended)
     shares = {name: importance(values, mean[ended]) for name, values in varied.items()}
-    # An estimate below 0 is so by chance alone.
+    # The estimate is noisy and may be below 0.
     shares = {name: x if x is None else max(0.0, x) for name, x in shares.items()}
     summary = {
         "points": [
@@ -277,7 +277,7 @@ def write(
 def _varied(
     parts: Sequence[Trained], names: Sequence[str], points: Sequence[int]
 ) -> dict[str, list[Any]]:
-    """Return the values that points trained with, of the names in which they differ."""
+    """Return the values of the names in which points differ, (points,) each."""
     trained: dict[int, dict[str, Any]] = {}
     for program in (program for part in parts for program in part.programs):
         for (point, _), own in zip(program.members, program.hyperparameters):
@@ -289,8 +289,8 @@ def _varied(
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the seconds, steps/s and devices of programs trained one after the other.
 
-    There are "evaluation_seconds" if policies were evaluated. For shards, which run in
-    parallel, "env_steps_per_second" is the average speed of one shard.
+    "evaluation_seconds" is included if policies were evaluated. For shards, which run
+    in parallel, "env_steps_per_second" is the average speed of one shard.
     """
     total = lambda name: sum(training[name] for training in trainings)
     devices = _joined([{"device": training["device"]} for training in trainings])
@@ -339,7 +339,7 @@ def _finite(value: float) -> float | None:
 
 
 def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
-    """Return lines of text with the speed and the best points."""
+    """Return the lines that a sweep prints at its end: speed and best points."""
     seconds = f"{summary['train_seconds']:,.0f} s of training"
     if "evaluation_seconds" in summary:
         seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
@@ -366,7 +366,7 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
 
 
 def _labels(points: Sequence[Point]) -> list[str]:
-    """Return a name for each point, of the values in which the points differ."""
+    """Return a label for each point: the values in which it differs from others."""
     names = {name for point in points for name in point}
     varied = {x for x in names if len({point.get(x) for point in points}) > 1}
     return [_label({x: point[x] for x in point if x in varied}) for point in points]

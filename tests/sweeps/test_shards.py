@@ -406,7 +406,7 @@ def test_a_launched_job_runs_again_after_its_process_died(program, tmp_path):
     ran = {name: len(list(folder.iterdir())) for name, folder in folders.items()}
     assert ran == {"killed": 3, "refused": 1, "fine": 1}
     # Nothing is left to continue.
-    with pytest.raises(InputError, match=r"^refused \(status 2\) refused what they"):
+    with pytest.raises(InputError, match=r"^refused \(status 2\): bad input"):
         launch.run_locally(program, {"refused": jobs["refused"]}, None)
 
 
