@@ -1,4 +1,4 @@
-"""Settings of JAX that must be made before it starts: devices, precision, cache."""
+"""Configure JAX before it starts: devices, precision, cache of compiled programs."""
 
 import contextlib
 import hashlib
@@ -35,7 +35,7 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
                 f"with {running} CPU device{'s' if running > 1 else ''}"
             )
     _keep_compiled_programs()
-    # This applies everywhere, not only to functions with `full_precision`.
+    # For all functions, not only those with `full_precision`.
     jax.config.update("jax_default_matmul_precision", "highest")
 
 
@@ -45,15 +45,15 @@ def _keep_compiled_programs() -> None:
     There is a folder for each version of jaxlib and each processor, because a program
     compiled for another one may crash.
     """
-    # Before 0.12 XLA warns of every loaded program that it is for another processor.
+    # Older versions print a warning for every program that is loaded from the cache.
     quiet = jaxlib.version.__version_info__ >= (0, 12)
-    config: Any = jax.config  # Its options are attributes that its type does not have.
+    config: Any = jax.config  # Its type does not declare its options.
     if config.jax_compilation_cache_dir is not None or not quiet:
         return
-    # Without a home folder there is a RuntimeError.
+    # Without a home folder `Path.home` raises a RuntimeError.
     with contextlib.suppress(OSError, RuntimeError):
-        described = pathlib.Path("/proc/cpuinfo")
-        lines = described.read_text().splitlines() if described.exists() else []
+        cpuinfo = pathlib.Path("/proc/cpuinfo")
+        lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
         features = {
             x for x in lines if x.startswith(("flags", "Features", "model name"))
         }

@@ -1,4 +1,4 @@
-"""Note SIGINT and SIGTERM, so that training can stop between two chunks."""
+"""Record SIGINT and SIGTERM, so that training can save before it stops."""
 
 import contextlib
 import signal
@@ -7,7 +7,7 @@ from typing import Any
 
 
 class Interrupted(Exception):
-    """A signal stopped a run early; everything done so far is saved.
+    """Raised when a signal has stopped a run early; its progress is saved.
 
     Attributes:
       signal: the signal.
@@ -19,7 +19,7 @@ class Interrupted(Exception):
 
 
 class Interruption:
-    """Notes the first signal inside the `with` block; a second signal kills.
+    """Records the first signal in the `with` block; a second one ends the process.
 
     Attributes:
       signal: the signal that was received, or None.
@@ -30,16 +30,16 @@ class Interruption:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> "Interruption":
-        # Outside the main thread Python accepts no handlers and receives no signals.
+        # Python allows signal handlers only in the main thread.
         with contextlib.suppress(ValueError):
             for number in (signal.SIGINT, signal.SIGTERM):
-                self._before[number] = signal.signal(number, self._note)
+                self._before[number] = signal.signal(number, self._record)
         return self
 
     def __exit__(self, *exception: object) -> None:
         self._restore()
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
+    def _record(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
         self._restore()
 

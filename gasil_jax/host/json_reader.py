@@ -1,4 +1,4 @@
-"""Read a JSON file as a type: the one reader of the JSON files in a run folder."""
+"""Read the JSON files of a run folder, and check their content against a type."""
 
 import dataclasses
 import json
@@ -11,7 +11,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from gasil_jax.errors import InputError, NotImportable
 
-_WORDS = {
+_DESCRIPTIONS = {
     str: "a string",
     int: "a whole number, 0 or more",
     float: "a finite number",
@@ -21,17 +21,17 @@ _WORDS = {
 
 
 def read(path: pathlib.Path, kind: Any) -> Any:
-    """Return the content of a JSON file, whose values are of the kinds that are given.
+    """Return the content of a JSON file, checked against a type.
 
     Args:
       path: the file.
-      kind: a dataclass, of which an instance is returned; a `TypedDict`, whose other
-        names are returned unchecked; a type of JSON, where a whole number is 0 or more
-        and a number finite; or a tuple, a dict or a union of these. Tuples are lists
-        in the file. A value of `Any` is not checked, but its lists become tuples.
+      kind: the type: a dataclass, of which an instance is returned; a `TypedDict`,
+        whose undeclared fields are returned unchecked; str, int (0 or more), float
+        (finite), bool or None; a tuple, which is a list in the file; a dict; a union of
+        these; or `Any`, which is not checked, but whose lists become tuples.
 
     Raises:
-      InputError: if the content is something else; the message names the field.
+      InputError: if the content has another type; the message names the field.
       NotImportable: if it names an agent that can't be imported here.
       OSError: if there is no such file.
     """
@@ -39,16 +39,21 @@ def read(path: pathlib.Path, kind: Any) -> Any:
         return _as(kind, json.loads(path.read_text()), "")
     except NotImportable:
         raise
-    # Deeply nested brackets are a RecursionError.
+    # Deeply nested brackets cause a RecursionError.
     except (ValueError, RecursionError) as error:
         raise InputError(f"{path} is damaged or of another program: {error}") from None
 
 
 def _as(kind: Any, value: Any, name: str) -> Any:
-    """Return a value as a kind.
+    """Return a value of a JSON file as a type; see `read`.
+
+    Args:
+      kind: the type.
+      value: the value.
+      name: name of the field that holds it, such as "config.alpha".
 
     Raises:
-      InputError: if it is something else; the message names it.
+      InputError: if the value has another type.
     """
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
@@ -77,9 +82,9 @@ def _as(kind: Any, value: Any, name: str) -> Any:
                 raise InputError(f"{_join(name, missing[0])} is missing")
             of = lambda key: hints.get(key, Any)
             return {key: _as(of(key), x, _join(name, key)) for key, x in value.items()}
-    elif kind in _WORDS and _is_plain(kind, value):
+    elif kind in _DESCRIPTIONS and _is_plain(kind, value):
         return value
-    raise InputError(f"{name or 'it'} is {value!r}: it must be {_in_words(kind)}")
+    raise InputError(f"{name or 'it'} is {value!r}: it must be {_describe(kind)}")
 
 
 def _with_fields(kind: Any, value: dict[str, Any], name: str) -> Any:
@@ -103,15 +108,15 @@ def _is_plain(kind: Any, value: Any) -> bool:
     return type(value) is kind
 
 
-def _in_words(kind: Any) -> str:
+def _describe(kind: Any) -> str:
     arguments = get_args(kind)
     if get_origin(kind) in (typing.Union, types.UnionType):
         return " or ".join(
-            _in_words(one) for one in arguments if get_origin(one) is not Callable
+            _describe(one) for one in arguments if get_origin(one) is not Callable
         )
     if get_origin(kind) is tuple:
         return "a list"
-    return _WORDS.get(kind, "an object")
+    return _DESCRIPTIONS.get(kind, "an object")
 
 
 def _join(name: str, key: str) -> str:

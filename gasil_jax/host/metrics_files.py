@@ -1,4 +1,4 @@
-"""Write and read the files of a run folder: JSON files and tables in CSV."""
+"""Write JSON files; write and read tables such as metrics.csv."""
 
 import array
 import csv
@@ -32,12 +32,12 @@ COLUMNS = (
     "explained_variance",
 )
 
-#: The columns of metrics.csv that tables and summaries are made from.
+#: The columns of metrics.csv that summaries need.
 SUMMARIZED = ("episode_return", "episode_length", "skipped_updates")
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of Python and the packages; None if not installed."""
+    """Return the versions of Python and packages; None if one is not installed."""
     packages = (
         "gasil_jax",
         "jax",
@@ -63,7 +63,7 @@ def _version(package: str) -> str | None:
 
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file; if that fails, none is left."""
+    """Write a JSON file atomically."""
     text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
     with output_file.atomic(path) as partial:
         partial.write_text(text + "\n")
@@ -80,8 +80,8 @@ def _to_json(value: Any) -> Any:
 class MetricsWriter:
     """Appends a row for each member and iteration to a table such as metrics.csv.
 
-    A value that is not finite (no episode ended yet, no discriminator) is left empty.
-    The others are written so that reading them as float32 gives the same numbers.
+    The cell of a value that is not finite (no episode ended yet, no discriminator) is
+    empty. Reading the others as float32 gives the numbers that were written.
 
     Args:
       path: the file.
@@ -120,8 +120,8 @@ class MetricsWriter:
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
         """Write arrays (members, iterations), one for each metric."""
         if self._columns is None:
-            own = tuple(sorted(set(metrics) - set(self._first)))
-            self._columns = (*self._labels, *self._first, *own)
+            others = tuple(sorted(set(metrics) - set(self._first)))
+            self._columns = (*self._labels, *self._first, *others)
             self._writer.writerow(self._columns)
         members, iterations = metrics["env_steps"].shape
         labels = list(zip(*self._labels.values(), strict=True))
@@ -147,7 +147,7 @@ class MetricsWriter:
 
 
 def _cut(path: pathlib.Path, size: int) -> None:
-    """Shorten a file, and move what is cut off to a new file beside it."""
+    """Shorten a file to `size` bytes, and move the rest to a new file beside it."""
     with path.open("rb+") as file:
         file.seek(size)
         rest = file.read()
@@ -186,8 +186,8 @@ def read_metrics(
       labels: names of the first columns, which are not metrics.
       num_members: number of rows per iteration.
       required: columns that it must have besides "env_steps".
-      unfinished: leave out an iteration at the end that is not whole, because training
-        may be writing it. The result is empty if no iteration is whole yet.
+      unfinished: leave out a last iteration that is incomplete, because training may be
+        writing it. The result is empty if no iteration is complete yet.
 
     Raises:
       InputError: if the file is damaged, has no rows or lacks a column.
@@ -227,8 +227,8 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
     """Return each seed's mean return over the last tenth of iterations, (seeds,).
 
     It also works for other metrics of episodes, such as their length. If no episode of
-    a seed ended in that time (in some tasks all episodes end at once), the result is
-    the value of the last iteration in which one ended; NaN if none ever did.
+    a seed ended in the last tenth (in some tasks all episodes end at once), the result
+    is the value of the last iteration in which one ended; NaN if none ended at all.
     """
     last = returns[:, -max(1, returns.shape[1] // 10) :]
     count = np.isfinite(last).sum(axis=1)

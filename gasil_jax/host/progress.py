@@ -15,7 +15,7 @@ from rich.progress import Progress as RichProgress
 from rich.table import Column
 
 _SECONDS_BETWEEN_LINES = 10.0
-_SECONDS_OF_SILENCE = 1.0
+_SECONDS_BEFORE_ANNOUNCEMENT = 1.0
 
 
 @contextlib.contextmanager
@@ -23,10 +23,10 @@ def announced(title: str, name: str) -> Iterator[None]:
     """Print a line to stderr if the `with` block takes more than a second.
 
     Args:
-      title: name of the program or run, the part before the colon.
-      name: name of the work, the part after the colon.
+      title: name of the program or run; the line is "TITLE: NAME".
+      name: what the block does.
     """
-    timer = threading.Timer(_SECONDS_OF_SILENCE, _line, (title, name))
+    timer = threading.Timer(_SECONDS_BEFORE_ANNOUNCEMENT, _line, (title, name))
     timer.daemon = True
     timer.start()
     try:
@@ -36,7 +36,7 @@ def announced(title: str, name: str) -> Iterator[None]:
 
 
 def _line(title: str, text: str) -> None:
-    # A single write, so that no line of another thread comes in between.
+    # One write, so that other threads' lines are not mixed with it.
     sys.stderr.write(f"{title}: {text}\n")
     sys.stderr.flush()
 
@@ -49,8 +49,8 @@ class Progress:
     Args:
       title: name of what is trained.
       total_steps: environment steps over all members.
-      num_members: number of members; the steps that are shown are those of one.
-      members: what the members are.
+      num_members: number of members; the steps of one member are shown.
+      members: what to call the members.
       shown: whether anything is shown at all.
     """
 
@@ -74,13 +74,13 @@ class Progress:
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = 0
         self._return: str | None = None
-        # Only the bar gives way where the terminal is narrow.
-        whole = Column(no_wrap=True)
+        # In a narrow terminal only the bar shrinks.
+        fixed = Column(no_wrap=True)
         self._bar = RichProgress(
-            SpinnerColumn(table_column=whole),
-            TextColumn("{task.percentage:3.0f}%", table_column=whole),
+            SpinnerColumn(table_column=fixed),
+            TextColumn("{task.percentage:3.0f}%", table_column=fixed),
             BarColumn(bar_width=None, table_column=Column(ratio=1)),
-            TextColumn("{task.fields[status]}", table_column=whole),
+            TextColumn("{task.fields[status]}", table_column=fixed),
             console=self._console,
             disable=not self._live,
             expand=True,
@@ -97,7 +97,7 @@ class Progress:
         self._bar.stop()
 
     def phase(self, name: str, steps: int = 0) -> None:
-        """Show the name of the phase that begins after `steps` environment steps."""
+        """Show the name of a phase that begins after `steps` environment steps."""
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = steps
         self._bar.update(self._task, status=name)
@@ -106,7 +106,7 @@ class Progress:
 
     @contextlib.contextmanager
     def aside(self, name: str) -> Iterator[None]:
-        """Show the name of work between two pieces of training, if it takes long.
+        """Show what the `with` block does, if it takes more than a second.
 
         Its time does not count towards the training speed.
         """
@@ -121,7 +121,7 @@ class Progress:
         self._training_since += time.monotonic() - started
 
     def warn(self, text: str) -> None:
-        """Print a line that stays above the progress."""
+        """Print a warning above the progress."""
         if self._live:
             self._console.print(f"warning: {text}", highlight=False)
         elif self._in_lines:
@@ -141,7 +141,7 @@ class Progress:
             self._return = f"{np.mean(each):.1f}{deviation}"
         now = time.monotonic()
         speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
-        # The last batch may go beyond what was asked for.
+        # The last iteration may go beyond the total.
         steps = min(steps, self._total)
         left = datetime.timedelta(seconds=math.ceil((self._total - steps) / speed))
         status = (

@@ -12,14 +12,13 @@ import jax
 from gasil_jax import train
 from gasil_jax.config import Config
 
-# Measured with XLA's own report, over eight programs with different agents and shapes:
-# besides the states a program needs 7 to 11 times the memory of a batch
-# (tests/host/test_resources.py).
-_BATCHES = 8
-# By the same report an evaluated episode needs 7 (point mass) or 25 (hopper) times the
-# memory of its environment's state.
-_STATES = 7
-# Where the control groups are, and which of them this process is in.
+# Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
+# programs with different agents and shapes (tests/host/test_resources.py).
+_BATCHES_PER_PROGRAM = 8
+# Memory of an evaluated episode, in states of its environment. XLA reports 7 (point
+# mass) and 25 (hopper).
+_STATES_PER_EPISODE = 7
+# The folder of all control groups, and the file that lists those of this process.
 _CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
 _OWN_CONTROL_GROUPS = pathlib.Path("/proc/self/cgroup")
 
@@ -38,7 +37,7 @@ class Need(NamedTuple):
 
 def _size(tree: Any) -> int:
     def bytes_of(leaf: Any) -> int:
-        # A key is two words.
+        # A key consists of two 32-bit words.
         is_key = jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key)
         return math.prod(leaf.shape) * (8 if is_key else leaf.dtype.itemsize)
 
@@ -46,20 +45,20 @@ def _size(tree: Any) -> int:
 
 
 def need(env: Any, config: Config) -> Need:
-    """Return the bytes that one run needs; memory is right within a factor of two."""
+    """Estimate the bytes that one run needs; memory is within a factor of two."""
     state = jax.eval_shape(lambda: train.init(env, config, jax.random.key(0)))
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + env.action_size + 12
     batch = 4 * config.batch_steps * numbers
     # The imitation method's state may be large, and is copied if it is not donated.
-    memory = _size(state) + _size(state.imitation) + _BATCHES * batch
+    memory = _size(state) + _size(state.imitation) + _BATCHES_PER_PROGRAM * batch
     return Need(_size(state), memory)
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
-    """Return the bytes that equal shares on these devices may have together.
+    """Return the free bytes of the devices together; None if unknown.
 
-    The device with the least free memory decides; None if it is unknown.
+    All devices get equal shares, so the one with the least free memory counts.
     """
     if devices[0].platform != "cpu":
         every = [device.memory_stats() or {} for device in devices]
@@ -68,7 +67,7 @@ def available(devices: Sequence[jax.Device]) -> int | None:
         free = [x["bytes_limit"] - x.get("bytes_in_use", 0) for x in every]
         return len(devices) * min(free)
     free = _free_in_control_groups()
-    # On another system the file or the line is missing.
+    # Only Linux has this file and this line.
     with contextlib.suppress(OSError, LookupError):
         text = pathlib.Path("/proc/meminfo").read_text()
         free.append(1024 * int(text.split("MemAvailable:")[1].split()[0]))
@@ -76,7 +75,7 @@ def available(devices: Sequence[jax.Device]) -> int | None:
 
 
 class _Files(NamedTuple):
-    """The names of a control group's files: of its limit, its use and its cache."""
+    """The files of a control group's limit and use, and the field of its cache."""
 
     limit: str
     used: str
@@ -92,10 +91,10 @@ _VERSION_2 = _Files("memory.max", "memory.current", "inactive_file")
 def _free_in_control_groups(
     root: pathlib.Path = _CONTROL_GROUPS, own: pathlib.Path = _OWN_CONTROL_GROUPS
 ) -> list[int]:
-    """Return what is left of the limits of this process' control groups, in bytes.
+    """Return the bytes left below each limit of this process's control groups.
 
-    A group's limit also holds for the groups in it. Files that the kernel only caches
-    count as free.
+    A group's limit also holds for the groups in it. The kernel's cache of files counts
+    as free.
 
     Args:
       root: the folder of all groups.
@@ -104,7 +103,7 @@ def _free_in_control_groups(
     free = []
     try:
         lines = own.read_text().splitlines()
-    except OSError:  # another system
+    except OSError:  # Only Linux has control groups.
         return []
     for line in lines:
         _, controllers, path = line.split(":", 2)
@@ -115,7 +114,7 @@ def _free_in_control_groups(
                 continue
         group = top / path.lstrip("/")
         for folder in (group, *group.parents):
-            # There is no such file, or no limit.
+            # The group may have no such file, or no limit.
             with contextlib.suppress(OSError, ValueError, LookupError):
                 free.append(_free_in(folder, names))
             if folder == top:
@@ -151,7 +150,7 @@ def check_memory(
     one, used = need(env, config), devices[:num_members]
     required, free = _padded(num_members, used) * one.memory, available(used)
     if free is not None and required > free:
-        # All devices have equally many.
+        # Each device trains the same number of members.
         fit = free // len(used) // one.memory * len(used)
         sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
         if fit == 0:
@@ -188,7 +187,7 @@ def check_episodes(
     """
     state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
     used = devices[:num_policies]
-    each, free = _STATES * state * num_episodes, available(used)
+    each, free = _STATES_PER_EPISODE * state * num_episodes, available(used)
     required = _padded(num_policies, used) * each
     if free is not None and required > free:
         raise ValueError(

@@ -21,7 +21,7 @@ def wait_for_text(capsys, seconds=20.0):
 
 
 def test_a_slow_phase_is_announced_in_one_line(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 0.01)
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_ANNOUNCEMENT", 0.01)
     with progress.announced("hopper", "building"):
         assert wait_for_text(capsys) == "hopper: building\n"
     with pytest.raises(OSError, match="full"), progress.announced("hopper", "saving"):
@@ -30,7 +30,7 @@ def test_a_slow_phase_is_announced_in_one_line(monkeypatch, capsys):
 
 
 def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_SECONDS_OF_SILENCE", 600.0)
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_ANNOUNCEMENT", 600.0)
     before = threading.active_count()
     with progress.announced("hopper", "building"):
         assert threading.active_count() == before + 1
