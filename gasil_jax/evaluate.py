@@ -72,10 +72,10 @@ class Options:
       seed: evaluate only this seed; default all seeds.
       episodes: number of episodes for each seed.
       stochastic: draw actions from the policy instead of taking its mean.
-      gymnasium: evaluate in Gymnasium, with C MuJoCo, instead; only for locomotion,
-        with the policy's mean, without delay and noise.
+      gymnasium: evaluate in Gymnasium, with C MuJoCo, without delay and noise. Only for
+        locomotion, and not with stochastic.
       key: random key of the episodes' starts and actions.
-      out: new CSV file to which every episode's return and length are written too.
+      out: new CSV file, to which the return and length of each episode are written.
     """
 
     run: Annotated[pathlib.Path, tyro.conf.Positional]

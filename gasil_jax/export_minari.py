@@ -4,12 +4,12 @@
 
 The data set holds complete episodes, best first. Observations and actions are exact;
 actions are as the policy drew them, before the environment limits them to its range.
-The buffer keeps neither an episode's rewards nor what followed its last action, so the
-following is filled in: the last step's reward is the episode's return, discounted as
-the buffer ranks it, and the others are 0; the final observation repeats the one before
-it; and every episode is marked as truncated. The last episode of a full buffer may be
-cut. It is left out unless it has the environment's full length. The data set's
-description says the same.
+The buffer does not hold an episode's rewards or its final observation, so these are
+filled in: the last step's reward is the episode's return, discounted as the buffer
+ranks it, and the others are 0; the final observation repeats the one before it; and
+every episode is marked as truncated. The last episode of a full buffer may be cut. It
+is left out unless it has the environment's full length. The data set's description says
+the same.
 """
 
 import dataclasses

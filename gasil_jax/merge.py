@@ -23,7 +23,7 @@ class Options:
 
     Attributes:
       folders: the folder of the sweep, which holds shards/; or the folders of all its
-        shards, wherever they have been copied to.
+        shards, which may have been copied elsewhere.
       out: folder to write the tables to; default the folder of the sweep.
     """
 

@@ -22,10 +22,10 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of the runs; each is a curve of its own, even if they differ only
+      runs: folders of the runs. Each run is a separate curve, even if runs differ only
         in their seeds.
       out: image file to write: PNG, PDF or SVG.
-      labels: labels of the runs; default environment and agent.
+      labels: labels of the runs; default "ENVIRONMENT, AGENT".
     """
 
     runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]

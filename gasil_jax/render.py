@@ -46,9 +46,9 @@ class Options:
     Attributes:
       run: folder of the run or sweep, which need not be finished, or zoo:NAME, one of
         the package's policies.
-      out: file to write: .mp4, which needs the package imageio-ffmpeg; .gif; .png, a
-        strip of eight moments in two rows; or, for locomotion, .html, to turn and zoom
-        in a browser.
+      out: file to write: .mp4 (needs the package imageio-ffmpeg), .gif, .png (a strip
+        of eight pictures in two rows) or, for locomotion only, .html (to turn and zoom
+        in a browser).
       seed: seed of the policy; default the run's first seed.
       point: number of a sweep's point in results.csv; default the best by mean.
       checkpoint: checkpoint of the policy: last, or best, which has the best
@@ -77,7 +77,7 @@ def episode(
 ) -> tuple[list[Any], float]:
     """Return the physics states of an episode, from its start on, and its true return.
 
-    A step in which the physics fails ends the episode, and counts in neither.
+    A step in which the physics fails ends the episode; the step is left out of both.
 
     Args:
       env: one environment.
@@ -208,13 +208,13 @@ def write_film(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> 
 def write_strip(
     env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
 ) -> int:
-    """Write up to eight moments of an episode in two rows, each above its time.
+    """Write up to eight pictures of an episode in two rows, each above its time.
 
     The times are large enough to read when the strip, four pictures wide, fills a
     column of a paper.
 
     Returns:
-      The number of moments.
+      The number of pictures.
 
     Raises:
       NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
