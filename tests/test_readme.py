@@ -35,6 +35,8 @@ SMALL = (
 #: What stands for an option's value when a command is run.
 TOY = {
     "--env": "point_mass",
+    # Others may have nothing for it.
+    "--preset": "tuned",
     "--seeds": "2",
     "--episodes": "2",
     "--evaluate-every": "128",

@@ -204,7 +204,7 @@ def test_interrupted_training_is_continued_on_request_only(tmp_path):
 def toy(monkeypatch):
     """A figure of two small curves on the point mass."""
     changes = {**SMALL, "total_steps": 512}
-    curve = Curve("point_mass", "ppo", seeds=2, changes=changes)
+    curve = Curve("point_mass", "ppo", seeds=4, changes=changes)
     other = dataclasses.replace(curve, changes={**curve.changes, "learning_rate": 1e-4})
     figure = Figure("Toy", "None.", {"a": {"x": curve, "y": other}}, favourite="x")
     monkeypatch.setitem(FIGURES, "matrix", figure)
@@ -223,7 +223,7 @@ def test_a_figure_is_trained_from_end_to_end_and_in_shards(toy, tmp_path, capsys
         stored = Store(results / "runs")
         missing.append(set(stored.missing(toy.requested(stored))))
     assert missing[0] and missing[1] and not missing[0] & missing[1]
-    words = f"Not trained yet: {len(missing[1])} of 4 runs."
+    words = f"Not trained yet: {len(missing[1])} of 8 runs."
     assert words in (results / "matrix.md").read_text()
     results = str(tmp_path / "1")
     assert __main__.main(["merge", str(tmp_path / "2"), "--results", results]) == 0
