@@ -317,8 +317,9 @@ _LOGIT, _CENTERED = (
     for form in ("logit", "centered")
 )
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
-#: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
+#: The lambda that the preset `scaled` had on all tasks before it had a rule for it.
 _LAMBDA: Point = {"gae_lambda": 0.95}
+#: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
     "lambda 0.95": lambda size: _LAMBDA,
     "deviation scaled inversely, lambda 0.95": lambda size: {

@@ -178,16 +178,13 @@ def preset(
     ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", str(env), ours, others))
-    if name != DEFAULT and not has_overrides(env, agent, name, reward_delay):
-        delayed, rows = reward_delay > 1, _rows(PRESETS[name], reward_delay)
-        raise ValueError(
-            f"preset {name!r} has nothing for agent {agent!r} on {env} with "
-            f"{'delayed' if delayed else 'dense'} rewards: it has "
-            + (_listed(rows) or f"rows for {'dense' if delayed else 'delayed'} ones")
-        )
-    chosen = PRESETS[name]
-    row = _row(chosen, env, agent, reward_delay)
-    return Config(agent=agent).replace(**{**chosen.every, **row})
+    lacking = describe_lack(env, agent, name, reward_delay)
+    if lacking is not None and name != DEFAULT:
+        other = "dense" if reward_delay > 1 else "delayed"
+        listed = _listed(_rows(name, reward_delay)) or f"rows for {other} ones"
+        raise ValueError(f"{lacking}: it has {listed}")
+    row = _rows(name, reward_delay).get((env, agent), {})
+    return Config(agent=agent).replace(**{**PRESETS[name].every, **row})
 
 
 def _listed(rows: Rows) -> str:
@@ -199,15 +196,19 @@ def _listed(rows: Rows) -> str:
     return "; ".join(words)
 
 
-def has_overrides(env: str, agent: str, name: str, reward_delay: int = 1) -> bool:
-    """Return whether a preset changes any default for an agent on a task."""
-    chosen = PRESETS[name]
-    return bool(chosen.every or _row(chosen, env, agent, reward_delay))
+def describe_lack(env: str, agent: str, name: str, reward_delay: int) -> str | None:
+    """Return in words that a preset changes no default for an agent on a task.
+
+    The result is None if the preset changes any.
+    """
+    if PRESETS[name].every or (env, agent) in _rows(name, reward_delay):
+        return None
+    rewards = "delayed" if reward_delay > 1 else "dense"
+    return (
+        f"preset {name!r} has nothing for agent {agent!r} on {env} with {rewards} "
+        "rewards"
+    )
 
 
-def _row(chosen: Preset, env: str, agent: str, reward_delay: int) -> Overrides:
-    return _rows(chosen, reward_delay).get((env, agent), {})
-
-
-def _rows(chosen: Preset, reward_delay: int) -> Rows:
-    return chosen.delayed if reward_delay > 1 else chosen.dense
+def _rows(name: str, reward_delay: int) -> Rows:
+    return PRESETS[name].delayed if reward_delay > 1 else PRESETS[name].dense

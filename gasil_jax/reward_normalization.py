@@ -83,7 +83,7 @@ def normalize(
 
 
 def clipped(
-    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float = CLIP
+    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float
 ) -> jax.Array:
     """Return the share of rewards other than 0 that `normalize` clips, ().
 

@@ -308,13 +308,9 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
 def note_if_untuned(options: Options) -> None:
     """Print a note if the preset has no values for the agent on the task."""
     agent, delay = options.config.agent, options.settings.reward_delay
-    if not presets.has_overrides(options.env, agent, options.preset, delay):
-        rewards = "delayed" if delay > 1 else "dense"
-        command_line.note(
-            f"preset {options.preset!r} has nothing for agent {agent!r} on "
-            f"{options.env} with {rewards} rewards: each setting that is not given has "
-            "its default"
-        )
+    lacking = presets.describe_lack(options.env, agent, options.preset, delay)
+    if lacking is not None:
+        command_line.note(f"{lacking}: each setting that is not given has its default")
 
 
 def seeds_of(options: Options) -> range:

@@ -52,7 +52,9 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
         )
         scale = plain_scale(reward, reward > 0, 0.99)
         expected = np.mean(payments / scale > 10.0)
-        share[length] = reward_normalization.clipped(normalizer, jnp.asarray(reward))
+        share[length] = reward_normalization.clipped(
+            normalizer, jnp.asarray(reward), 10.0
+        )
         np.testing.assert_allclose(share[length], expected)
         for clip in (10.0, 1e9):
             np.testing.assert_allclose(
@@ -62,7 +64,7 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
             )
     assert share[20] == 0.0 and share[1000] > 0.5
     nothing = jnp.zeros((5, 4))
-    assert np.isnan(reward_normalization.clipped(normalizer, nothing))
+    assert np.isnan(reward_normalization.clipped(normalizer, nothing, 10.0))
 
 
 def test_no_reward_stays_none():
