@@ -191,11 +191,12 @@ def layout(model: mujoco.MjModel) -> Layout:
             model, model.jnt_solref[limited], model.jnt_solimp[limited]
         ),
     )
-    # Which geoms collide, and with which parameters, is for MJX to say.
+    # Which geoms collide, and with which parameters, is for MJX to say. The model is an
+    # argument: MJX would compile each operation on a constant by itself.
     with jax.ensure_compile_time_eval():
-        mjx_model = mjx.put_model(model)
-        collide = jax.jit(lambda data: mjx.collision(mjx_model, data)._impl.contact)
-        contact = jax.tree.map(np.asarray, collide(mjx.make_data(model)))
+        contact = jax.tree.map(
+            np.asarray, _contact(mjx.put_model(model), mjx.make_data(model))
+        )
     motion_normal = _motion_normal(model, contact.geom.reshape(-1, 2))
     pyramid = _PYRAMID if motion_normal is None else _FLAT_PYRAMID
     groups = [
@@ -203,6 +204,13 @@ def layout(model: mujoco.MjModel) -> Layout:
         for dim, edges in ((1, ((),)), (3, pyramid))
     ]
     return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
+
+
+@jax.jit
+def _contact(model: mjx.Model, data: mjx.Data) -> mjx.Contact:
+    """Return MJX's possible contacts, without their present positions."""
+    contact = mjx.collision(model, data)._impl.contact
+    return contact.replace(dist=None, pos=None, frame=None)
 
 
 def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
