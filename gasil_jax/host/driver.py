@@ -31,6 +31,8 @@ from gasil_jax.train import TrainState
 _SECONDS_PER_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
+_Columns = Mapping[str, np.ndarray]
+
 
 @dataclasses.dataclass(frozen=True)
 class CheckpointSchedule:
@@ -103,19 +105,66 @@ class Outcome:
     evaluation_seconds: float | None
 
 
+@dataclasses.dataclass
+class _Training:
+    """Members in training.
+
+    Attributes:
+      members: the members.
+      states: their states, padded once training is compiled; None for the first ones.
+      done: number of iterations so far.
+    """
+
+    members: Members
+    states: Any = None
+    done: int = 0
+    _seconds_per_iteration: float = math.inf
+
+    @property
+    def left(self) -> int:
+        """The number of iterations that are left."""
+        return max(0, self.members.config.num_iterations - self.done)
+
+    def compile(self) -> None:
+        """Compile the training and move the states to the devices."""
+        self.states, self._advance = self.members.compile(self.states)
+
+    def train_chunk(self, most: float) -> _Columns:
+        """Train for some seconds, `most` iterations or fewer; return their metrics."""
+        in_time = max(1, int(_SECONDS_PER_CHUNK / self._seconds_per_iteration))
+        count = int(min(most, in_time, self.left, self.members.chunk))
+        started = time.monotonic()
+        self.states, metrics = self.members.train(
+            self._advance, self.states, self.done, count
+        )
+        self._seconds_per_iteration = (time.monotonic() - started) / count
+        self.done += count
+        return metrics
+
+    def progress(self, metrics: _Columns, evaluation: _Columns | None) -> FitProgress:
+        """Return the progress after a chunk, with its metrics and evaluation."""
+        done, env_steps = self.done, self.done * self.members.config.batch_steps
+        copy_states = lambda: self._copy_states(done)
+        return FitProgress(done, env_steps, metrics, evaluation, copy_states)
+
+    def _copy_states(self, iteration: int) -> TrainState:
+        if iteration != self.done:
+            raise RuntimeError(
+                f"the states of iteration {iteration} are gone: read "
+                "FitProgress.states in the callback"
+            )
+        return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
+
+
 class _Tables:
     """Writes metrics to metrics.csv, scores to evaluations.csv, and both to trackers.
 
-    Args:
-      members: the members that are trained.
-      folder: the folder of the files.
-      labels: columns that identify the members, (members,) each.
-      evaluation_schedule: the times of evaluations; None for none.
-      trackers: trackers that also get the metrics and scores.
-      record: record of the checkpoint that training continues from; None without one.
+    Its arguments are those of `drive`, and the record of the checkpoint that training
+    continues from, None without one.
 
     Attributes:
       evaluation: the periodic evaluation; None for none.
+      score: the mean score of the current policies; None if they are not evaluated.
     """
 
     def __init__(
@@ -129,6 +178,9 @@ class _Tables:
         record: Mapping[str, Any] | None,
     ):
         self._labels, self._trackers = labels, trackers
+        # The finite returns since the last record, after an empty array.
+        self._returns = [np.empty(0, np.float32)]
+        self.score: float | None = None
         path = folder / "metrics.csv"
         size = _recorded_size(path, record)
         self._metrics = metrics_files.MetricsWriter(path, labels, size)
@@ -144,17 +196,41 @@ class _Tables:
                 trackers=trackers,
             )
 
-    def write(self, metrics: Mapping[str, np.ndarray]) -> None:
+    def write(self, metrics: _Columns) -> None:
         """Write and log the metrics of a chunk, (members, iterations) each."""
         self._metrics.write(metrics)
         log(self._trackers, self._labels, metrics)
+        returns = metrics["episode_return"]
+        self._returns.append(returns[np.isfinite(returns)])
 
-    def sizes(self) -> dict[str, int]:
-        """Write everything to the disk; return each file's size in bytes, by name."""
-        sizes = {"metrics_size": self._metrics.size()}
-        if self.evaluation is not None:
-            sizes["evaluations_size"] = self.evaluation.size()
-        return sizes
+    def iterations_left(self, done: int) -> float:
+        """Return the iterations to the next evaluation; infinity if there is none."""
+        evaluation = self.evaluation
+        return math.inf if evaluation is None else evaluation.iterations_left(done)
+
+    def evaluate(self, training: _Training, progress: Progress) -> _Columns | None:
+        """Evaluate the policies if it is time; write, log and return their scores."""
+        self.score = None
+        if self.evaluation is None or not self.evaluation.is_due(training.done):
+            return None
+        with progress.aside("evaluating the policies"):
+            scores = self.evaluation.score(training.states, training.done)
+        self.score = float(scores["mean"].mean(dtype=np.float64))
+        return scores
+
+    def record(self) -> dict[str, Any]:
+        """Write everything to the disk; return a record of it for a checkpoint.
+
+        It has each file's size in bytes and, as "score", the mean score of the current
+        policies or, without evaluations, the mean of all returns since the last record.
+        """
+        record = {"metrics_size": self._metrics.size()}
+        returns = np.concatenate(self._returns)
+        del self._returns[1:]
+        if self.evaluation is None:
+            return record | {"score": float(returns.mean()) if returns.size else None}
+        size = self.evaluation.size()
+        return record | {"evaluations_size": size, "score": self.score}
 
     def close(self) -> None:
         """Close the files and the trackers."""
@@ -171,17 +247,17 @@ class _Checkpoints:
     Args:
       root: the folder of the checkpoints.
       schedule: the times of checkpoints and the number to keep.
-      members: the members that are trained.
+      batch_steps: environment steps of a seed in an iteration.
     """
 
     def __init__(
-        self, root: pathlib.Path, schedule: CheckpointSchedule, members: Members
+        self, root: pathlib.Path, schedule: CheckpointSchedule, batch_steps: int
     ):
-        self.root, self._keep, self._members = root, schedule.keep, members
-        self._interval = None
+        self._root, self._keep, self._interval = root, schedule.keep, None
         if schedule.every is not None:
-            self._interval = math.ceil(schedule.every / members.config.batch_steps)
+            self._interval = math.ceil(schedule.every / batch_steps)
         self._saved_at = time.monotonic()
+        self._best_score = checkpoint.best_score(root)
 
     def iterations_left(self, done: int) -> float:
         """Return the iterations to the next checkpoint; infinity if time decides."""
@@ -189,28 +265,34 @@ class _Checkpoints:
             return math.inf
         return self._interval - done % self._interval
 
-    def is_due(self, done: int) -> bool:
-        """Return whether to write a checkpoint after `done` iterations."""
+    def is_due(self, done: int, score: float | None) -> bool:
+        """Return whether it is time for a checkpoint or the score is the best yet."""
+        if score is not None and score > self._best_score:
+            return True
         if self._interval is None:
             return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
         return done % self._interval == 0
 
-    def save(self, done: int, states: Any, record: Mapping[str, Any]) -> None:
+    def save(self, training: _Training, tables: _Tables, progress: Progress) -> None:
         """Write a checkpoint, and delete older ones that need not be kept."""
-        if not self._keep:
-            return
-        checkpoint.write(self.root, done, self._members.trim(states), record)
-        checkpoint.prune(self.root, self._keep)
-        self._saved_at = time.monotonic()
+        if tables.score is not None:
+            self._best_score = max(self._best_score, tables.score)
+        with progress.aside("saving a checkpoint"):
+            record = tables.record()
+            if self._keep:
+                states = training.members.trim(training.states)
+                checkpoint.write(self._root, training.done, states, record)
+                checkpoint.prune(self._root, self._keep)
+                self._saved_at = time.monotonic()
 
 
 def _restored(
     members: Members, root: pathlib.Path, progress: Progress, tables: Sequence[str]
-) -> tuple[Any, int, Mapping[str, Any] | None]:
-    """Return states, iteration and record of the newest undamaged checkpoint.
+) -> tuple[_Training, Mapping[str, Any] | None]:
+    """Return the training after the newest undamaged checkpoint, and its record.
 
-    Without one they are None, 0 and None. Newer, damaged checkpoints are renamed with a
-    warning, and partial ones are deleted.
+    Without one, training is at its beginning and the record is None. Newer, damaged
+    checkpoints are renamed with a warning, and partial ones are deleted.
 
     Args:
       members: the members to train.
@@ -249,20 +331,15 @@ def _restored(
                 "beginning, and the old tables are kept under other names",
                 file=sys.stderr,
             )
-        return None, 0, None
+        return _Training(members), None
     with progress.aside(f"restoring {newest.folder.name}"):
         with command_line.input_checked():
             states = newest.restore(members.shapes())
-    return states, newest.iteration, newest.record
+    return _Training(members, states, newest.iteration), newest.record
 
 
 def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Return the size in bytes to cut a table to; None if there is no table yet.
-
-    Args:
-      path: the table, such as metrics.csv.
-      record: record of the checkpoint that training continues from; None without one.
-    """
+    """Return the size in bytes to cut a table to; None if there is no table yet."""
     if record is not None:
         return record[f"{path.stem}_size"]
     return 0 if path.exists() else None
@@ -304,11 +381,9 @@ def drive(
         is damaged, or if the folder holds results but no undamaged checkpoint.
       OSError: if the folder can't be written, or if the disk is full.
     """
-    config, last = members.config, members.config.num_iterations
-    steps_of = lambda done: done * config.batch_steps * members.num_members
-    checkpoints = _Checkpoints(folder / "checkpoints", schedule, members)
+    root = folder / "checkpoints"
     names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
-    states, first, record = _restored(members, checkpoints.root, progress, names)
+    training, record = _restored(members, root, progress, names)
     with command_line.input_checked():
         tables = _Tables(
             members,
@@ -319,89 +394,47 @@ def drive(
             record=record,
         )
     on_restored()
-    evaluation = tables.evaluation
-    best_score = checkpoint.best_score(checkpoints.root)
+    checkpoints = _Checkpoints(root, schedule, members.config.batch_steps)
+    first = training.done
+    steps_of = lambda done: steps_before + members.env_steps(done)
 
     started = time.monotonic()
-    if first < last:
-        progress.phase("compiling", steps_before + steps_of(first))
-        states, advance = members.compile(states)
+    if training.left:
+        progress.phase("compiling", steps_of(first))
+        training.compile()
     compile_seconds = time.monotonic() - started
 
-    progress.phase("training", steps_before + steps_of(first))
-    started = time.monotonic()
-    done, seconds_per_iteration = first, math.inf
-    # The returns since the last checkpoint, and the evaluation of the current policies.
-    returns: list[np.ndarray] = []
-    evaluation_score: float | None = None
-
-    def save() -> None:
-        score = _mean(returns) if evaluation is None else evaluation_score
-        with progress.aside("saving a checkpoint"):
-            checkpoints.save(done, states, tables.sizes() | {"score": score})
-
-    def copy_states(iteration: int) -> TrainState:
-        if iteration != done:
-            raise RuntimeError(
-                f"the states of iteration {iteration} are gone: read "
-                "FitProgress.states in the callback"
-            )
-        return jax.tree.map(lambda x: x.copy(), members.trim(states))
-
-    stopped = warned = False
-    while done < last and not stopped and interruption.signal is None:
-        count = min(
-            members.chunk,
-            last - done,
-            max(1, int(_SECONDS_PER_CHUNK / seconds_per_iteration)),
-            checkpoints.iterations_left(done),
-            math.inf if evaluation is None else evaluation.iterations_left(done),
-        )
-        chunk_started = time.monotonic()
-        states, metrics = members.train(advance, states, done, int(count))
-        seconds_per_iteration = (time.monotonic() - chunk_started) / count
-        done += int(count)
+    progress.phase("training", steps_of(first))
+    started, stopped, warned = time.monotonic(), False, False
+    while training.left and not stopped and interruption.signal is None:
+        done = training.done
+        most = min(checkpoints.iterations_left(done), tables.iterations_left(done))
+        metrics = training.train_chunk(most)
         tables.write(metrics)
-        returns.append(metrics["episode_return"])
-        progress.update(steps_before + steps_of(done), metrics["episode_return"])
+        progress.update(steps_of(training.done), metrics["episode_return"])
         if not warned and np.any(metrics["skipped_updates"] > 0):
             warned = True
             progress.warn(
                 "an update was undone because a number in it was not finite: see "
                 "skipped_updates in metrics.csv"
             )
-        save_now, evaluation_score, scores = checkpoints.is_due(done), None, None
-        if evaluation is not None and evaluation.is_due(done):
-            with progress.aside("evaluating the policies"):
-                scores = evaluation.score(states, done)
-            evaluation_score = float(scores["mean"].mean(dtype=np.float64))
-            save_now |= evaluation_score > best_score
-            best_score = max(best_score, evaluation_score)
-        if save_now:
-            save()
-            returns = []
+        scores = tables.evaluate(training, progress)
+        if checkpoints.is_due(training.done, tables.score):
+            checkpoints.save(training, tables, progress)
         if callback is not None:
-            steps = done * config.batch_steps
-            copy = functools.partial(copy_states, done)
-            stopped = bool(callback(FitProgress(done, steps, metrics, scores, copy)))
+            stopped = bool(callback(training.progress(metrics, scores)))
     train_seconds = time.monotonic() - started
-    save()
+    checkpoints.save(training, tables, progress)
     with progress.aside("closing the trackers"):
         tables.close()
-    if interruption.signal is not None and done < last and not stopped:
+    if interruption.signal is not None and training.left and not stopped:
         raise Interrupted(interruption.signal)
+    evaluation = tables.evaluation
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
-        states=members.trim(states),
-        new_steps=steps_of(done - first),
+        states=members.trim(training.states),
+        new_steps=members.env_steps(training.done - first),
         compile_seconds=compile_seconds,
         train_seconds=train_seconds - (evaluation_seconds or 0.0),
         evaluation_seconds=evaluation_seconds,
     )
-
-
-def _mean(returns: Sequence[np.ndarray]) -> float | None:
-    """Return the mean of all finite returns; None if there are none."""
-    finite = [x[np.isfinite(x)] for x in returns]
-    every = np.concatenate(finite) if finite else np.empty(0)
-    return float(every.mean()) if every.size else None

@@ -95,6 +95,10 @@ class Members:
         """The number of members, without the padding."""
         return len(self.seeds)
 
+    def env_steps(self, iterations: int) -> int:
+        """Return the environment steps of all members in some iterations."""
+        return iterations * self.config.batch_steps * self.num_members
+
     @property
     def chunk(self) -> int:
         """The largest number of iterations in one call of `advance`."""
