@@ -172,24 +172,46 @@ class Trained:
         }
 
 
-def write(
-    folder: pathlib.Path,
-    points: Sequence[Point],
-    seeds: Sequence[int],
-    parts: Sequence[Trained],
-) -> dict[str, Any]:
-    """Write results.csv, curves.npz, summary.json and the plots; return the summary.
+@dataclasses.dataclass(frozen=True)
+class _Results:
+    """The results of all points and seeds of a sweep.
 
-    A cell of results.csv is empty where a point does not change the sweep's value.
-    hyperparameters.png is written only if a hyperparameter varies among the points that
-    have a final return.
-
-    Args:
-      folder: folder to write to.
-      points: all points of the sweep.
+    Attributes:
+      points: the points.
       seeds: absolute seed numbers.
-      parts: the finished parts, which together hold every point with every seed.
+      curves: every metric and score by its name in curves.npz, (points, seeds,
+        iterations or evaluations) each.
+      finals: the last columns of results.csv by their names, (points, seeds) each; NaN
+        in seeds in which no episode ended.
+      diverged: whether an update was undone, bool (points, seeds).
     """
+
+    points: Sequence[Point]
+    seeds: Sequence[int]
+    curves: dict[str, Any]
+    finals: dict[str, np.ndarray]
+    diverged: np.ndarray
+
+    @property
+    def names(self) -> list[str]:
+        """The names of all values that points change."""
+        return sorted({name for point in self.points for name in point})
+
+    @property
+    def mean(self) -> np.ndarray:
+        """The mean final return of each point, (points,); NaN where it is unknown."""
+        return self.finals["final_return"].mean(axis=1)
+
+    @property
+    def ended(self) -> list[int]:
+        """The indices of the points that have a mean final return."""
+        return np.flatnonzero(np.isfinite(self.mean)).tolist()
+
+
+def _results(
+    points: Sequence[Point], seeds: Sequence[int], parts: Sequence[Trained]
+) -> _Results:
+    """Return the results that the tables of a sweep's parts hold."""
     members: dict[Member, dict[str, np.ndarray]] = {}
     evaluations: dict[Member, dict[str, np.ndarray]] = {}
     for part in parts:
@@ -201,7 +223,6 @@ def write(
         [metrics_files.final_returns(of_point(name, i)) for i in range(len(points))]
     )
     final, length = finals_of("episode_return"), finals_of("episode_length")
-    # (points, seeds) each, for columns and fields of the same names.
     finals = {"final_return": final, "final_length": length}
     if evaluations:
         scores = _curves(points, seeds, evaluations)
@@ -211,45 +232,93 @@ def write(
             [[last((i, seed)) for seed in seeds] for i in range(len(points))]
         )
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
-    names = sorted({name for point in points for name in point})
-    with (
-        output_file.atomic(folder / "results.csv") as partial,
-        partial.open("w", newline="") as file,
-    ):
-        writer = csv.writer(file)
-        writer.writerow([*LABELS, *names, *finals, "diverged"])
-        for index, point in enumerate(points):
-            own = [point.get(name, "") for name in names]
-            for position, seed in enumerate(seeds):
-                values = (x[index, position] for x in finals.values())
-                cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
-                bad = int(diverged[index, position])
-                writer.writerow([index, seed, *own, *cells, bad])
+    return _Results(points, seeds, curves, finals, diverged)
+
+
+def write(
+    folder: pathlib.Path,
+    points: Sequence[Point],
+    seeds: Sequence[int],
+    parts: Sequence[Trained],
+) -> dict[str, Any]:
+    """Write results.csv, curves.npz, summary.json and the plots; return the summary.
+
+    hyperparameters.png is written only if a hyperparameter varies among the points that
+    have a final return.
+
+    Args:
+      folder: folder to write to.
+      points: all points of the sweep.
+      seeds: absolute seed numbers.
+      parts: the finished parts, which together hold every point with every seed.
+    """
+    results = _results(points, seeds, parts)
+    _write_results(folder / "results.csv", results)
     with output_file.atomic(folder / "curves.npz") as partial:
-        np.savez_compressed(partial, **curves)
+        np.savez_compressed(partial, **results.curves)
+    varied = _varied(parts, results.names, results.ended)
     trainings = [training for part in parts for training in part.trainings()]
+    summary = _summary(results, varied, trainings)
+    metrics_files.write_json(folder / "summary.json", summary)
+    with output_file.atomic(folder / "sweep.png") as partial:
+        final, best = results.finals["final_return"], summary["best_by_mean"]
+        plotting.final_returns(partial, _labels(points), final, best)
+    if varied:
+        with output_file.atomic(folder / "hyperparameters.png") as partial:
+            _draw_hyperparameters(partial, results, varied, summary)
+    return summary
+
+
+def _write_results(path: pathlib.Path, results: _Results) -> None:
+    """Write results.csv, a row for each point and seed.
+
+    A cell is empty where a point does not change the sweep's value, or where a final
+    value is NaN.
+    """
+    names = results.names
+    with output_file.atomic(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow([*LABELS, *names, *results.finals, "diverged"])
+        for index, point in enumerate(results.points):
+            own = [point.get(name, "") for name in names]
+            for position, seed in enumerate(results.seeds):
+                values = (x[index, position] for x in results.finals.values())
+                cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
+                bad = int(results.diverged[index, position])
+                writer.writerow([index, seed, *own, *cells, bad])
+
+
+def _summary(
+    results: _Results,
+    varied: Mapping[str, Sequence[Any]],
+    trainings: Sequence[Mapping[str, Any]],
+) -> dict[str, Any]:
+    """Return the content of summary.json.
+
+    Args:
+      results: the results.
+      varied: the values of the hyperparameters that vary, from `_varied`.
+      trainings: what `Trained.trainings` returns, for all parts.
+    """
+    mean, diverged = results.mean, results.diverged
+    others = dict(results.finals)
+    final = others.pop("final_return")
     sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
     best = lambda scores: int(sound[scores[sound].argmax()]) if sound.size else None
-    mean = final.mean(axis=1)
-    ended = [i for i in range(len(points)) if math.isfinite(mean[i])]
-    varied = _varied(parts, names, ended)
-    shares = {name: importance(values, mean[ended]) for name, values in varied.items()}
+    returns = mean[results.ended]
+    shares = {name: importance(values, returns) for name, values in varied.items()}
     # The estimate is noisy and may be below 0.
     shares = {name: x if x is None else max(0.0, x) for name, x in shares.items()}
-    summary = {
+    return {
         "points": [
             {
                 **point,
                 "mean": _finite(mean[i]),
                 "worst_seed": _finite(final[i].min()),
-                **{
-                    name: _finite(values[i].mean())
-                    for name, values in finals.items()
-                    if name != "final_return"
-                },
+                **{name: _finite(values[i].mean()) for name, values in others.items()},
                 "diverged_seeds": int(diverged[i].sum()),
             }
-            for i, point in enumerate(points)
+            for i, point in enumerate(results.points)
         ],
         "best_by_mean": best(mean),
         "best_by_worst_seed": best(final.min(axis=1)),
@@ -257,21 +326,24 @@ def write(
         **speed(trainings),
         "versions": _joined([training["versions"] for training in trainings]),
     }
-    metrics_files.write_json(folder / "summary.json", summary)
-    chosen = summary["best_by_mean"]
-    with output_file.atomic(folder / "sweep.png") as partial:
-        plotting.final_returns(partial, _labels(points), final, chosen)
-    if varied:
-        with output_file.atomic(folder / "hyperparameters.png") as partial:
-            plotting.marginals(
-                partial,
-                varied,
-                mean[ended],
-                shares,
-                best=None if chosen is None else ended.index(chosen),
-                left_out=len(points) - len(ended),
-            )
-    return summary
+
+
+def _draw_hyperparameters(
+    path: pathlib.Path,
+    results: _Results,
+    varied: Mapping[str, Sequence[Any]],
+    summary: Mapping[str, Any],
+) -> None:
+    """Draw the mean final returns over each hyperparameter that `_varied` returns."""
+    ended, best = results.ended, summary["best_by_mean"]
+    plotting.marginals(
+        path,
+        varied,
+        results.mean[ended],
+        summary["importance"],
+        best=None if best is None else ended.index(best),
+        left_out=len(results.points) - len(ended),
+    )
 
 
 def _varied(
