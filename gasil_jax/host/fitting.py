@@ -86,7 +86,7 @@ def fit(
       Interrupted: if a folder is given and SIGINT or SIGTERM was received; a checkpoint
         was written first.
       OSError: if the folder can't be written.
-      ValueError: if a value is not allowed, or if the folder holds something else.
+      ValueError: if a value is not allowed, or if the folder holds other files.
     """
     members = make_members(env, config, _numbers(seeds))
     for name, value in (
@@ -176,7 +176,7 @@ def _opened(
     Yields a function that writes fit.json, to call when training continues.
 
     Raises:
-      ValueError: if the folder can't be written, is in use, or holds something else.
+      ValueError: if the folder can't be written, is in use, or holds other files.
     """
     path = folder / _DESCRIPTION
     with contextlib.ExitStack() as stack:

@@ -41,7 +41,9 @@ def read(path: pathlib.Path, kind: Any) -> Any:
         raise
     # Deeply nested brackets cause a RecursionError.
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is damaged or of another program: {error}") from None
+        raise InputError(
+            f"{path} is damaged, or another program wrote it: {error}"
+        ) from None
 
 
 def _as(kind: Any, value: Any, name: str) -> Any:

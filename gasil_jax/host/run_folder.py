@@ -250,7 +250,9 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         validate(description["config"])
         check_seeds(description["seeds"], description["first_seed"])
     except ValueError as error:
-        raise InputError(f"{path} is damaged or of another program: {error}") from None
+        raise InputError(
+            f"{path} is damaged, or another program wrote it: {error}"
+        ) from None
     return description
 
 

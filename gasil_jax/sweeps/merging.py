@@ -99,7 +99,7 @@ def _refuse_used(out: pathlib.Path, shard: StoredRun) -> None:
     else:
         used = any(path.name not in ("shards", ".lock") for path in out.iterdir())
     if used:
-        raise InputError(f"out is {out}, which holds something else: name another")
+        raise InputError(f"out is {out}, which holds other files: name another folder")
 
 
 def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
@@ -111,7 +111,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
 
     Raises:
       InputError: if a shard is missing, unfinished or of another sweep, or if `out`
-        holds something else.
+        holds other files.
     """
     every = _read_all(folders)
     description = every[0].description

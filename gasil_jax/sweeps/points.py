@@ -75,7 +75,7 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
     """Return the points that a JSON file lists, for an agent.
 
     Raises:
-      InputError: if the file can't be read or holds something else.
+      InputError: if the file can't be read or is not a list of points.
     """
     try:
         points = json.loads(path.read_text())
@@ -130,7 +130,7 @@ def check_point(point: Point, agent: str) -> None:
 
 def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> None:
     """Raise `InputError` if the points in a config.json do not fit its config."""
-    with _errors_name(f"{path} is damaged or of another program: points"):
+    with _errors_name(f"{path} is damaged, or another program wrote it: points"):
         for point in points:
             check_point(point, config.agent)
             validate(config.replace(**point))

@@ -135,9 +135,9 @@ def load(
     """
     description = run_folder.read(folder)
     saved = find(folder, description, point)
-    chosen, damages = checkpoint.latest(saved.root)
-    for damage in damages:
-        print(f"warning: {damage}", file=sys.stderr)
+    chosen, errors = checkpoint.latest(saved.root)
+    for error in errors:
+        print(f"warning: {error}", file=sys.stderr)
     config, count = saved.program.config, len(saved.program.members)
     if which == "best":
         if len(saved.indices) < count:

@@ -320,7 +320,7 @@ def test_a_foreign_run_folder_is_refused(content, tmp_path, capsys):
         assert main(arguments) == 2
         error = capsys.readouterr().err
         assert len(error.splitlines()) == 1
-        assert "damaged or of another program" in error
+        assert "is damaged, or another program wrote it" in error
 
 
 def test_an_unknown_preset_of_a_run_is_refused(tmp_path, capsys):

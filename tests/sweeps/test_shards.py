@@ -186,16 +186,16 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     # Never onto another sweep or anything else.
     whole = tmp_path / "whole"
     train(whole)
-    assert "holds something else" in refused(out, "--out", whole)
+    assert "holds other files" in refused(out, "--out", whole)
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "results.csv").touch()
-    assert "holds something else" in refused(out, "--out", tmp_path / "thesis")
+    assert "holds other files" in refused(out, "--out", tmp_path / "thesis")
     described = json.loads((first.folder / "config.json").read_text())
     alone = {field.name for field in dataclasses.fields(run_options.Options)}
     of_a_run = {name: x for name, x in described.items() if name in alone}
     (tmp_path / "run").mkdir()
     (tmp_path / "run" / "config.json").write_text(json.dumps(of_a_run))
-    assert "holds something else" in refused(out, "--out", tmp_path / "run")
+    assert "holds other files" in refused(out, "--out", tmp_path / "run")
     assert not (out / "results.csv").exists()
     # On each host the expert's file may be another one.
     kept = (second / "config.json").read_text()
