@@ -78,7 +78,7 @@ class Episode(NamedTuple):
 
 
 def episodes(
-    buffer: GoodTrajectories, max_episode_steps: int, max_steps: float | None = None
+    buffer: GoodTrajectories, max_episode_steps: int, max_steps: float
 ) -> list[Episode]:
     """Return the buffer's complete episodes, best first.
 
@@ -94,8 +94,8 @@ def episodes(
         Episode(observation[start:end], action[start:end], float(buffer.return_[start]))
         for start, end in itertools.pairwise(bounds)
     ]
-    most = buffer.capacity if max_steps is None else min(buffer.capacity, max_steps)
-    if size >= int(most) and len(complete[-1].action) < max_episode_steps:
+    most = min(buffer.capacity, int(max_steps))
+    if size >= most and len(complete[-1].action) < max_episode_steps:
         complete.pop()
     return complete
 

@@ -201,7 +201,8 @@ def insert(
     good_trajectories: GoodTrajectories,
     history: History,
     episodes: Episodes,
-    max_steps: jax.Array | float | None = None,
+    *,
+    max_steps: jax.Array | float,
     max_episodes: int | None = None,
 ) -> GoodTrajectories:
     """Return the buffer with the best of its own and the offered episodes.
@@ -211,8 +212,8 @@ def insert(
       history: the history that holds the steps of the offered episodes.
       episodes: the offered episodes. Those whose return is not finite are rejected. The
         return of an episode with a number that is not finite must not be finite either.
-      max_steps: a capacity () below the buffer's, which may be traced. It must be the
-        same in all insertions into a buffer.
+      max_steps: number of steps to keep at most, (), which may be traced; the buffer's
+        capacity if that is lower. It must be the same in all insertions into a buffer.
       max_episodes: number of episodes to keep at most; None for any number.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
@@ -239,8 +240,7 @@ def insert(
         length = length.at[order[max_episodes:]].set(0)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
-    if max_steps is not None:
-        size = jnp.minimum(size, jnp.asarray(max_steps, jnp.int32))
+    size = jnp.minimum(size, jnp.asarray(max_steps, jnp.int32))
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]

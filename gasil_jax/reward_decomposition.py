@@ -170,24 +170,24 @@ def window_sums(
     return total, length, running
 
 
-def share_evenly(rest: jax.Array, ends: jax.Array) -> jax.Array:
-    """Return for each step the share at the end of its window.
+def at_window_end(values: jax.Array, ends: jax.Array) -> jax.Array:
+    """Return for each step the value at the end of its window.
 
     Args:
-      rest: float32 (T, N), the share of each step of a window, read where it ends.
+      values: float32 (T, N); only those where a window ends are used.
       ends: bool (T, N), whether a window ends with this step.
 
     Returns:
       float32 (T, N); 0 in steps of a window that does not end in the batch.
     """
 
-    def backward(share: jax.Array, now: Any) -> Any:
-        rest, ends = now
-        share = jnp.where(ends, rest, share)
-        return share, share
+    def backward(later: jax.Array, now: Any) -> Any:
+        value, ends = now
+        value = jnp.where(ends, value, later)
+        return value, value
 
-    start = jnp.zeros_like(rest[0])
-    return jax.lax.scan(backward, start, (rest, ends), reverse=True)[1]
+    start = jnp.zeros_like(values[0])
+    return jax.lax.scan(backward, start, (values, ends), reverse=True)[1]
 
 
 def goodness_of_fit(
@@ -299,8 +299,8 @@ def decompose(
     # shares of steps in earlier batches are lost.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
-    rest = jnp.where(scored, (batch.reward - total) / length, 0.0)
-    reward = reward + share_evenly(rest, ends)
+    share = jnp.where(scored, (batch.reward - total) / length, 0.0)
+    reward = reward + at_window_end(share, ends)
     reward = jnp.where(ends & (length == 1), batch.reward, reward)
     reward = jnp.where(batch.faulty, 0.0, reward)
     decomposition = decomposition.replace(

@@ -15,9 +15,6 @@ from flax import struct
 
 from gasil_jax import normalization
 
-#: Baselines clip normalized rewards to plus and minus this number.
-CLIP = 10.0
-
 
 class RewardNormalizer(struct.PyTreeNode):
     """The running sums and their moments, from which the scale is computed.
@@ -71,7 +68,7 @@ def scale(normalizer: RewardNormalizer) -> jax.Array:
 
 
 def normalize(
-    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float = CLIP
+    normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float
 ) -> jax.Array:
     """Return rewards of any shape divided by `scale` and clipped to +-`clip`.
 

@@ -345,8 +345,8 @@ def update_good_trajectories(
         state.good_trajectories,
         history,
         episodes,
-        hyperparameters.buffer_steps,
-        config.buffer_episodes,
+        max_steps=hyperparameters.buffer_steps,
+        max_episodes=config.buffer_episodes,
     )
 
 

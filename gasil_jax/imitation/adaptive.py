@@ -26,12 +26,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import good_trajectories, reward_normalization
-from gasil_jax.config import Config
+from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.imitation import adversarial
 from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
 from gasil_jax.learner import Learner
 from gasil_jax.rollout import Rollout
 
+# The hyperparameter's own value clips only the environment's rewards.
+_BONUS_CLIP = Hyperparameters.reward_clip
 # Decay of the moving mean of the policy's returns, for each new episode.
 _DECAY = 0.9
 # The gap is 1 if the buffer is better by at least this share of its own return.
@@ -114,7 +116,7 @@ def _update_and_reward(
     )
     metrics["bonus"] = jnp.mean(bonus)
     metrics["bonus_deviation"] = jnp.std(bonus)
-    normalized = reward_normalization.normalize(normalizer, bonus)
+    normalized = reward_normalization.normalize(normalizer, bonus, _BONUS_CLIP)
     streams = jnp.stack([batch.reward, normalized], axis=-1)
     state = Adaptive(discriminator, normalizer, policy_return, has_episodes)
     return state, streams, metrics

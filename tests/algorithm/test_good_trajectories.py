@@ -41,7 +41,7 @@ def push(
     ended,
     return_,
     length,
-    max_steps=None,
+    max_steps=CAPACITY,
     max_episodes=None,
 ):
     action = -observation
@@ -50,7 +50,7 @@ def push(
     )
     episodes = good_trajectories.ended_episodes(history, ended, return_, length)
     buffer = good_trajectories.insert(
-        buffer, history, episodes, max_steps, max_episodes
+        buffer, history, episodes, max_steps=max_steps, max_episodes=max_episodes
     )
     return buffer, history
 

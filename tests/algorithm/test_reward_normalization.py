@@ -34,7 +34,8 @@ def test_batches_give_the_scale_of_all_steps():
         np.testing.assert_allclose(
             reward_normalization.scale(normalizer), expected, rtol=1e-4
         )
-    normalized = reward_normalization.normalize(normalizer, jnp.array([30.0, -1e9]))
+    rewards = jnp.array([30.0, -1e9])
+    normalized = reward_normalization.normalize(normalizer, rewards, 10.0)
     np.testing.assert_allclose(normalized, [30.0 / expected, -10.0], rtol=1e-4)
 
 
@@ -72,7 +73,7 @@ def test_no_reward_stays_none():
     normalizer = reward_normalization.update(
         reward_normalization.init(2), nothing, nothing > 0, 0.99
     )
-    assert not np.any(reward_normalization.normalize(normalizer, nothing))
+    assert not np.any(reward_normalization.normalize(normalizer, nothing, 10.0))
 
 
 def test_without_normalization_there_is_no_scale():

@@ -95,8 +95,9 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
 
 
 def test_the_last_episode_of_a_buffer_is_kept_if_it_is_whole():
-    lengths = lambda kept, *limits: [
-        len(episode.action) for episode in export_minari.episodes(kept, *limits)
+    lengths = lambda kept, limit, max_steps=100: [
+        len(episode.action)
+        for episode in export_minari.episodes(kept, limit, max_steps)
     ]
     full = buffer((30, 20, 50), (3.0, 2.0, 1.0), 100, 4, 2)
     assert lengths(full, 1000) == [30, 20]
