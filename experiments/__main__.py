@@ -227,12 +227,9 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
 }
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> int | None:
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print("python -m experiments NAME (--help for its options)\n")
@@ -245,10 +242,10 @@ def _main(arguments: Sequence[str] | None) -> int | None:
         _train(name, command_line.parse(Options, rest, f"experiments {name}"))
     elif name in COMMANDS:
         options, function = COMMANDS[name]
-        return function(command_line.parse(options, rest, f"experiments {name}"))
+        return function(command_line.parse(options, rest, f"experiments {name}")) or 0
     else:
         raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
-    return None
+    return 0
 
 
 if __name__ == "__main__":

@@ -121,12 +121,9 @@ def _score_in_gymnasium(options: Options, policies: Policies) -> dict[str, np.nd
     return jax.tree.map(lambda *x: np.stack(x), *scores)
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.evaluate")
     command_line.check_minimum(options, episodes=1)
     command_line.check_key(options.key)
@@ -164,6 +161,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     if options.out is not None:
         _write(options.out, seeds, scores)
         print(f"in {options.out}")
+    return 0
 
 
 def _write(

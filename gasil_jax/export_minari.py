@@ -172,12 +172,9 @@ def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
         raise
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
     check_name(options.name)
     env, config, seeds, states = saved_states.load(
@@ -209,6 +206,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     write(options.name, complete, algorithm_name=config.agent, description=description)
     steps = sum(len(episode.action) for episode in complete)
     print(f"{len(complete)} episodes, {steps} steps in {options.name}")
+    return 0
 
 
 if __name__ == "__main__":

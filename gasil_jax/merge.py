@@ -31,12 +31,9 @@ class Options:
     out: pathlib.Path | None = None
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.merge")
     if not options.folders:
         raise InputError(
@@ -55,6 +52,7 @@ def _main(arguments: Sequence[str] | None) -> None:
     summary = merging.merge(options.folders, out)
     points = run_folder.read(out)["points"]
     print(*tables.report(points, summary), f"in {out}", sep="\n")
+    return 0
 
 
 if __name__ == "__main__":

@@ -153,12 +153,9 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
     profile.set(xlabel="final return", ylabel="share of seeds above", ylim=(0, 1.03))
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.plot")
     labels = options.labels or (None,) * len(options.runs)
     if not options.runs:
@@ -180,6 +177,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         interval = f"{low:.1f} to {high:.1f}"
         print(f"{run.label:30} {len(run.final):6} {middle:19.1f}  {interval}")
     print(f"in {options.out}")
+    return 0
 
 
 if __name__ == "__main__":

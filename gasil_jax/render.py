@@ -244,12 +244,9 @@ def write_strip(
     return len(steps)
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = command_line.parse(Options, arguments, "gasil_jax.render")
     output_file.check(options.out, (*_PICTURES, _PAGE))
     if options.out.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
@@ -296,6 +293,7 @@ def _main(arguments: Sequence[str] | None) -> None:
         f"seed {seeds[0]}: return {total:.1f} in {len(states) - 1} steps, "
         f"{num_frames} frames in {options.out}"
     )
+    return 0
 
 
 if __name__ == "__main__":

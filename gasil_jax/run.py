@@ -162,12 +162,9 @@ def _recorded(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
         return trained
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
@@ -196,6 +193,7 @@ def _main(arguments: Sequence[str] | None) -> None:
             f"skipped_updates (learning) in {folder / 'summary.json'}",
             file=sys.stderr,
         )
+    return 0
 
 
 if __name__ == "__main__":

@@ -118,17 +118,14 @@ def train(
     )
 
 
+@command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
-    return command_line.exit_status(lambda: _main(arguments))
-
-
-def _main(arguments: Sequence[str] | None) -> None:
     given, others = _process_options(arguments)
     if given.launcher is not None:
         options = run_options.parse(Options, arguments, _PROGRAM)
         _launch(options, given.launcher, others)
-        return
+        return 0
     if given.shard is not None:
         shard = shards.parse(given.shard)
         folder = _shard_folder(shard, given.out)
@@ -136,13 +133,14 @@ def _main(arguments: Sequence[str] | None) -> None:
         if given.resume and run_folder.has_run(folder):
             resumed = StoredRun(folder, run_folder.read(folder))
         _train_shard(arguments, shard, folder, resumed)
-        return
+        return 0
     resumed = run_options.resumed_run(arguments)
     if resumed is not None and (text := resumed.description.get("shard")):
         _train_shard(arguments, shards.parse(text), resumed.folder, resumed)
     else:
         options = run_options.parse(Options, arguments, _PROGRAM, resumed)
         _train_whole(options, resumed)
+    return 0
 
 
 def _process_options(

@@ -4,13 +4,14 @@ import contextlib
 import dataclasses
 import difflib
 import errno
+import functools
 import io
 import itertools
 import re
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar, get_origin, get_type_hints
+from typing import Any, ParamSpec, TypeVar, get_origin, get_type_hints
 
 import tyro
 from tyro.constructors import (
@@ -23,6 +24,7 @@ from gasil_jax.config import Schedule
 from gasil_jax.errors import InputError
 from gasil_jax.host.interruption import Interrupted
 
+P = ParamSpec("P")
 T = TypeVar("T")
 
 _REGISTRY = ConstructorRegistry()
@@ -240,25 +242,29 @@ def check_key(key: int) -> None:
         raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")
 
 
-def exit_status(work: Callable[[], int | None]) -> int:
-    """Call the function of a command, print its errors and return the exit status.
+def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
+    """Decorate a command's `main`: print its errors and return their exit status.
 
-    Returns:
-      The status that the function returns, or 0 if it returns None; 1 if a folder or
-      file can't be read or written, or if a program that it started failed; 2 for bad
-      input, which includes a file name that is too long; 128 plus the signal's number
-      if it was interrupted.
+    The status is 1 if a folder or file can't be read or written, or if a program that
+    it started failed; 2 for bad input, which includes a file name that is too long; and
+    128 plus the signal's number if it was interrupted. Without an error it is what
+    `main` returns.
     """
-    try:
-        return work() or 0
-    except (InputError, OSError) as error:
-        print(f"error: {error}", file=sys.stderr)
-        too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-        return 2 if too_long or isinstance(error, InputError) else 1
-    except Interrupted as interrupted:
-        print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
-        return 128 + interrupted.signal
-    # Ctrl-C outside of training, or for the second time during it.
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        return 128 + signal.SIGINT
+
+    @functools.wraps(main)
+    def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
+        try:
+            return main(*args, **kwargs)
+        except (InputError, OSError) as error:
+            print(f"error: {error}", file=sys.stderr)
+            too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
+            return 2 if too_long or isinstance(error, InputError) else 1
+        except Interrupted as interrupted:
+            print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
+            return 128 + interrupted.signal
+        # Ctrl-C outside of training, or for the second time during it.
+        except KeyboardInterrupt:
+            print("interrupted", file=sys.stderr)
+            return 128 + signal.SIGINT
+
+    return reporting

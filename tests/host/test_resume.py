@@ -233,7 +233,7 @@ def test_ctrl_c_before_training_is_one_line(capsys):
     def work():
         raise KeyboardInterrupt
 
-    assert command_line.exit_status(work) == 130
+    assert command_line.reports_errors(work)() == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
