@@ -29,10 +29,12 @@ class Need(NamedTuple):
     Attributes:
       state: size of its `TrainState`, which is the size of a checkpoint.
       memory: memory during training.
+      largest_part: what most of the memory is for, in words.
     """
 
     state: int
     memory: int
+    largest_part: str
 
 
 def _size(tree: Any) -> int:
@@ -49,10 +51,19 @@ def need(env: Any, config: Config) -> Need:
     state = jax.eval_shape(lambda: train.init(env, config, jax.random.key(0)))
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + env.action_size + 12
-    batch = 4 * config.batch_steps * numbers
+    batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
     # The imitation method's state may be large, and is copied if it is not donated.
-    memory = _size(state) + _size(state.imitation) + _BATCHES_PER_PROGRAM * batch
-    return Need(_size(state), memory)
+    memory = _size(state) + _size(state.imitation) + batches
+    episodes = (state.environments, state.history, state.reward_decomposition)
+    parts = {
+        f"batches, with batch_steps {config.batch_steps}": batches,
+        f"running episodes, with num_envs {config.num_envs}": _size(episodes),
+        "good trajectories, with buffer_steps "
+        f"{config.hyperparameters.buffer_steps}": _size(state.good_trajectories),
+        f"the state of agent {config.agent!r}": 2 * _size(state.imitation),
+        "networks": _size(state.actor_critic),
+    }
+    return Need(_size(state), memory, max(parts, key=lambda part: parts[part]))
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
@@ -152,12 +163,12 @@ def check_memory(
     if free is not None and required > free:
         # Each device trains the same number of members.
         fit = free // len(used) // one.memory * len(used)
-        sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
         if fit == 0:
             raise ValueError(
-                f"with {sizes} a single seed needs about {_in_words(one.memory)} of "
-                f"memory, and {_in_words(free)} are free: both must be smaller"
+                f"a single seed needs about {_in_words(one.memory)} of memory, and "
+                f"{_in_words(free)} are free: most is for {one.largest_part}"
             )
+        sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
             f"{_in_words(required)} of memory, {_in_words(one.memory)} each with "
