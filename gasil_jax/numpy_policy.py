@@ -112,8 +112,8 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
     path = _file(path)
     if not path.exists():
         raise ValueError(
-            f"{path} does not exist: it must be a saved policy, which a run has when "
-            "it is finished"
+            f"{path} does not exist: it must be a finished run's folder or its "
+            f"policy.npz, or {ZOO_PREFIX}NAME"
         )
     try:
         arrays = npz.read(path)
@@ -127,7 +127,8 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
     if seed is None:
         seed = seeds[int(np.argmax(returns))]
     if seed not in seeds:
-        raise ValueError(f"seed is {seed}: {path} has {', '.join(map(str, seeds))}")
+        listed = ", ".join(map(str, seeds))
+        raise ValueError(f"seed is {seed}: {path} has a policy of {listed}")
     index = seeds.index(seed)
     return {name: value[index] for name, value in arrays.items()} | shared
 
@@ -141,7 +142,13 @@ def mean_and_log_std(
       weights: the arrays from `read`.
       observation: (..., obs), not normalized.
       xp: the array module, numpy or jax.numpy.
+
+    Raises:
+      ValueError: if the observation has another size than the policy's.
     """
+    size = weights["mean"].shape[-1]
+    if (shape := np.shape(observation))[-1:] != (size,):
+        raise ValueError(f"observation has shape {shape}: it must be (..., {size})")
     x = (observation - weights["mean"]) / weights["scale"]
     x = xp.clip(x, -CLIP, CLIP)
     last = sum(name.startswith("kernel_") for name in weights) - 1

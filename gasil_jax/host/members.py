@@ -20,7 +20,14 @@ from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
 
 
 def member(states: Any, index: int) -> Any:
-    """Return the state of one member: entry `index` of the first axis of each leaf."""
+    """Return the state of one member: entry `index` of the first axis of each leaf.
+
+    Raises:
+      IndexError: if there is no such entry. JAX alone would return the last one.
+    """
+    count = jax.tree.leaves(states)[0].shape[0]
+    if not isinstance(index, jax.Array) and not -count <= index < count:
+        raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
 
 

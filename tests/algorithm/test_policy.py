@@ -80,9 +80,9 @@ def test_it_needs_no_jax(saved):
 
 def test_bad_files_and_seeds_are_refused(saved, tmp_path):
     _, _, _, folder = saved
-    with pytest.raises(ValueError, match=r"seed is 9: .* has 5, 6, 7"):
+    with pytest.raises(ValueError, match=r"seed is 9: .* has a policy of 5, 6, 7"):
         gasil_jax.load_policy(folder, 9)
-    with pytest.raises(ValueError, match="does not exist: it must be a saved policy"):
+    with pytest.raises(ValueError, match="does not exist: it must be a finished run"):
         gasil_jax.load_policy(tmp_path)
     whole = (folder / "policy.npz").read_bytes()
     for content in (b"", whole[: len(whole) // 2], b"\x80\x04N."):
@@ -101,8 +101,19 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
             gasil_jax.load_policy(tmp_path)
 
 
+def test_an_observation_of_another_size_is_refused(saved):
+    # One number would otherwise be taken as all of them.
+    for act in (gasil_jax.load_policy(saved[-1]), numpy_policy.load(saved[-1])):
+        for observation in (np.float32(0), np.zeros(1), np.zeros((11, 2))):
+            with pytest.raises(ValueError, match=r"it must be \(\.\.\., 11\)"):
+                act(observation)
+
+
 def test_a_batch_of_states_is_no_policy(trained_point_mass):
     env, _, states = trained_point_mass
+    assert gasil_jax.member(states, -1).iteration.shape == ()
+    with pytest.raises(IndexError, match="index is 3: there are 3 states"):
+        gasil_jax.member(states, 3)
     with pytest.raises(ValueError, match="state is a batch of 3 states"):
         policy.from_state(states, env)
 
