@@ -29,12 +29,13 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from gasil_jax.config import Config
+from gasil_jax.config import Config, Range
 from gasil_jax.errors import unknown
 from gasil_jax.imitation import find_agent
 
 #: The preset that runs start from if none is named.
 DEFAULT = "tuned"
+_DELAYS = Range(1, whole=True)
 Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
 Rows = Mapping[tuple[str, str], Overrides]
@@ -150,8 +151,8 @@ def names() -> tuple[str, ...]:
 
 def check(name: str) -> None:
     """Raise `ValueError` unless there is a preset of this name."""
-    if name not in PRESETS:
-        raise ValueError(unknown("preset", name, names()))
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ValueError(unknown("preset", str(name), names()))
 
 
 def preset(
@@ -170,11 +171,14 @@ def preset(
       "tuned" the preset may have neither.
 
     Raises:
-      ValueError: if the environment, the agent or the preset is unknown, or if a preset
-        other than "tuned" has nothing for the agent on the task.
+      ValueError: if the environment, the agent or the preset is unknown, if the delay
+        is no whole number from 1 on, or if a preset other than "tuned" has nothing for
+        the agent on the task.
     """
     check(name)
     find_agent(agent)
+    if reward_delay not in _DELAYS:
+        raise ValueError(f"reward_delay is {reward_delay!r}: it must be {_DELAYS}")
     ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", str(env), ours, others))

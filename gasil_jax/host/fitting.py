@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from gasil_jax.config import Config, Range
@@ -66,7 +67,7 @@ def fit(
     Args:
       env: one environment.
       config: the config that the seeds share.
-      seeds: number of seeds, from 0 on; or their numbers.
+      seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
       folder: folder of metrics.csv, evaluations.csv, checkpoints/ and, at the end,
         policy.npz for `gasil_jax.load_policy`. It is created if it is missing; None
         keeps nothing.
@@ -147,24 +148,24 @@ def fit(
 
 
 def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
-    """Return the numbers of the seeds.
+    """Return the numbers of the seeds, which may also be an array of integers.
 
     Raises:
       ValueError: if they are none, not different or out of range.
     """
-    if isinstance(seeds, int | np.integer):
-        run_folder.check_seeds(int(seeds), 0)
-        return range(int(seeds))
+    if jax.dtypes.issubdtype(getattr(seeds, "dtype", object), np.integer):
+        seeds = np.asarray(seeds).tolist()
     allowed = Range(0, 2**32 - 1, whole=True)
-    listed = isinstance(seeds, Sequence | np.ndarray) and all(
-        x in allowed for x in seeds
+    if isinstance(seeds, Sequence):
+        if all(x in allowed for x in seeds) and len(set(seeds)) == len(seeds) > 0:
+            return tuple(int(seed) for seed in seeds)
+    elif not isinstance(seeds, bool) and isinstance(seeds, int):
+        run_folder.check_seeds(seeds, 0)
+        return range(seeds)
+    raise ValueError(
+        f"seeds is {seeds!r}: it must be a number of seeds, or different whole numbers "
+        f"from 0 to {2**32 - 1}"
     )
-    if not (listed and len(set(seeds)) == len(seeds) > 0):
-        raise ValueError(
-            f"seeds is {seeds!r}: it must be a number of seeds, or different whole "
-            f"numbers from 0 to {2**32 - 1}"
-        )
-    return tuple(int(seed) for seed in seeds)
 
 
 @contextlib.contextmanager

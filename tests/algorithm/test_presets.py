@@ -115,3 +115,7 @@ def test_an_unknown_preset_is_refused(capsys):
         gasil_jax.preset("hopper", "ppo+gasill")
     with pytest.raises(ValueError, match="env 'walker' is unknown: did you mean 'walk"):
         gasil_jax.preset("walker", "ppo")
+    with pytest.raises(ValueError, match="preset '20' is unknown"):
+        gasil_jax.preset("hopper", "ppo", 20)
+    with pytest.raises(ValueError, match=r"reward_delay is 2\.5: it must be a whole"):
+        gasil_jax.preset("hopper", "ppo", reward_delay=2.5)

@@ -167,6 +167,8 @@ def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
         ({"seeds": 0}, "seeds is 0: it must be from 1"),
         ({"seeds": []}, r"seeds is \[\]: it must be a number of seeds"),
         ({"seeds": None}, "seeds is None: it must be a number of seeds"),
+        ({"seeds": True}, "seeds is True: it must be a number of seeds"),
+        ({"seeds": jax.numpy.zeros(2, int)}, r"seeds is \[0, 0\]: it must be a number"),
         ({"seeds": [1, 1]}, "different whole numbers"),
         ({"seeds": [-1]}, "different whole numbers"),
         ({"evaluate_every": 0}, "evaluate_every is 0: it must be a whole number"),
