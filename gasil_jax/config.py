@@ -150,6 +150,9 @@ class Hyperparameters(struct.PyTreeNode):
 class Config:
     """The settings that change array shapes, loop counts or the program; hashable.
 
+    `Config(...)` takes the fields below. `replace` also takes those of
+    `hyperparameters`: ``Config(agent="gasil").replace(alpha=0.2)``.
+
     Attributes:
       agent: name of the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil,
         ppo+gasil-adaptive, ppo+bonus, gail, or MODULE:NAME of your own.
@@ -312,7 +315,7 @@ class Config:
         for name in swept:
             if name not in names:
                 hyperparameters_of(changed.agent)  # If it is unknown, this says so.
-                raise ValueError(unknown("hyperparameter", name, names))
+                raise ValueError(unknown("setting", name, (*_names(Config), *names)))
         hyperparameters = changed.hyperparameters.replace(**swept)
         return dataclasses.replace(changed, hyperparameters=hyperparameters)
 

@@ -14,8 +14,13 @@ class NotImportable(InputError):
 
 
 def nearest(name: str, allowed: Sequence[str]) -> str | None:
-    """Return the allowed name that is most similar to `name`, or None if none is."""
-    return next(iter(difflib.get_close_matches(name, allowed, n=1, cutoff=0.7)), None)
+    """Return the allowed name that is most similar to `name`, or None if none is.
+
+    Capital letters and small ones count as the same.
+    """
+    lowered = {x.lower(): x for x in allowed}
+    close = difflib.get_close_matches(name.lower(), lowered, n=1, cutoff=0.7)
+    return lowered[close[0]] if close else None
 
 
 def unknown(

@@ -5,13 +5,14 @@ any leaf of `Hyperparameters`, shard it over devices, call it from other JAX cod
 """
 
 import math
+from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs import wrappers
+from gasil_envs import own_environment, wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     good_trajectories,
@@ -93,8 +94,10 @@ def init(
       hyperparameters: scalars, which may be traced; default the config's.
 
     Raises:
-      ValueError: if a hyperparameter is out of its range and not traced.
+      ValueError: if the key is no single random key, or if a hyperparameter is out of
+        its range and not traced.
     """
+    _check_key(key)
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
     validate_hyperparameters(config, hyperparameters)
@@ -152,6 +155,19 @@ def init(
         key=key,
         iteration=jnp.int32(0),
     )
+
+
+def _check_key(key: Any) -> None:
+    """Raise `ValueError` unless this is one random key, typed or of the older kind."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != jnp.uint32:
+        raise ValueError(f"key is {key!r}: it must be like jax.random.key(0)")
+    if typed and key.shape:
+        raise ValueError(
+            f"key has shape {key.shape}: it must be a single key (to train with "
+            "several, use jax.vmap)"
+        )
 
 
 def _networks(env: Any, config: Config) -> tuple[Any, Any]:
@@ -607,6 +623,10 @@ def check(env: Any, config: Config) -> None:
 
     Nothing is compiled.
     """
+    if isinstance(env, type):
+        raise ValueError(
+            f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
+        )
     for name in ("reset", "step", "observation_size", "action_size"):
         if not hasattr(env, name):
             raise ValueError(
@@ -616,6 +636,10 @@ def check(env: Any, config: Config) -> None:
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
+    *_, innermost = _levels(env)
+    # Ours and Brax's need no check, and tracing one takes seconds.
+    if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
+        own_environment.check(type(innermost).__name__, env, env)
     if not isinstance(config, Config):
         raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
     validate(config)
@@ -637,15 +661,21 @@ def _refuse_automatic_resets(env: Any) -> None:
     The value of a truncated episode would then be bootstrapped from the first
     observation of the next one.
     """
-    wrapper = env
-    while wrapper is not None:
-        if "AutoReset" in (name := type(wrapper).__name__):
+    for level in _levels(env):
+        if "AutoReset" in (name := type(level).__name__):
             raise ValueError(
                 f"env is wrapped in {name}: it must not reset itself (for a Brax "
                 "environment use brax.envs.get_environment)"
             )
+
+
+def _levels(env: Any) -> Iterator[Any]:
+    """Yield an environment, what it wraps, and so on down to the innermost one."""
+    level = env
+    while level is not None:
+        yield level
         # `getattr` would skip levels: wrappers forward attributes of what they wrap.
-        wrapper = getattr(wrapper, "__dict__", {}).get("env")
+        level = getattr(level, "__dict__", {}).get("env")
 
 
 class Train(Protocol):

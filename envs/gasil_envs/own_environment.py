@@ -1,4 +1,4 @@
-"""Import, build and check a user's environment, which is named as MODULE:NAME.
+"""Import, build and check a user's environment.
 
 Mistakes that would stop training with a long trace are reported in one line before it.
 """
@@ -48,13 +48,29 @@ def build(name: str) -> Env:
     for attribute in ("reset", "step", "observation_size", "action_size"):
         if not hasattr(env, attribute):
             raise ValueError(f"env {name!r} is no environment: it has no {attribute}")
+    # `registry.make` wraps it in an `EpisodeLimit`, which adds fields to its states.
+    check(name, env, wrappers.EpisodeLimit(env, 1))
+    return env
+
+
+def check(name: str, env: Any, trained: Any) -> None:
+    """Check the sizes and states of an environment, without running it.
+
+    Args:
+      name: name of the environment, for the error message.
+      env: an object with Brax's `reset`, `step`, `observation_size` and `action_size`.
+      trained: the environment that training steps: `env`, or a wrapper of it.
+
+    Raises:
+      ValueError: if a size is no count, or if a state has a wrong structure, shape or
+        dtype.
+    """
     for attribute in ("observation_size", "action_size"):
         _check_count(name, attribute, getattr(env, attribute))
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
     _check_action_range(name, env)
-    _check_states(name, env)
-    return env
+    _check_states(name, env, trained)
 
 
 def _check_count(name: str, what: str, count: Any) -> None:
@@ -98,15 +114,15 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
     return state
 
 
-def _check_states(name: str, env: Env) -> None:
+def _check_states(name: str, env: Env, trained: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
-    # Training wraps the environment in `EpisodeLimit`, which adds fields to its states.
-    limited = wrappers.EpisodeLimit(env, 1)
     key, action = jax.random.key(0), jnp.zeros(env.action_size)
     bare = _traced(name, env, "reset", key)
     stepped = _traced(name, env, "step", bare, action)
-    first = _traced(name, limited, "reset", key)
-    then = _traced(name, limited, "step", first, action)
+    first, then = bare, stepped
+    if trained is not env:
+        first = _traced(name, trained, "reset", key)
+        then = _traced(name, trained, "step", first, action)
     for state, where in ((bare, "reset"), (stepped, "step")):
         fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
         of_info = {

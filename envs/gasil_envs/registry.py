@@ -66,7 +66,8 @@ def _refuse_unknown(
         return
     # The prefix, which all names have, must not make them similar.
     bare = {x.removeprefix(BRAX): x for x in allowed}
-    near = difflib.get_close_matches(name.removeprefix(BRAX), bare, n=1, cutoff=0.7)
+    given = name.removeprefix(BRAX).lower()  # Gymnasium writes "Hopper-v5".
+    near = difflib.get_close_matches(given, bare, n=1, cutoff=0.7)
     if not near:
         raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
     raise ValueError(
@@ -194,6 +195,7 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
       ValueError: if a name is unknown or a value is out of range.
     """
     allowed = [field.name for field in dataclasses.fields(Settings)]
+    allowed.append("max_episode_steps")
     for setting in settings:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)

@@ -215,6 +215,8 @@ def test_point_mass_layout_is_data():
 def test_an_unknown_name_is_refused_with_the_nearest():
     with pytest.raises(ValueError, match="did you mean 'walker2d'"):
         gasil_envs.make("walker")
+    with pytest.raises(ValueError, match="did you mean 'hopper'"):
+        gasil_envs.make("Hopper-v5")
     with pytest.raises(ValueError, match=r"'reward_dellay' .* mean 'reward_delay'"):
         gasil_envs.make("walker2d", reward_dellay=20)
 

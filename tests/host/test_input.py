@@ -9,8 +9,10 @@ import pickle
 import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from brax.envs import State
 from brax.envs import Wrapper as BraxWrapper
 from brax.envs.wrappers import training
 from hypothesis import HealthCheck, given, settings
@@ -176,6 +178,26 @@ def test_a_value_of_any_type_is_refused_by_name(name, value):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.parametrize(
+    ("name", "nearest"), [("num_env", "num_envs"), ("Alpha", "alpha")]
+)
+def test_a_name_that_is_no_setting_is_refused_with_the_nearest(name, nearest):
+    message = f"setting '{name}' is unknown: did you mean '{nearest}'"
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.Config().replace(**{name: 3})
+
+
+def test_what_is_no_single_random_key_is_refused():
+    env = gasil_jax.make_env("point_mass")
+    train = gasil_jax.make_train(env, gasil_jax.Config())
+    for seed in (0, 0.5, None):
+        with pytest.raises(ValueError, match=rf"key is {seed}: it must be like jax"):
+            train(seed)
+    with pytest.raises(ValueError, match=r"key has shape \(2,\): it must be a single"):
+        train(jax.random.split(jax.random.key(0)))
+    jax.eval_shape(train, jax.random.PRNGKey(0))
+
+
 def test_traced_values_pass_unlooked_at():
     def check(gamma):
         config = gasil_jax.Config().replace(gamma=gamma, alpha_schedule=lambda s: gamma)
@@ -222,6 +244,36 @@ def test_an_environment_that_resets_itself_is_refused():
         with pytest.raises(ValueError, match=f"env is wrapped in {name}"):
             gasil_jax.make_train(wrapped, gasil_jax.Config())
     gasil_jax.make_train(BraxWrapper(env), gasil_jax.Config())
+
+
+class Short:
+    """An environment whose observations are shorter than it says."""
+
+    observation_size, action_size = 3, 1
+
+    def reset(self, rng):
+        return State(None, jnp.zeros(2), jnp.float32(0), jnp.float32(0))
+
+    def step(self, state, action):
+        return state
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        ("hopper", "env is 'hopper', which has no reset"),
+        (Short, "env is the class Short: it must be an instance"),
+        (
+            Short(),
+            "env 'Short': the obs of its reset has the shape (2,), must have (3,)",
+        ),
+        (wrappers.RewardDelay(Short(), 5), "env 'Short': the obs of its reset has"),
+    ],
+)
+def test_what_is_no_environment_is_refused(env, message):
+    with pytest.raises(ValueError, match=re.escape(message)) as refusal:
+        gasil_jax.make_train(env, gasil_jax.Config())
+    assert "\n" not in str(refusal.value)
 
 
 class Bomb:
