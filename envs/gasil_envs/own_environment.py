@@ -108,7 +108,7 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
         ) from None
     if not all(hasattr(state, x) for x in ("obs", "reward", "done", "info")):
         raise ValueError(
-            f"env {name!r}: its {function} returns a {type(state).__name__}, must "
+            f"env {name!r}: its {function} returns a {type(state).__name__}: it must "
             "return a brax.envs.State"
         )
     return state
@@ -131,19 +131,24 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
             if x in state.info
         }
         for field, value in (fields | of_info).items():
-            shape = (env.observation_size,) if field == "obs" else ()
-            of = f", as observation_size is {env.observation_size}"
-            given = getattr(value, "shape", type(value).__name__)
-            if given != shape:
+            shape: tuple[int, ...] = ()
+            why = ""
+            if field == "obs":
+                shape = (env.observation_size,)
+                why = f", as observation_size is {env.observation_size}"
+            is_array = hasattr(value, "shape")
+            if not is_array or value.shape != shape:
+                kind = type(value).__name__
+                given = f"has shape {value.shape}" if is_array else f"is a {kind}"
                 raise ValueError(
-                    f"env {name!r}: the {field} of its {where} has the shape {given}, "
-                    f"must have {shape}{of if field == 'obs' else ''}"
+                    f"env {name!r}: the {field} of its {where} {given}: it must have "
+                    f"shape {shape}{why}"
                 )
             # A truncation may be a bool too.
             if field in fields and value.dtype != jnp.float32:
                 raise ValueError(
-                    f"env {name!r}: the {field} of its {where} is {value.dtype}, must "
-                    "be float32"
+                    f"env {name!r}: the {field} of its {where} is {value.dtype}: it "
+                    "must be float32"
                 )
     flat = [
         {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
@@ -153,6 +158,6 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
         before, after = (own_code.described(leaves.get(path)) for leaves in flat)
         if before != after:
             raise ValueError(
-                f"env {name!r}: state{path} is {before} in its reset and {after} in "
-                "its step, must be alike"
+                f"env {name!r}: state{path} is {before} after its reset and {after} "
+                "after its step: both must be the same"
             )

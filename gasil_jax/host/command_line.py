@@ -193,9 +193,19 @@ def _in_one_line(printed: str) -> str:
     message = " ".join(" ".join(rest).split())
     message = re.split(r" (?:Argument helptext|For full helptext)", message)[0]
     if missing := re.match(
-        r"Missing from python -m [\w.]+(?: \w+)?: (--[\w-]+)", message
+        r"Missing from python -m [\w.]+(?: \w+)?: (--[\w-]+|[A-Z]+)", message
     ):
-        return f"option {missing[1]} is missing: see --help"
+        kind = "option " if missing[1].startswith("--") else ""
+        return f"{kind}{missing[1]} is missing: see --help"
+    if extra := re.match(r"Unrecognized options: (.*)", message):
+        return f"{extra[1]!r} belongs to no option: see --help"
+    if choice := re.match(
+        r"invalid choice '(.*)' for argument '--([\w-]+)'. Expected one of \((.*)\)",
+        message,
+    ):
+        value, name, allowed = choice.groups()
+        name, allowed = name.replace("-", "_"), allowed.replace("'", "")
+        return f"{name} is {value!r}: it must be one of {allowed}"
     if unparsed := re.match(
         r"Error parsing --([\w-]+): Could not find valid parse .*\['(.*)'\]", message
     ):

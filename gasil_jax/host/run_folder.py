@@ -227,7 +227,7 @@ def _why_no_run(folder: pathlib.Path) -> str:
         return ", which gasil_jax.fit has written: gasil_jax.load_policy takes it"
     if (folder / "shards").is_dir():
         return f", which holds shards: first run python -m gasil_jax.merge {folder}"
-    return ": it must be the folder of a run"
+    return f", which has no {_CONFIG}: it must be the folder of a run"
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:

@@ -410,5 +410,5 @@ def _trace(env: Any, config: Config) -> None:
         if before != after:
             raise InputError(
                 f"{agent}: state{jax.tree_util.keystr(path)} is {before} at the start "
-                f"and {after} after an iteration, must be alike"
+                f"and {after} after an iteration: both must be the same"
             )

@@ -116,6 +116,19 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(tmp_path, caps
         assert message in error and len(error.splitlines()) == 1
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "PATH is missing: see --help"),
+        (("x", "--checkpoint", "first"), "checkpoint is 'first': it must be one of la"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line(arguments, message, capsys):
+    assert evaluate.main(arguments) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error
+
+
 def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
     """As in training; `done` need not be set beside `truncation`."""
     env, config, states = trained_point_mass

@@ -185,6 +185,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env os:getcwd --physics mujoco", "os:getcwd has its own"),
         ("--env point_mass --max-episode-steps 51", "environment's own limit is 50"),
         ("", "option --env is missing: see --help"),
+        ("--env hopper walker2d", "'walker2d' belongs to no option: see --help"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):

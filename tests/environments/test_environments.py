@@ -289,38 +289,38 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
             _OWN.replace("2, 1, ", "2.5, 1, "),
             "size 2.5: it must be a whole",
         ),
-        (_OWN.replace("2, 1, ", "3, 1, "), r"obs of its reset .*\(2,\), .* \(3,\)"),
-        (_OWN.replace("action[0]", "action"), r"reward of its step .*\(1,\), .* \(\)"),
+        (_OWN.replace("2, 1, ", "3, 1, "), r"obs of its reset .*\(2,\): .* \(3,\)"),
+        (_OWN.replace("action[0]", "action"), r"reward of its step .*\(1,\): .* \(\)"),
         (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
-        (_OWN.replace("obs=a", "obs={'x': a}"), r"step has the shape dict, .* \(2,\)"),
+        (_OWN.replace("obs=a", "obs={'x': a}"), r"step is a dict: it .* \(2,\)"),
         (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
         (
             _OWN.replace(
                 "return state.", "return a, reward, False, {}\n        state."
             ),
-            "its step returns a tuple, must return a brax.envs.State",
+            "its step returns a tuple: it must return a brax.envs.State",
         ),
-        (_OWN.replace("zeros(2)", "zeros(2, int)"), "obs of its reset is int32, must"),
+        (_OWN.replace("zeros(2)", "zeros(2, int)"), "obs of its reset is int32: it"),
         (
             _OWN.replace("reward=reward", "reward=reward > 0"),
-            "the reward of its step is bool, must be float32",
+            "the reward of its step is bool: it must be float32",
         ),
         (
             _OWN.replace("reward=reward", "reward=reward, done=reward > 0"),
-            "the done of its step is bool, must be float32",
+            "the done of its step is bool: it must be float32",
         ),
         (
             _OWN.replace("pipeline_state + 1", "pipeline_state + 0.5"),
-            r"state.pipeline_state is int32\[\] in its reset and float32\[\] in",
+            r"state.pipeline_state is int32\[\] after its reset and float32\[\] af",
         ),
-        (_OWN.replace("info={}", "info={'x': a}"), r"info\['x'\] is missing in its r"),
+        (_OWN.replace("info={}", "info={'x': a}"), r"info\['x'\] is missing after i"),
         (_OWN + "    episode_length = 0\n", "has episode_length 0: it must be a whole"),
         (_OWN + "    action_range = 0.5\n", "has action_range 0.5: it must be the low"),
         (_OWN + "    action_range = (1, -1)\n", r"has action_range \(1, -1\): it must"),
         (_OWN + "    action_range = (0, [1, 1])\n", "it must be the lowest and the hi"),
         (
             _OWN.replace("info={}", "info={'true_reward': a}"),
-            r"info\['true_reward'\] of its step has the shape \(2,\), must have \(\)",
+            r"info\['true_reward'\] of its step has shape \(2,\): it must have s",
         ),
     ],
 )

@@ -265,7 +265,7 @@ class Short:
         (Short, "env is the class Short: it must be an instance"),
         (
             Short(),
-            "env 'Short': the obs of its reset has the shape (2,), must have (3,)",
+            "env 'Short': the obs of its reset has shape (2,): it must have shape (3,)",
         ),
         (wrappers.RewardDelay(Short(), 5), "env 'Short': the obs of its reset has"),
     ],
