@@ -23,17 +23,11 @@ from experiments import (
 from experiments.figures import FIGURES, Curve, Figure, name_of
 from experiments.report import Page
 from experiments.search import coverage
-from experiments.store import RESULTS, Store
+from experiments.store import RESULTS, ResultsFolder, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
-
-#: A folder of results. Its default is given in full, which the help need not say.
-_Results = Annotated[
-    pathlib.Path,
-    tyro.conf.arg(help_behavior_hint="(default: experiments/results of the checkout)"),
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,7 +55,7 @@ class Options:
     list: bool = False
     only: tuple[str, ...] = ()
     shard: str = "1/1"
-    results: _Results = RESULTS
+    results: ResultsFolder = RESULTS
     setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=engine.Setup
     )
@@ -165,7 +159,7 @@ class MergeOptions:
     """
 
     folder: Annotated[pathlib.Path, tyro.conf.Positional]
-    results: _Results = RESULTS
+    results: ResultsFolder = RESULTS
 
 
 def _merge(options: MergeOptions) -> None:
@@ -183,7 +177,7 @@ class CoverageOptions:
       results: folder of the results that are counted.
     """
 
-    results: _Results = RESULTS
+    results: ResultsFolder = RESULTS
 
 
 def _coverage(options: CoverageOptions) -> int:

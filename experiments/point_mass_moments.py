@@ -10,7 +10,6 @@ the more opaque is the arrow.
 import dataclasses
 import functools
 import itertools
-import pathlib
 from collections.abc import Sequence
 from typing import Any
 
@@ -21,7 +20,7 @@ from matplotlib.figure import Figure
 
 import gasil_jax
 from experiments import plots
-from experiments.store import RESULTS
+from experiments.store import RESULTS, ResultsFolder
 from gasil_envs import pictures
 from gasil_jax import normalization, policy
 from gasil_jax.host import command_line, output_file
@@ -48,7 +47,7 @@ class Options:
     """
 
     total_steps: int = 500_000
-    out: pathlib.Path = RESULTS
+    out: ResultsFolder = RESULTS
 
 
 def states_at(env: Any, config: gasil_jax.Config, shares: Sequence[float]) -> list[Any]:

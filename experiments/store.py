@@ -11,9 +11,10 @@ import hashlib
 import json
 import pathlib
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+import tyro
 
 from gasil_jax import npz
 from gasil_jax.config import Config, hyperparameters_of
@@ -27,6 +28,11 @@ ALGORITHM_VERSION = 2
 
 _NONE = np.empty(0)
 RESULTS = pathlib.Path(__file__).parent / "results"
+#: The type of an option with this default, which the help need not say in full.
+ResultsFolder = Annotated[
+    pathlib.Path,
+    tyro.conf.arg(help_behavior_hint="(default: experiments/results of the checkout)"),
+]
 
 
 @dataclasses.dataclass(frozen=True)

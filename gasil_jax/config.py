@@ -107,8 +107,8 @@ class Hyperparameters(struct.PyTreeNode):
         gradients are clipped separately.
       initial_deviation: standard deviation of the untrained policy's actions.
       reward_clip: largest absolute value of a normalized reward (see normalize_rewards,
-        without which it has no effect). Where an episode pays once, at its end, the
-        default makes most of the payments equal: take 1e9, which clips nothing.
+        without which it has no effect). If an episode is rewarded only at its end, the
+        default clips most rewards to the same number: use 1e9, which clips none.
       alpha: scale of the discriminator's reward (paper, section 4.3).
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_updates: gradient steps of the discriminator in an iteration.
@@ -155,7 +155,7 @@ class Config:
 
     Attributes:
       agent: name of the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil,
-        ppo+gasil-adaptive, ppo+bonus, gail, or MODULE:NAME of your own.
+        ppo+gasil-adaptive, ppo+bonus, gail, or your own as MODULE:NAME.
       total_steps: environment steps per seed, rounded up to whole batches.
       num_envs: number of environments that each seed steps in parallel.
       batch_steps: environment steps in an iteration, summed over all environments (the
@@ -165,11 +165,11 @@ class Config:
       hidden_sizes: widths of the tanh layers, in the policy and in the value.
       bonus: form of the discriminator's reward: softplus (-log D, the paper's), logit,
         dail or centered.
-      imitation_rule: what the share of imitation in the policy's advantage follows, in
-        the agent ppo+gasil-adaptive: "agreement", "gap", "both", or "fixed" for
-        neither.
-      discriminator_minibatch_size: steps of the policy, and equally many good steps, in
-        one gradient step of the discriminator.
+      imitation_rule: how ppo+gasil-adaptive weights imitation in the policy's
+        advantage: by the "agreement" of the two advantages, by the "gap" between the
+        buffer's returns and the policy's, by "both", or by neither, "fixed".
+      discriminator_minibatch_size: steps of the policy, and as many good steps, in one
+        gradient step of the discriminator.
       discriminator_hidden_sizes: widths of the discriminator's tanh layers.
       behavior_cloning_updates: gradient steps on PPO+BC's cloning loss in an iteration.
       behavior_cloning_minibatch_size: good steps in one gradient step on PPO+BC's
@@ -177,13 +177,13 @@ class Config:
       sil_updates: gradient steps on PPO+SIL's loss in an iteration.
       sil_minibatch_size: replayed steps in one gradient step on PPO+SIL's loss.
       sil_buffer_steps: capacity of PPO+SIL's replay buffer, in steps.
-      discriminator_gradient_penalty: weight of the penalty on the discriminator's
-        gradient with respect to its input, which is pulled to norm 1 between good pairs
-        and the policy's (as in WGAN-GP).
+      discriminator_gradient_penalty: weight of a gradient penalty on the
+        discriminator, as in WGAN-GP: at points between good pairs and the policy's, the
+        norm of its gradient with respect to its input is pulled to 1.
       discriminator_normalizes_actions: whether the discriminator sees actions in units
         of the batch's mean and standard deviation; otherwise as they are.
-      buffer_episodes: number of episodes that the good-trajectory buffer keeps at most,
-        beside its capacity in steps; None for any number.
+      buffer_episodes: largest number of episodes in the good-trajectory buffer, besides
+        its capacity in steps; None for no limit.
       buffer_discounts: whether the good-trajectory buffer ranks episodes by their
         discounted return, as the paper does; otherwise by the undiscounted one.
       sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
@@ -194,33 +194,31 @@ class Config:
         schedule).
       clip_epsilon_schedule: factor that multiplies PPO's clip range, given in the same
         way.
-      alpha_schedule: factor that multiplies alpha, given in the same way. The paper's
-        rule for Humanoid, 0 for 2M steps and then a rise to alpha until 3M, is 2e6 0
-        3e6 1 on the command line and ((2e6, 0), (3e6, 1)) in Python.
+      alpha_schedule: factor that multiplies alpha, given in the same way. On Humanoid
+        the paper's alpha is 0 for 2M steps and then rises to its full value at 3M. That
+        is 2e6 0 3e6 1 on the command line and ((2e6, 0), (3e6, 1)) in Python.
       normalize_rewards: whether to divide PPO's rewards by the standard deviation of
         their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
         that unit, not in the environment's. It has no effect on the agents gasil and
         gail, which do not use the environment's reward.
-      decompose_rewards: whether PPO sees, instead of a reward that arrives late, a
-        reward for each step that a network learns from the sums that are paid (see
-        reward_decomposition).
+      decompose_rewards: whether PPO learns from a reward for each step, which a network
+        learns from the delayed sums, instead of from the delayed reward itself.
       decomposition_updates: gradient steps in an iteration of the network that
         decomposes rewards.
-      decomposition_minibatch_size: windows between two payouts in one gradient step of
-        the network that decomposes rewards.
-      decomposition_window_steps: steps of each window in one gradient step of the
-        network that decomposes rewards: all steps of a window that has no more,
-        otherwise this many, drawn at random.
+      decomposition_minibatch_size: windows in one gradient step of the network that
+        decomposes rewards. A window is the steps between two payouts.
+      decomposition_window_steps: largest number of steps that represent a window in
+        such a gradient step. Of a longer window, this many are drawn at random.
       decomposition_history_episodes: length of the history that windows are drawn from,
-        in episodes of the largest length; a batch comes on top. If rewards come only at
-        the end of an episode, 1 leaves few windows.
+        in episodes of full length; a batch is added to it. If rewards come only at the
+        end of an episode, 1 leaves few windows.
       decomposition_hidden_sizes: widths of the tanh layers of the network that
         decomposes rewards.
       stagger_episodes: whether each environment's first episode begins at a random age,
         so that a batch holds steps from all parts of an episode. Otherwise all begin at
-        age 0, and where episodes never end early a batch is one thin slice of them.
-      expert: expert that GAIL imitates: an .npz file with arrays "observation" and
-        "action", or minari:NAME for a Minari data set.
+        age 0 and, if none ends early, a batch holds the same few steps of each episode.
+      expert: expert that GAIL imitates: minari:NAME for a Minari data set, or an .npz
+        file with the arrays "observation" and "action".
       max_episode_steps: number of steps after which an episode is truncated; None takes
         the environment's own limit, or 1000 if it has none.
       hyperparameters: numbers that `make_train` also takes as traced arguments. They do

@@ -50,11 +50,11 @@ class Options:
         by default none. The scores are undelayed returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
-      preset: the hyperparameters to start from: tuned, by environment and agent;
-        decomposed, for PPO that decomposes delayed rewards; scaled, the same with one
-        setting for all locomotion tasks; or paper, with the paper's single environment
-        per seed, which is slow where seeds are few. Flags override them. The defaults
-        that this help shows are those without a preset.
+      preset: the settings to start from: tuned, searched for each environment and
+        agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
+        setting of PPO for all locomotion tasks; or paper, with the paper's single
+        environment per seed, which is slow with few seeds. Options override them. The
+        defaults that this help shows are those without a preset.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       settings: settings of the environment.
