@@ -342,7 +342,7 @@ def test_the_caption_of_the_film_has_the_score_of_its_policy():
     with Image.open(film) as image:
         assert image.n_frames > 50
     policy = re.search(r"render (zoo:\S+) --out", TEXT)[1]
-    score = re.search(r"policy has ([\d,]+ ± \d+)", " ".join(TEXT.split()))[1]
+    score = re.search(r"policy scores ([\d,]+ ± \d+)", " ".join(TEXT.split()))[1]
     (row,) = re.findall(rf"\| `{policy}` \|.*", (DOCS / "zoo.md").read_text())
     assert f"| {score} |" in row
 
