@@ -453,7 +453,7 @@ FIGURES: Mapping[str, Figure] = {
         favourite=_SCALED.name,
     ),
     "bonus_forms": Figure(
-        "Delayed rewards: PPO+GASIL without pay for staying up",
+        "Delayed rewards: PPO+GASIL without a survival bonus",
         "",
         grid(
             TASKS[:4],

@@ -105,7 +105,7 @@ CLAIMS = (
     ),
     Claim(
         "Control, not a claim of the paper: with delayed rewards PPO+GASIL is ahead of "
-        "the same pay for staying up without imitation (PPO+BONUS)",
+        "the same survival bonus without imitation (PPO+BONUS)",
         "matrix",
         _ahead(DELAY, _CONTROL),
         needed=6,
