@@ -133,12 +133,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.run, options.checkpoint, options.point, options.seed
     )
     env, seeds = policies.env, policies.seeds
-    locomotion = environments.is_locomotion(env)
-    if options.gymnasium and (options.stochastic or not locomotion):
-        raise InputError(
-            "gymnasium is on: the run must be of a locomotion task, and stochastic "
-            "must be off"
-        )
+    if options.gymnasium and not environments.is_locomotion(env):
+        raise InputError("gymnasium is on: the run must be of a locomotion task")
+    if options.gymnasium and options.stochastic:
+        raise InputError("gymnasium is on: stochastic must be off")
     if not options.gymnasium:
         with command_line.input_checked():
             resources.check_episodes(
@@ -147,7 +145,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.out is not None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")
-    with announced("evaluate", f"scoring policies: {len(seeds)}"):
+    with announced("evaluate", f"running {options.episodes} episodes per seed"):
         score = _score_in_gymnasium if options.gymnasium else _score
         scores = score(options, policies)
     print("seed  episodes      return        std  length")

@@ -145,8 +145,8 @@ def check(name: str, settings: Settings) -> None:
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
     if settings.physics != "mjx" and settings.solver != Settings.solver:
         raise ValueError(
-            f"solver is {settings.solver!r}, which is of physics 'mjx': "
-            f"physics is {settings.physics!r}"
+            f"solver is {settings.solver!r}: it needs physics 'mjx', and physics is "
+            f"{settings.physics!r}"
         )
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.

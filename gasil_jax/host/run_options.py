@@ -310,7 +310,7 @@ def note_if_untuned(options: Options) -> None:
     agent, delay = options.config.agent, options.settings.reward_delay
     lacking = presets.describe_lack(options.env, agent, options.preset, delay)
     if lacking is not None:
-        command_line.note(f"{lacking}: each setting that is not given has its default")
+        command_line.note(f"{lacking}: options that are not given have their defaults")
 
 
 def seeds_of(options: Options) -> range:

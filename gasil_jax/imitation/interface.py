@@ -56,7 +56,7 @@ def check_without_expert(
     """
     if config.expert is not None:
         raise ValueError(
-            f"expert is {config.expert!r}: agent {config.agent!r} imitates none, "
+            f"expert is {config.expert!r}: agent {config.agent!r} uses no expert, only "
             "agent 'gail' does"
         )
 

@@ -111,9 +111,9 @@ def note_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
         limit = training.max_episode_steps(env, config)
         if steps < limit and not environments.ends_early(env):
             command_line.note(
-                f"no return will be known: each of {config.num_envs} environments "
-                f"takes {steps:,} steps, and an episode has {limit:,}: give fewer "
-                "--num-envs or more --total-steps"
+                f"no episode can end, so no return is known: each of {config.num_envs} "
+                f"environments takes {steps:,} steps, and an episode has {limit:,}: "
+                "lower --num-envs or raise --total-steps"
             )
             return
 

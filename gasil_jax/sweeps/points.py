@@ -54,7 +54,7 @@ def parse_grid(grid: Sequence[str], agent: str) -> dict[str, tuple[Any, ...]]:
         if name not in allowed:
             raise InputError(f"grid: {_unknown_name(name, allowed)}")
         if name in values:
-            raise InputError(f"grid has {name} twice: all its values must be in one")
+            raise InputError(f"grid has {name} twice: give all its values in one entry")
         try:
             read = float if allowed[name] is float else whole_number
             numbers = [read(value) for value in listed.split(",")]

@@ -80,7 +80,7 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
         ({"normalize_rewards": 1}, "normalize_rewards is 1: it must be True or"),
         ({"minibatch_size": 60}, "nearest that does is"),
         ({"num_envs": 3}, "num_envs is 3"),
-        ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' imitates none"),
+        ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' uses no exp"),
         ({"hyperparameters": gasil_jax.Hyperparameters(alpha=-1.0)}, "alpha is -1.0"),
         ({"hyperparameters": gasil_jax.Hyperparameters(gamma=1.5)}, "gamma is 1.5"),
         (

@@ -224,7 +224,7 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
     short = gasil_jax.Config(total_steps=40, num_envs=1, batch_steps=16)
     assembly.note_if_no_episode_ends(env, [short.replace(total_steps=50), short])
     (line,) = capsys.readouterr().err.splitlines()
-    assert "no return will be known: each of 1 environments takes 48 steps" in line
+    assert "no return is known: each of 1 environments takes 48 steps" in line
     assembly.note_if_no_episode_ends(env, [short.replace(total_steps=50)])
     # Where episodes may end early, they may end within few steps.
     monopod = types.SimpleNamespace(episode_length=1000)
