@@ -1,4 +1,4 @@
-"""Train an agent of one's own, which imitates without a discriminator.
+"""Train your own agent, which imitates without a discriminator.
 
     python docs/examples/own_agent.py --steps 300000
 

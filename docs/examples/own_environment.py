@@ -1,9 +1,9 @@
-"""Train PPO and PPO+GASIL in an environment of one's own: a pendulum to swing up.
+"""Train PPO and PPO+GASIL in your own environment: a pendulum to swing up.
 
     python docs/examples/own_environment.py --steps 300000
 
 An environment is a class with Brax's interface. `reset` and `step` are pure functions
-of one environment; training vmaps them. Started here the command line does too:
+of one environment; training vmaps them. In this folder the command line trains it too:
 
     python -m gasil_jax.run --env own_environment:Pendulum
 """
@@ -65,7 +65,7 @@ def main() -> None:
         returns = metrics["episode_return"]
         tenth = max(1, len(returns) // 10)
         first, last = jnp.nanmean(returns[:tenth]), jnp.nanmean(returns[-tenth:])
-        print(f"{agent}: return {first:.1f}, in the end {last:.1f}")
+        print(f"{agent}: return {first:.1f} at the start, {last:.1f} at the end")
 
 
 if __name__ == "__main__":
