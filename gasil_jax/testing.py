@@ -5,7 +5,7 @@ from typing import Any
 import jax
 
 from gasil_envs.precision import full_precision
-from gasil_jax import schedules, train
+from gasil_jax import checks, schedules, train
 from gasil_jax.config import Config
 from gasil_jax.imitation.interface import Context
 
@@ -26,7 +26,7 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
     Raises:
       ValueError: if the config is not valid.
     """
-    train.check(env, config)
+    checks.check(env, config)
     state = train.init(env, config, key)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     _, act_key, _, _, _, decompose_key = jax.random.split(state.key, 6)

@@ -4,17 +4,16 @@ Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or
 any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
 """
 
-import math
-from collections.abc import Iterator
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs import own_environment, wrappers
+from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
+    checks,
     good_trajectories,
     learner,
     normalization,
@@ -24,16 +23,8 @@ from gasil_jax import (
     rollout,
     schedules,
 )
-from gasil_jax.config import (
-    Config,
-    Hyperparameters,
-    validate,
-    validate_hyperparameters,
-)
-from gasil_jax.errors import unknown
+from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
 from gasil_jax.imitation import find_agent
-from gasil_jax.imitation.adaptive import RULES
-from gasil_jax.imitation.adversarial import BONUSES
 from gasil_jax.imitation.interface import Context, Imitation, checked
 from gasil_jax.networks import Policy, Value
 from gasil_jax.ppo import ActorCritic
@@ -97,7 +88,7 @@ def init(
       ValueError: if the key is no single random key, or if a hyperparameter is out of
         its range and not traced.
     """
-    _check_key(key)
+    checks.check_key(key)
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
     validate_hyperparameters(config, hyperparameters)
@@ -155,19 +146,6 @@ def init(
         key=key,
         iteration=jnp.int32(0),
     )
-
-
-def _check_key(key: Any) -> None:
-    """Raise `ValueError` unless this is one random key, typed or of the older kind."""
-    dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not typed and dtype != jnp.uint32:
-        raise ValueError(f"key is {key!r}: it must be like jax.random.key(0)")
-    if typed and key.shape:
-        raise ValueError(
-            f"key has shape {key.shape}: it must be a single key (to train with "
-            "several, use jax.vmap)"
-        )
 
 
 def _networks(env: Any, config: Config) -> tuple[Any, Any]:
@@ -618,66 +596,6 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
     return {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
 
 
-def check(env: Any, config: Config) -> None:
-    """Raise `ValueError` if the config can't train in the environment.
-
-    Nothing is compiled.
-    """
-    if isinstance(env, type):
-        raise ValueError(
-            f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
-        )
-    for name in ("reset", "step", "observation_size", "action_size"):
-        if not hasattr(env, name):
-            raise ValueError(
-                f"env is {env!r}, which has no {name}: it must be an environment with "
-                "Brax's interface, as gasil_jax.make_env gives"
-            )
-    _refuse_automatic_resets(env)
-    if jax.config.read("jax_enable_x64"):
-        raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
-    *_, innermost = _levels(env)
-    # Ours and Brax's need no check, and tracing one takes seconds.
-    if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
-        own_environment.check(type(innermost).__name__, env, env)
-    if not isinstance(config, Config):
-        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
-    validate(config)
-    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
-        if (value := getattr(config, name)) not in allowed:
-            raise ValueError(unknown(name, value, tuple(allowed)))
-    limit = getattr(env, "episode_length", math.inf)
-    if (config.max_episode_steps or 0) > limit:
-        raise ValueError(
-            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
-            f"limit is {limit}"
-        )
-    find_agent(config.agent).check(config, env.observation_size, env.action_size)
-
-
-def _refuse_automatic_resets(env: Any) -> None:
-    """Raise `ValueError` if a wrapper resets the environment when an episode ends.
-
-    The value of a truncated episode would then be bootstrapped from the first
-    observation of the next one.
-    """
-    for level in _levels(env):
-        if "AutoReset" in (name := type(level).__name__):
-            raise ValueError(
-                f"env is wrapped in {name}: it must not reset itself (for a Brax "
-                "environment use brax.envs.get_environment)"
-            )
-
-
-def _levels(env: Any) -> Iterator[Any]:
-    """Yield an environment, what it wraps, and so on down to the innermost one."""
-    level = env
-    while level is not None:
-        yield level
-        # `getattr` would skip levels: wrappers forward attributes of what they wrap.
-        level = getattr(level, "__dict__", {}).get("env")
-
-
 class Train(Protocol):
     """The type of the function that `make_train` returns."""
 
@@ -703,7 +621,7 @@ def make_train(env: Any, config: Config) -> Train:
     Raises:
       ValueError: if the config can't train in the environment; nothing is compiled.
     """
-    check(env, config)
+    checks.check(env, config)
 
     def train(
         key: jax.Array, hyperparameters: Hyperparameters | None = None

@@ -15,7 +15,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from gasil_jax import train
+from gasil_jax import checks, train
 from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
 
 
@@ -251,7 +251,7 @@ def make_members(
     Raises:
       ValueError: if the config or a hyperparameter is not allowed.
     """
-    train.check(env, config)
+    checks.check(env, config)
     # The config's own are checked with it.
     for one in hyperparameters or ():
         validate_hyperparameters(config, one)

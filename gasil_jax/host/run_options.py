@@ -13,7 +13,7 @@ import jax
 import tyro
 
 from gasil_envs import own_code
-from gasil_jax import presets
+from gasil_jax import checks, presets
 from gasil_jax import train as training
 from gasil_jax.config import Config, own_names, validate
 from gasil_jax.errors import InputError
@@ -381,7 +381,7 @@ def make_env(options: Options) -> Any:
     with command_line.input_checked():
         with announced(options.env, "building the environment"):
             env = environments.make_env(options.env, **settings)
-        training.check(env, options.config)
+        checks.check(env, options.config)
         if ":" in options.config.agent:
             with announced(options.env, "tracing the agent"):
                 _trace(env, options.config)

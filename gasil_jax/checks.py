@@ -1,0 +1,88 @@
+"""Refuse what training can't start from, each in one line and before it compiles."""
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from gasil_envs import own_environment
+from gasil_jax.config import Config, validate
+from gasil_jax.errors import unknown
+from gasil_jax.imitation import find_agent
+from gasil_jax.imitation.adaptive import RULES
+from gasil_jax.imitation.adversarial import BONUSES
+
+
+def check(env: Any, config: Config) -> None:
+    """Raise `ValueError` if the config can't train in the environment.
+
+    Nothing is compiled.
+    """
+    if isinstance(env, type):
+        raise ValueError(
+            f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
+        )
+    for name in ("reset", "step", "observation_size", "action_size"):
+        if not hasattr(env, name):
+            raise ValueError(
+                f"env is {env!r}, which has no {name}: it must be an environment with "
+                "Brax's interface, as gasil_jax.make_env gives"
+            )
+    _refuse_automatic_resets(env)
+    if jax.config.read("jax_enable_x64"):
+        raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
+    validate(config)
+    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
+        if (value := getattr(config, name)) not in allowed:
+            raise ValueError(unknown(name, value, tuple(allowed)))
+    *_, innermost = _levels(env)
+    # Ours and Brax's need no check, and tracing one takes seconds.
+    if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
+        own_environment.check(type(innermost).__name__, env, env)
+    limit = getattr(env, "episode_length", math.inf)
+    if (config.max_episode_steps or 0) > limit:
+        raise ValueError(
+            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
+            f"limit is {limit}"
+        )
+    find_agent(config.agent).check(config, env.observation_size, env.action_size)
+
+
+def _refuse_automatic_resets(env: Any) -> None:
+    """Raise `ValueError` if a wrapper resets the environment when an episode ends.
+
+    The value of a truncated episode would then be bootstrapped from the first
+    observation of the next one.
+    """
+    for level in _levels(env):
+        if "AutoReset" in (name := type(level).__name__):
+            raise ValueError(
+                f"env is wrapped in {name}: it must not reset itself (for a Brax "
+                "environment use brax.envs.get_environment)"
+            )
+
+
+def _levels(env: Any) -> Iterator[Any]:
+    """Yield an environment, what it wraps, and so on down to the innermost one."""
+    level = env
+    while level is not None:
+        yield level
+        # `getattr` would skip levels: wrappers forward attributes of what they wrap.
+        level = getattr(level, "__dict__", {}).get("env")
+
+
+def check_key(key: Any) -> None:
+    """Raise `ValueError` unless this is one random key, typed or of the older kind."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != jnp.uint32:
+        raise ValueError(f"key is {key!r}: it must be like jax.random.key(0)")
+    if typed and key.shape:
+        raise ValueError(
+            f"key has shape {key.shape}: it must be a single key (to train with "
+            "several, use jax.vmap)"
+        )
