@@ -11,7 +11,7 @@ from typing import Any
 import brax.envs
 import jax
 import jax.numpy as jnp
-from brax.envs import Env
+from brax.envs import Env, Wrapper
 
 from gasil_envs import locomotion, own_environment, point_mass, wrappers
 from gasil_envs.physics import native
@@ -107,6 +107,22 @@ def _build_ours(name: str, settings: Settings) -> Env:
     )
 
 
+class _OfBrax(Wrapper):
+    """An environment of Brax that keeps the size of its observations.
+
+    Brax runs a reset, operation by operation, each time that it is asked for the size.
+    """
+
+    def __init__(self, env: Env, observation_size: int):
+        super().__init__(env)
+        self._observation_size = observation_size
+
+    @property
+    def observation_size(self) -> int:
+        """The number of numbers in an observation."""
+        return self._observation_size
+
+
 def _build_of_brax(name: str) -> Env:
     """Build an environment of Brax, and trace a step without running it."""
     try:
@@ -116,13 +132,13 @@ def _build_of_brax(name: str) -> Env:
             env = brax.envs.get_environment(name.removeprefix(BRAX))
             state = jax.eval_shape(env.reset, jax.random.key(0))
             jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
+            return _OfBrax(env, state.obs.shape[-1])
     except Exception as error:
         version = importlib.metadata.version("brax")
         why = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise ValueError(
             f"env {name!r} fails within Brax {version} itself: {why}"
         ) from None
-    return env
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:

@@ -32,6 +32,7 @@ SMALL = gasil_jax.Config(
 
 def test_it_trains_an_environment_of_brax():
     env = gasil_jax.make_env("brax:fast")
+    assert env.observation_size == env.unwrapped.observation_size
     config = SMALL.replace(agent="ppo", total_steps=1024, max_episode_steps=50)
     state, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
     assert np.all(np.isfinite(metrics["policy_loss"]))
