@@ -336,9 +336,9 @@ _LAMBDA_WITH_AND_WITHOUT = (
     Arm("ppo (scaled, lambda 0.95)", "ppo", {**_LAMBDA, "decompose_rewards": False}),
 )
 _LONG_HISTORY = Arm(
-    "ppo (decomposed, scaled, lambda 0.95, long history)",
+    "ppo (decomposed, scaled, long history)",
     "ppo",
-    {**_LAMBDA, "decomposition_history_episodes": 4},
+    {"decomposition_history_episodes": 4},
 )
 #: The last is the whole episode.
 _DELAYS = (1, 5, DELAY, 100, 1000)
@@ -515,12 +515,12 @@ FIGURES: Mapping[str, Figure] = {
                 (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
                 (TASKS[:3], _NOT_CLIPPED, _DELAYS[-1:], _usual_delay, 10),
                 (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
-                (TASKS[:3], _LAMBDA_WITH_AND_WITHOUT[:1], _DELAYS, "scaled", 10),
+                (TASKS[:3], [_SCALED], _DELAYS, "scaled", 10),
                 # The others' episodes are shorter at first.
                 (("halfcheetah",), [_LONG_HISTORY], _DELAYS[-1:], "scaled", 10),
             )
         ),
-        favourite=_LAMBDA_WITH_AND_WITHOUT[0].name,
+        favourite=_SCALED.name,
         over=("reward_delay", "delay"),
     ),
     "adaptive_ablation": Figure(
