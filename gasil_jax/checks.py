@@ -15,16 +15,47 @@ from gasil_jax.imitation.adaptive import RULES
 from gasil_jax.imitation.adversarial import BONUSES
 
 
+def check_environment(env: Any) -> None:
+    """Raise `ValueError` if an environment's sizes or states do not fit training.
+
+    The environment is traced, which takes seconds for a large one. The commands do not
+    call this: `make_env` has checked every environment that they name.
+    """
+    _check_interface(env)
+    *_, innermost = _levels(env)
+    # Ours and Brax's need no check.
+    if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
+        own_environment.check(type(innermost).__name__, env, env)
+
+
 def check(env: Any, config: Config) -> None:
     """Raise `ValueError` if the config can't train in the environment.
 
-    Nothing is compiled.
+    Nothing is traced or compiled.
     """
+    _check_interface(env)
+    if not isinstance(config, Config):
+        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
+    validate(config)
+    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
+        if (value := getattr(config, name)) not in allowed:
+            raise ValueError(unknown(name, value, tuple(allowed)))
+    limit = getattr(env, "episode_length", math.inf)
+    if (config.max_episode_steps or 0) > limit:
+        raise ValueError(
+            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
+            f"limit is {limit}"
+        )
+    find_agent(config.agent).check(config, env.observation_size, env.action_size)
+
+
+def _check_interface(env: Any) -> None:
+    """Raise `ValueError` unless the environment has Brax's interface, in float32."""
     if isinstance(env, type):
         raise ValueError(
             f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
         )
-    for name in ("reset", "step", "observation_size", "action_size"):
+    for name in own_environment.INTERFACE:
         if not hasattr(env, name):
             raise ValueError(
                 f"env is {env!r}, which has no {name}: it must be an environment with "
@@ -33,23 +64,6 @@ def check(env: Any, config: Config) -> None:
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
-    if not isinstance(config, Config):
-        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
-    validate(config)
-    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
-        if (value := getattr(config, name)) not in allowed:
-            raise ValueError(unknown(name, value, tuple(allowed)))
-    *_, innermost = _levels(env)
-    # Ours and Brax's need no check, and tracing one takes seconds.
-    if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
-        own_environment.check(type(innermost).__name__, env, env)
-    limit = getattr(env, "episode_length", math.inf)
-    if (config.max_episode_steps or 0) > limit:
-        raise ValueError(
-            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
-            f"limit is {limit}"
-        )
-    find_agent(config.agent).check(config, env.observation_size, env.action_size)
 
 
 def _refuse_automatic_resets(env: Any) -> None:

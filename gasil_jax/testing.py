@@ -26,6 +26,7 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
     Raises:
       ValueError: if the config is not valid.
     """
+    checks.check_environment(env)
     checks.check(env, config)
     state = train.init(env, config, key)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)

@@ -621,6 +621,7 @@ def make_train(env: Any, config: Config) -> Train:
     Raises:
       ValueError: if the config can't train in the environment; nothing is compiled.
     """
+    checks.check_environment(env)
     checks.check(env, config)
 
     def train(

@@ -15,6 +15,9 @@ from brax.envs import Env
 
 from gasil_envs import own_code, wrappers
 
+#: The attributes of Brax's interface that training uses.
+INTERFACE = ("reset", "step", "observation_size", "action_size")
+
 
 def find(name: str) -> Callable[[], Env]:
     """Return the class or function that MODULE:NAME names.
@@ -45,7 +48,7 @@ def build(name: str) -> Env:
         raise ValueError(
             f"env {name!r} can't be built: {own_code.in_a_line(error)}"
         ) from None
-    for attribute in ("reset", "step", "observation_size", "action_size"):
+    for attribute in INTERFACE:
         if not hasattr(env, attribute):
             raise ValueError(f"env {name!r} is no environment: it has no {attribute}")
     # `registry.make` wraps it in an `EpisodeLimit`, which adds fields to its states.
@@ -117,6 +120,7 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
 def _check_states(name: str, env: Env, trained: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
     key, action = jax.random.key(0), jnp.zeros(env.action_size)
+    size = env.observation_size  # Once: Brax runs a reset for it.
     bare = _traced(name, env, "reset", key)
     stepped = _traced(name, env, "step", bare, action)
     first, then = bare, stepped
@@ -134,8 +138,8 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
             shape: tuple[int, ...] = ()
             why = ""
             if field == "obs":
-                shape = (env.observation_size,)
-                why = f", as observation_size is {env.observation_size}"
+                shape = (size,)
+                why = f", as observation_size is {size}"
             is_array = hasattr(value, "shape")
             if not is_array or value.shape != shape:
                 kind = type(value).__name__

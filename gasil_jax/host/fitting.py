@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from gasil_jax import checks
 from gasil_jax.config import Config, Range
 from gasil_jax.host import (
     driver,
@@ -89,6 +90,7 @@ def fit(
       OSError: if the folder can't be written.
       ValueError: if a value is not allowed, or if the folder holds other files.
     """
+    checks.check_environment(env)
     members = make_members(env, config, _numbers(seeds))
     for name, value in (
         ("checkpoint_every", checkpoint_every),
