@@ -196,6 +196,12 @@ def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
     assert message in captured.err
 
 
+def test_another_process_writes_the_same_bytes(finished, tmp_path):
+    assert main([*SMALL, "--out", str(tmp_path / "out")]) == 0
+    there, here = (x / "metrics.csv" for x in (finished[1], tmp_path / "out"))
+    assert here.read_bytes() == there.read_bytes()
+
+
 def test_a_refusal_starts_no_device_and_does_not_load_the_plots(tmp_path):
     # Both take seconds, and nothing compiles without a device.
     code = """
