@@ -68,7 +68,8 @@ def test_the_command_line_starts_from_the_preset():
     assert parse("point_mass", "--agent", "gasil") == gasil_jax.preset(
         "point_mass", "gasil"
     )
-    assert parse("humanoid", "--agent", "gasil") == Config(agent="gasil")
+    without_row = parse("point_mass", "--agent", "ppo+bonus")
+    assert without_row == Config(agent="ppo+bonus")
     delayed = parse("walker2d", "--reward-delay", "20")
     assert delayed == gasil_jax.preset("walker2d", "ppo+gasil", reward_delay=20)
     assert delayed != parse("walker2d")
