@@ -25,6 +25,7 @@ from experiments.search import (
     PAIR,
     TASKS,
     Point,
+    PPOValues,
     Search,
     SingleSetting,
     searches,
@@ -462,6 +463,18 @@ FIGURES: Mapping[str, Figure] = {
             base=Search,
         ),
         favourite=_LOGIT.name,
+    ),
+    "ppo_values": Figure(
+        "Dense rewards: imitation added to PPO, the rest as PPO's search chose it",
+        "",
+        joined(
+            grid(TASKS, arms, base=base)
+            for arms, base in (
+                (["ppo"], Search),
+                ([Arm(f"{x} (PPO's values)", x) for x in _PAPERS[1:]], PPOValues),
+            )
+        ),
+        favourite="ppo",
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",

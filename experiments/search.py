@@ -266,6 +266,17 @@ class SingleSetting(Search):
         return drawn[int(np.mean(ranks, axis=0).argmax())]
 
 
+@dataclasses.dataclass(frozen=True)
+class PPOValues(Search):
+    """The search of an agent on a task, with PPO's choice for all values that PPO has."""
+
+    def chosen(self, store: Store) -> Point | None:
+        """Return the chosen point with PPO's values, or None if runs are missing."""
+        own = super().chosen(store)
+        of_ppo = Search(self.env, "ppo", self.reward_delay).chosen(store)
+        return None if own is None or of_ppo is None else {**own, **of_ppo}
+
+
 def importance(agent: str, store: Store) -> dict[str, float]:
     """Return the share of the scores' variance that each hyperparameter explains alone.
 
