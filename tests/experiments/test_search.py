@@ -103,6 +103,21 @@ def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
     assert single.chosen(store) == points[1]
 
 
+def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
+    store, mixed = Store(tmp_path), search.PPOValues("hopper", "ppo+bc")
+    chosen = {}
+    for agent in ("ppo", "ppo+bc"):
+        assert mixed.chosen(store) is None
+        one = Search("hopper", agent)
+        fill(store, one, search.draw(agent), np.arange(len(search.draw(agent))))
+        fill(store, one, one.points(store), np.arange(len(one.points(store))))
+        fill(store, one, one.finalists(store), [1.0, 0.0, 0.0], range(1002, 1006))
+        chosen[agent] = one.chosen(store)
+    assert mixed.chosen(store) == {**chosen["ppo+bc"], **chosen["ppo"]}
+    assert mixed.chosen(store) != chosen["ppo+bc"]
+    assert "behavior_cloning_coefficient" not in chosen["ppo"]
+
+
 def test_which_values_suit_a_task_is_told(tmp_path):
     store, points = Store(tmp_path), search.draw("ppo")
     assert search.mean_ranks("gamma", "ant", 20, store) == {}
