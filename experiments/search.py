@@ -268,7 +268,7 @@ class SingleSetting(Search):
 
 @dataclasses.dataclass(frozen=True)
 class PPOValues(Search):
-    """The search of an agent on a task, with PPO's choice of all values that PPO has."""
+    """The search of an agent on a task, with PPO's choice of all values it shares."""
 
     def chosen(self, store: Store) -> Point | None:
         """Return the chosen point with PPO's values, or None if runs are missing."""
