@@ -320,6 +320,19 @@ _LOGIT, _CENTERED = (
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
 #: The lambda that the preset `scaled` had on all tasks before it had a rule for it.
 _LAMBDA: Point = {"gae_lambda": 0.95}
+
+
+def _up_to_eight_dimensions(size: int) -> Point:
+    """Return settings that change linearly from two dimensions to eight, then stay."""
+    share = min((size - 2) / 6, 1.0)
+    between = lambda two, eight: two * (1 - share) + eight * share
+    return {
+        "learning_rate": between(7.5e-4, 1e-4),
+        "gae_lambda": between(0.975, 0.9),
+        "initial_deviation": between(0.7, 0.25),
+    }
+
+
 #: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
     "lambda 0.95": lambda size: _LAMBDA,
@@ -331,6 +344,7 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
         "gae_lambda": max(0.9, 1 - size / 80),
         "gamma": max(0.99, 1 - size / 800),
     },
+    "all linear up to eight dimensions": _up_to_eight_dimensions,
 }
 _LAMBDA_WITH_AND_WITHOUT = (
     Arm("ppo (decomposed, scaled, lambda 0.95)", "ppo", _LAMBDA),

@@ -118,9 +118,10 @@ def test_a_figure_over_delays_is_a_row():
 
 def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path):
     panels = FIGURES["action_dimension"].panels
-    for env, inverse, both in (
-        ("swimmer", 1.0, (0.975, 0.9975)),
-        ("humanoid", 2 / 17, (0.9, 0.99)),
+    changed = ("learning_rate", "gae_lambda", "initial_deviation")
+    for env, inverse, both, linear in (
+        ("swimmer", 1.0, (0.975, 0.9975), (7.5e-4, 0.975, 0.7)),
+        ("humanoid", 2 / 17, (0.9, 0.99), (1e-4, 0.9, 0.25)),
     ):
         scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
         configs = [
@@ -134,4 +135,5 @@ def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path
             scaled.replace(gae_lambda=0.95),
             scaled.replace(gae_lambda=0.95, initial_deviation=inverse),
             scaled.replace(gae_lambda=both[0], gamma=both[1]),
+            scaled.replace(**dict(zip(changed, linear, strict=True))),
         ]
