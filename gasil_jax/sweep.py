@@ -30,7 +30,7 @@ from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.sweeps import assembly, launch, merging, shards, tables
+from gasil_jax.sweeps import assembly, launch, merging, shards, tables, trained_programs
 from gasil_jax.sweeps.points import Point, check_saved, kinds, make_points
 from gasil_jax.sweeps.shards import Program
 
@@ -89,7 +89,7 @@ def train(
         write()
 
     def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
-        tables.write_training(
+        trained_programs.write_training(
             folder,
             job.program,
             env_steps=outcome.new_steps,
@@ -106,9 +106,9 @@ def train(
         assembly.Job(
             program,
             program.folder(folder),
-            dict(zip(tables.LABELS, zip(*program.members))),
+            dict(zip(trained_programs.LABELS, zip(*program.members))),
             name=f"{name}-{program.number}",
-            finished=tables.read_training(folder, program) is not None,
+            finished=trained_programs.read_training(folder, program) is not None,
         )
         for program in programs
     ]
@@ -211,7 +211,7 @@ def _untrained(options: Options, programs: Sequence[Program]) -> list[Program]:
     """Return the programs that are not yet trained to their end in the folder `out`."""
     if options.out is None:
         return list(programs)
-    return tables.Trained(options.out, programs).unfinished()
+    return trained_programs.TrainedPrograms(options.out, programs).unfinished()
 
 
 def _refuse_other_points(points: Sequence[Point], resumed: StoredRun) -> None:
@@ -251,7 +251,7 @@ def _train_whole(options: Options, resumed: StoredRun | None) -> None:
     env = assembly.prepare(options, programs, _untrained(options, programs))
     with run_options.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
-        trained = tables.Trained(folder, programs)
+        trained = trained_programs.TrainedPrograms(folder, programs)
         summary = tables.write(folder, points, run_options.seeds_of(options), [trained])
     print(*tables.report(points, summary), f"in {folder}", sep="\n")
 
@@ -312,7 +312,7 @@ def _train_shard(
     points, programs = _plan_here(options, resumed, others)
     _refuse_other_sweep(options, shard_folder, points=points, others=others)
     programs = shards.cut_evenly(programs, shard)
-    trained = tables.Trained(shard_folder, programs)
+    trained = trained_programs.TrainedPrograms(shard_folder, programs)
     if resumed is not None and not trained.unfinished():
         print(f"shard {shard} is done, in {shard_folder}")
         return

@@ -8,6 +8,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.sweeps import shards, tables
+from gasil_jax.sweeps.trained_programs import TrainedPrograms
 
 
 def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
@@ -117,7 +118,7 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
     description = every[0].description
     points = description["points"]
     seeds = run_folder.seeds_of(description)
-    parts = [tables.Trained.from_description(*shard) for shard in every]
+    parts = [TrainedPrograms.from_description(*shard) for shard in every]
     unfinished = [
         shard.description["shard"]
         for part, shard in zip(parts, every, strict=True)

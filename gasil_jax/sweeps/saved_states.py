@@ -25,7 +25,7 @@ from gasil_jax.host.members import member
 from gasil_jax.sweeps import shards
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.shards import Program
-from gasil_jax.sweeps.tables import Trained
+from gasil_jax.sweeps.trained_programs import TrainedPrograms
 
 
 class _Summary(TypedDict):
@@ -106,7 +106,7 @@ def _find_point(
             f"run is {folder}, whose members are in its shards: name one of "
             f"{shards.root(folder)}"
         )
-    for program in Trained.from_description(folder, description).programs:
+    for program in TrainedPrograms.from_description(folder, description).programs:
         indices = [i for i, (index, _) in enumerate(program.members) if index == point]
         if indices:
             return Saved(program.folder(folder) / "checkpoints", program, indices)

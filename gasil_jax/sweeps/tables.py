@@ -1,9 +1,7 @@
 """Make a sweep's tables, such as results.csv, from the folders of its programs.
 
-A program's folder holds metrics.csv, with a row for each member and iteration; once
-trained, training.json; and evaluations.csv if policies were evaluated. The tables are
-made from these files alone, whether one process trained all programs or shards did on
-many hosts.
+They are made from the programs' files alone, whether one process trained all programs
+or shards did on many hosts.
 """
 
 import csv
@@ -11,165 +9,15 @@ import dataclasses
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 import numpy as np
 
-from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import importance
-from gasil_jax.host import json_reader, metrics_files, output_file, run_folder
-from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.points import Point, check_saved
-from gasil_jax.sweeps.shards import Program
-
-#: The columns of metrics.csv that identify the members.
-LABELS = ("point", "seed")
-_TRAINING = "training.json"
-
-Member = tuple[int, int]
-
-
-def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> None:
-    """Write training.json, which marks a program as trained to its end.
-
-    Args:
-      folder: folder of the sweep or shard.
-      program: the program.
-      **measured: "env_steps" (over all members), "compile_seconds", "train_seconds"
-        and "evaluation_seconds" (None without evaluations), all measured in the
-        process that finished the program; "device" and "device_count".
-    """
-    iterations = program.config.num_iterations
-    content = {"iterations": iterations, "members": len(program.members), **measured}
-    content["versions"] = metrics_files.versions()
-    metrics_files.write_json(program.folder(folder) / _TRAINING, content)
-
-
-class _Training(TypedDict):
-    """The content of training.json."""
-
-    iterations: int
-    members: int
-    env_steps: int
-    compile_seconds: float
-    train_seconds: float
-    evaluation_seconds: NotRequired[float | None]
-    device: str
-    device_count: int
-    versions: dict[str, str | None]
-
-
-def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | None:
-    """Return what `write_training` wrote; None if the program is not yet finished.
-
-    Args:
-      folder: folder of the sweep or shard.
-      program: the program, whose config says where its end is.
-    """
-    try:
-        content = json_reader.read(program.folder(folder) / _TRAINING, _Training)
-    except (FileNotFoundError, NotADirectoryError, ValueError):
-        return None
-    ended = content["iterations"] == program.config.num_iterations
-    return content if ended and content["members"] == len(program.members) else None
-
-
-@dataclasses.dataclass(frozen=True)
-class Trained:
-    """The folder of a sweep or a shard, and the programs that are trained in it.
-
-    Attributes:
-      folder: folder of the sweep or shard.
-      programs: the programs, with only the members that are trained there.
-    """
-
-    folder: pathlib.Path
-    programs: Sequence[Program]
-
-    @classmethod
-    def from_description(
-        cls, folder: pathlib.Path, description: Mapping[str, Any]
-    ) -> "Trained":
-        """Return the programs of a folder, from its config.json (`run_folder.read`).
-
-        Raises:
-          InputError: if its points can't be trained.
-        """
-        check_saved(
-            description["points"], description["config"], folder / "config.json"
-        )
-        seeds = run_folder.seeds_of(description)
-        programs = shards.programs(
-            description["config"],
-            description["points"],
-            seeds,
-            description["share_counts"],
-        )
-        if description["shard"] is not None:
-            programs = shards.cut_evenly(programs, shards.parse(description["shard"]))
-        return cls(folder, programs)
-
-    def unfinished(self) -> list[Program]:
-        """Return the programs that are not trained to their end."""
-        return [
-            program
-            for program in self.programs
-            if read_training(self.folder, program) is None
-        ]
-
-    def trainings(self) -> list[dict[str, Any]]:
-        """Return what `read_training` reads, for each finished program."""
-        read = [read_training(self.folder, program) for program in self.programs]
-        return [training for training in read if training is not None]
-
-    def members(self) -> dict[Member, dict[str, np.ndarray]]:
-        """Return every metric of every member, (iterations,) each; NaN where empty.
-
-        Raises:
-          InputError: if a metrics.csv is damaged.
-        """
-        every: dict[Member, dict[str, np.ndarray]] = {}
-        for program in self.programs:
-            required, rows = metrics_files.SUMMARIZED, program.config.num_iterations
-            every |= self._table(program, "metrics.csv", required, rows)
-        return every
-
-    def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
-        """Return every member's scores, (evaluations,) each; empty without evaluations.
-
-        Raises:
-          InputError: if an evaluations.csv is damaged.
-        """
-        every: dict[Member, dict[str, np.ndarray]] = {}
-        for program, training in zip(self.programs, self.trainings(), strict=True):
-            if training.get("evaluation_seconds") is not None:
-                every |= self._table(program, "evaluations.csv", ("mean",))
-        return every
-
-    def _table(
-        self,
-        program: Program,
-        name: str,
-        required: Sequence[str],
-        rows: int | None = None,
-    ) -> dict[Member, dict[str, np.ndarray]]:
-        """Return a program's complete table by member, checking columns and `rows`."""
-        path, config = program.folder(self.folder) / name, program.config
-        try:
-            columns = metrics_files.read_metrics(
-                path, LABELS, len(program.members), required
-            )
-        except OSError as error:
-            raise InputError(f"{path} is damaged: {error}") from None
-        steps = columns["env_steps"][0]
-        whole = steps[-1] == config.num_iterations * config.batch_steps
-        if not whole or rows not in (None, len(steps)):
-            raise InputError(f"{path} is damaged: it lacks iterations")
-        return {
-            member: {column: x[position] for column, x in columns.items()}
-            for position, member in enumerate(program.members)
-        }
+from gasil_jax.host import metrics_files, output_file
+from gasil_jax.sweeps.points import Point
+from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,7 +57,7 @@ class _Results:
 
 
 def _results(
-    points: Sequence[Point], seeds: Sequence[int], parts: Sequence[Trained]
+    points: Sequence[Point], seeds: Sequence[int], parts: Sequence[TrainedPrograms]
 ) -> _Results:
     """Return the results that the tables of a sweep's parts hold."""
     members: dict[Member, dict[str, np.ndarray]] = {}
@@ -239,7 +87,7 @@ def write(
     folder: pathlib.Path,
     points: Sequence[Point],
     seeds: Sequence[int],
-    parts: Sequence[Trained],
+    parts: Sequence[TrainedPrograms],
 ) -> dict[str, Any]:
     """Write results.csv, curves.npz, summary.json and the plots; return the summary.
 
@@ -298,7 +146,7 @@ def _summary(
     Args:
       results: the results.
       varied: the values of the hyperparameters that vary, from `_varied`.
-      trainings: what `Trained.trainings` returns, for all parts.
+      trainings: what `TrainedPrograms.trainings` returns, for all parts.
     """
     mean, diverged = results.mean, results.diverged
     others = dict(results.finals)
@@ -347,7 +195,7 @@ def _draw_hyperparameters(
 
 
 def _varied(
-    parts: Sequence[Trained], names: Sequence[str], points: Sequence[int]
+    parts: Sequence[TrainedPrograms], names: Sequence[str], points: Sequence[int]
 ) -> dict[str, list[Any]]:
     """Return the values of the names in which points differ, (points,) each."""
     trained: dict[int, dict[str, Any]] = {}

@@ -17,7 +17,7 @@ from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, metrics_files, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.sweeps import assembly, launch, shards, tables
+from gasil_jax.sweeps import assembly, launch, shards, tables, trained_programs
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -88,7 +88,7 @@ def train(folder, shard=None, *arguments):
     for program in programs:
         program_folder = program.folder(folder)
         program_folder.mkdir(parents=True)
-        labels = dict(zip(tables.LABELS, zip(*program.members)))
+        labels = dict(zip(trained_programs.LABELS, zip(*program.members)))
         writer = metrics_files.MetricsWriter(program_folder / "metrics.csv", labels)
         steps = np.array([100.0, 200.0, 300.0])
         value = np.array([[10.0 * i + seed] for i, seed in program.members]) + steps
@@ -101,7 +101,7 @@ def train(folder, shard=None, *arguments):
             }
         )
         writer.close()
-        tables.write_training(
+        trained_programs.write_training(
             folder,
             program,
             env_steps=300 * len(program.members),
@@ -110,7 +110,7 @@ def train(folder, shard=None, *arguments):
             device="1 x cpu",
             device_count=1,
         )
-    return tables.Trained(folder, programs), points
+    return trained_programs.TrainedPrograms(folder, programs), points
 
 
 TABLES = ("results.csv", "curves.npz", "sweep.png", "hyperparameters.png")
