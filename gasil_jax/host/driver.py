@@ -21,6 +21,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, command_line, metrics_files, run_folder
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import Members
+from gasil_jax.host.periodic_checkpoints import CheckpointSchedule, PeriodicCheckpoints
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker, log
@@ -29,25 +30,8 @@ from gasil_jax.train import TrainState
 # Largest duration of a chunk. The progress display is updated, and Ctrl-C takes effect,
 # after each chunk.
 _SECONDS_PER_CHUNK = 5.0
-_SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
 _Columns = Mapping[str, np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True)
-class CheckpointSchedule:
-    """The times of checkpoints and the number to keep.
-
-    Attributes:
-      every: environment steps per seed between two checkpoints, rounded up to whole
-        iterations; None writes one every ten minutes.
-      keep: number of newest checkpoints to keep. One more is kept: the one with the
-        best evaluation or, without evaluations, with the best returns since the
-        checkpoint before it. 0 writes none.
-    """
-
-    every: int | None
-    keep: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -241,51 +225,6 @@ class _Tables:
             tracker.close()
 
 
-class _Checkpoints:
-    """Writes the checkpoints of members, and decides when.
-
-    Args:
-      root: the folder of the checkpoints.
-      schedule: the times of checkpoints and the number to keep.
-      batch_steps: environment steps of a seed in an iteration.
-    """
-
-    def __init__(
-        self, root: pathlib.Path, schedule: CheckpointSchedule, batch_steps: int
-    ):
-        self._root, self._keep, self._interval = root, schedule.keep, None
-        if schedule.every is not None:
-            self._interval = math.ceil(schedule.every / batch_steps)
-        self._saved_at = time.monotonic()
-        self._best_score = checkpoint.best_score(root)
-
-    def iterations_left(self, done: int) -> float:
-        """Return the iterations to the next checkpoint; infinity if time decides."""
-        if self._interval is None:
-            return math.inf
-        return self._interval - done % self._interval
-
-    def is_due(self, done: int, score: float | None) -> bool:
-        """Return whether it is time for a checkpoint or the score is the best yet."""
-        if score is not None and score > self._best_score:
-            return True
-        if self._interval is None:
-            return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        return done % self._interval == 0
-
-    def save(self, training: _Training, tables: _Tables, progress: Progress) -> None:
-        """Write a checkpoint, and delete older ones that need not be kept."""
-        if tables.score is not None:
-            self._best_score = max(self._best_score, tables.score)
-        with progress.aside("saving a checkpoint"):
-            record = tables.record()
-            if self._keep:
-                states = training.members.trim(training.states)
-                checkpoint.write(self._root, training.done, states, record)
-                checkpoint.prune(self._root, self._keep)
-                self._saved_at = time.monotonic()
-
-
 def _restored(
     members: Members, root: pathlib.Path, progress: Progress, tables: Sequence[str]
 ) -> tuple[_Training, Mapping[str, Any] | None]:
@@ -345,6 +284,20 @@ def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int 
     return 0 if path.exists() else None
 
 
+def _save(
+    checkpoints: PeriodicCheckpoints,
+    training: _Training,
+    tables: _Tables,
+    progress: Progress,
+) -> None:
+    """Write the tables to the disk, and a checkpoint if any are kept."""
+    with progress.aside("saving a checkpoint"):
+        states = training.members.trim(training.states)
+        checkpoints.save(
+            training.done, states, record=tables.record(), score=tables.score
+        )
+
+
 def drive(
     members: Members,
     folder: pathlib.Path,
@@ -394,7 +347,7 @@ def drive(
             record=record,
         )
     on_restored()
-    checkpoints = _Checkpoints(root, schedule, members.config.batch_steps)
+    checkpoints = PeriodicCheckpoints(root, schedule, members.config.batch_steps)
     first = training.done
     steps_of = lambda done: steps_before + members.env_steps(done)
 
@@ -420,11 +373,11 @@ def drive(
             )
         scores = tables.evaluate(training, progress)
         if checkpoints.is_due(training.done, tables.score):
-            checkpoints.save(training, tables, progress)
+            _save(checkpoints, training, tables, progress)
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
     train_seconds = time.monotonic() - started
-    checkpoints.save(training, tables, progress)
+    _save(checkpoints, training, tables, progress)
     with progress.aside("closing the trackers"):
         tables.close()
     if interruption.signal is not None and training.left and not stopped:

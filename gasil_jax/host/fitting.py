@@ -22,6 +22,7 @@ from gasil_jax.host import (
 from gasil_jax.host.driver import Callback, FitProgress
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import make_members
+from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import Progress
 from gasil_jax.train import TrainState
@@ -102,9 +103,7 @@ def fit(
     if folder is None and (resume or checkpoint_every is not None):
         name = "resume" if resume else "checkpoint_every"
         raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")
-    schedule = driver.CheckpointSchedule(
-        checkpoint_every, keep=0 if folder is None else 2
-    )
+    schedule = CheckpointSchedule(checkpoint_every, keep=0 if folder is None else 2)
     evaluation_schedule = None
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)

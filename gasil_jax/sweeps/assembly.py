@@ -24,6 +24,7 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import Members, make_members
+from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.progress import Progress, announced
 from gasil_jax.host.run_options import Options, evaluation_schedule, make_env
 from gasil_jax.sweeps.shards import Program
@@ -143,9 +144,7 @@ def train(
       OSError: if a folder can no longer be written.
       ValueError: if a job to continue does not fit the options.
     """
-    schedule = driver.CheckpointSchedule(
-        options.checkpoint_every, options.keep_checkpoints
-    )
+    schedule = CheckpointSchedule(options.checkpoint_every, options.keep_checkpoints)
     num_members = sum(len(job.program.members) for job in jobs)
     total_steps = options.config.total_steps * num_members
     kind = "seeds" if num_members == options.seeds else "members"
