@@ -73,32 +73,33 @@ CLAIMS = (
         needed=2,
     ),
     Claim(
-        "Dense rewards: it is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
+        "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
         "matrix",
         _ahead(1, _OTHERS),
         needed=4,
     ),
     Claim(
-        "Delayed rewards: it is ahead of them on all tasks (in the paper by a large "
-        "margin, which is not judged here)",
+        "Delayed rewards: PPO+GASIL is ahead of these three on all tasks (in the paper "
+        "by a large margin, which is not judged here)",
         "matrix",
         _ahead(DELAY, _OTHERS),
         needed=6,
     ),
     Claim(
-        "Noise: the gap to PPO is larger with it",
+        "Noise on observations: PPO+GASIL's lead over PPO is larger with it",
         "stochastic_walker2d",
         {key[0]: [(key, "better")] for key in _GROWS},
         needed=3,
     ),
     Claim(
-        "Discriminator updates: too few (1) and too many (20) do poorly",
+        "Discriminator updates: PPO+GASIL does poorly with too few (1) or too many "
+        "(20)",
         "hyperparameters",
         _comparisons("hyperparameters", "discriminator_updates"),
         needed=4,
     ),
     Claim(
-        "Buffer: too small (500 steps) and too large (5000) do poorly",
+        "Buffer: PPO+GASIL does poorly if it is too small (500 steps) or large (5000)",
         "hyperparameters",
         _comparisons("hyperparameters", "buffer_steps"),
         needed=4,
