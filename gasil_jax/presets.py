@@ -5,9 +5,10 @@ A preset has rows, each for an environment and an agent. A row overrides the def
 
 "tuned" has the settings that a search chose for an agent on a task, with the number of
 environments and the normalization of rewards that it ran with. Alpha suits only that
-normalization. If the stored search is complete, the row is its choice; the other rows
-are from earlier searches. Adaptive imitation has one setting for all locomotion tasks.
-An agent without a row for a task starts from the defaults.
+normalization. The rows of locomotion tasks, and those of PPO and PPO+GASIL on the dense
+point mass, are from the stored searches; the other rows of the point mass are from
+earlier ones. Adaptive imitation has one setting for all locomotion tasks. An agent
+without a row for a task starts from the defaults.
 
 "decomposed" has the settings that a search chose on each task for PPO on decomposed
 rewards, where rewards are delayed.

@@ -312,6 +312,18 @@ def test_the_summary_and_the_readme_are_what_the_stored_runs_say(published):
     assert presets.TUNED.read_text() == published.tuned()
 
 
+def test_the_readme_says_what_the_verdicts_on_the_mujoco_tasks_say(published):
+    verdicts = [
+        published.verdict(claim)
+        for claim in summary.CLAIMS
+        if not claim.words.startswith(("Point mass", "Control"))
+    ]
+    none = all(verdict.startswith("does not hold") for verdict in verdicts)
+    words = " ".join(summary.README.read_text().split())
+    assert len(verdicts) == 5
+    assert ("on the MuJoCo tasks none holds here" in words) == none
+
+
 def test_seeds_in_words():
     assert report._ranges([0, 1, 2, 4, 6, 7]) == "0 to 2, 4, 6 to 7"
     assert report._ranges([3]) == "3"
