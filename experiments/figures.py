@@ -479,7 +479,7 @@ FIGURES: Mapping[str, Figure] = {
         favourite=_LOGIT.name,
     ),
     "ppo_values": Figure(
-        "Dense rewards: imitation added to PPO, the rest as PPO's search chose it",
+        "Dense rewards: the paper's agents with the values that PPO's search chose",
         "",
         joined(
             grid(TASKS, arms, base=base)

@@ -53,21 +53,24 @@ PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 
 _READING = """## How to read this
 
-A final return is the mean, over the iterations of the last tenth of training, of the
-mean return of the episodes that end in an iteration, with the acting policy. Shown is
-the interquartile mean over seeds and, in brackets, its 95% interval, by the percentile
-bootstrap over seeds, which covers a little less than 95% with ten seeds. "Evaluated" is
-the interquartile mean of the last policy's returns with its mean actions, without
-noise; a number in brackets says how many seeds were evaluated, where not all were.
-Better and worse are verdicts on differences, by a permutation test and the bootstrap
-together (differences of differences: by the bootstrap alone), corrected by Holm's
-method for the {} comparisons of final returns on this page. If no two curves differed,
-the chance of even one "better" or "worse" would be at most 5% (about 5% for differences
-of differences). Verdicts on evaluated returns are a family of their own. All verdicts
-are about these settings: the intervals leave out that another search might have chosen
-others. "Not clear" does not mean that two are equal. The probability of improvement is
-the probability that a random seed of the first curve has a higher return than a random
-seed of the second, where equal ones count half, averaged over the tasks."""
+- **Final return:** the mean, over the iterations of the last tenth of training, of the
+  mean return of the episodes that end in an iteration, with the acting policy. The
+  interquartile mean over seeds is shown and, in brackets, its 95% interval, by the
+  percentile bootstrap over seeds, which covers a little less than 95% with ten seeds.
+- **Evaluated:** the interquartile mean of the last policy's returns with its mean
+  actions, without noise. A number in brackets says how many seeds were evaluated, where
+  not all were.
+- **Better, worse:** verdicts on differences, by a permutation test and the bootstrap
+  together (differences of differences: by the bootstrap alone), corrected by Holm's
+  method for the {} comparisons of final returns on this page. If no two curves
+  differed, the chance of even one "better" or "worse" would be at most 5% (about 5% for
+  differences of differences). Verdicts on evaluated returns are corrected on their own.
+  All verdicts are about these settings: the intervals leave out that another search
+  might have chosen others.
+- **Not clear:** neither; it does not mean that two are equal.
+- **Probability of improvement:** the probability that a random seed of the first curve
+  has a higher return than a random seed of the second, where equal ones count half,
+  averaged over the tasks."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

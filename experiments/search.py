@@ -38,12 +38,12 @@ _POINTS, SEEDS = 12, range(1000, 1002)
 _FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
 #: How a search chooses its point, for the pages.
 PROTOCOL = (
-    f"For every agent {_POINTS} points are drawn, the same on all tasks, and each is "
-    f"trained on each task with {len(SEEDS)} seeds. Where the best of them has a value "
-    "at an end of its grid, the next value beyond is tried too. The best "
-    f"{_FINALISTS} of all are trained with {len(FINALIST_SEEDS)} seeds in all, and the "
-    "best of these is chosen, each time by the mean return over the last fifth of "
-    "training."
+    f"For every agent {_POINTS} points (values of its hyperparameters) are drawn, the "
+    f"same on all tasks, and each is trained on each task with {len(SEEDS)} seeds. "
+    "Where the best of them has a value at an end of its grid, the next value beyond is "
+    f"tried too. The best {_FINALISTS} of all points are then trained with "
+    f"{len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen, each time "
+    "by the mean return over the last fifth of training."
 )
 #: The values for every agent, and those for some.
 _SHARED: Space = {
