@@ -40,8 +40,8 @@ _FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
 PROTOCOL = (
     f"For every agent {_POINTS} points (values of its hyperparameters) are drawn, the "
     f"same on all tasks, and each is trained on each task with {len(SEEDS)} seeds. "
-    "Where the best of them has a value at an end of its grid, the next value beyond is "
-    f"tried too. The best {_FINALISTS} of all points are then trained with "
+    "Where the best of them has a value at an end of its grid, the next value beyond "
+    f"is tried too. The best {_FINALISTS} of all points are then trained with "
     f"{len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen, each time "
     "by the mean return over the last fifth of training."
 )
