@@ -392,7 +392,7 @@ def _trace(env: Any, config: Config) -> None:
     """Trace the first state and one iteration of a custom agent, without running them.
 
     Raises:
-      InputError: if that raises an error, or if a shape or dtype in its state changes.
+      InputError: if that raises an error, or if a dtype in its state changes.
     """
     agent = f"agent {config.agent!r}"
     step = lambda state: training.iterate(env, config, state)[0]
@@ -404,7 +404,7 @@ def _trace(env: Any, config: Config) -> None:
         why = own_code.in_a_line(error, package)
         raise InputError(f"{agent} can't be traced: {why}") from None
     leaves = jax.tree_util.tree_leaves_with_path(first.imitation)
-    # A tree of another structure has raised an error above.
+    # Another structure or shape has raised an error above.
     for (path, x), y in zip(leaves, jax.tree.leaves(then.imitation), strict=True):
         before, after = own_code.described(x), own_code.described(y)
         if before != after:

@@ -1,6 +1,5 @@
 """The interface between the training loop and an imitation method."""
 
-import functools
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
@@ -130,7 +129,8 @@ def checked(agent: Imitation, name: str) -> Imitation:
 
     Returns:
       The agent. Its functions raise `ValueError` if they return too few or too many
-      values, or rewards or an advantage of a wrong shape.
+      values, metrics that are no dict, rewards or an advantage of a wrong shape, or a
+      state or networks of other shapes than they were given.
     """
 
     def call(function: str, *arguments: Any) -> Any:
@@ -142,7 +142,29 @@ def checked(agent: Imitation, name: str) -> Imitation:
                 f"value{'s' * (count != 1)}: it must return {len(names)}, "
                 f"{', '.join(names)}"
             )
+        if not isinstance(outputs[-1], Mapping):
+            raise ValueError(
+                f"{function} of agent {name!r} returns metrics {outputs[-1]!r}: they "
+                "must be a dict"
+            )
         return outputs
+
+    def check_shapes(function: str, what: str, value: Any, before: Any) -> None:
+        # Undoing an update that is not finite would broadcast other shapes.
+        described = [
+            {
+                jax.tree_util.keystr(path): f"of shape {jnp.shape(leaf)}"
+                for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+            }
+            for tree in (before, value)
+        ]
+        for path in described[0] | described[1]:
+            expected, given = (leaves.get(path, "missing") for leaves in described)
+            if given != expected:
+                raise ValueError(
+                    f"{function} of agent {name!r}: the returned {what}{path} is "
+                    f"{given}: it must be {expected}, as before"
+                )
 
     def check_shape(function: str, what: str, value: Any, expected: Any) -> None:
         if jnp.shape(value) != expected:
@@ -153,10 +175,19 @@ def checked(agent: Imitation, name: str) -> Imitation:
 
     def update_and_reward(state: Any, context: Context, key: jax.Array) -> Any:
         outputs = call("update_and_reward", state, context, key)
+        check_shapes("update_and_reward", "state", outputs[0], state)
         rewards, expected = outputs[1], context.rollout.reward.shape
         if agent.num_streams > 1 or jnp.ndim(rewards) == 3:
             expected = (*expected, agent.num_streams)
         check_shape("update_and_reward", "rewards", rewards, expected)
+        return outputs
+
+    def update_policy(
+        state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
+    ) -> Any:
+        outputs = call("update_policy", state, actor_critic, context, key)
+        check_shapes("update_policy", "state", outputs[0], state)
+        check_shapes("update_policy", "actor_critic", outputs[1], actor_critic)
         return outputs
 
     def mix(state: Any, advantages: jax.Array, context: Context) -> Any:
@@ -166,7 +197,7 @@ def checked(agent: Imitation, name: str) -> Imitation:
 
     return agent._replace(
         update_and_reward=update_and_reward,
-        update_policy=functools.partial(call, "update_policy"),
+        update_policy=update_policy,
         mix=mix,
     )
 

@@ -63,6 +63,14 @@ def grows(state, context, key):
     return {"count": jnp.zeros(3)}, context.rollout.reward, {}
 
 
+def shrinks(state, context, key):
+    return {"count": state["count"].sum()}, context.rollout.reward, {}
+
+
+def forgets(state, policy, context, key):
+    return state, (), {}
+
+
 OWN = Imitation(no_state, reward, leave_policy, fields=(), hyperparameters=Own)
 TAKEN = OWN._replace(hyperparameters=Taken)
 COLUMN = OWN._replace(hyperparameters=Column)
@@ -72,6 +80,17 @@ MISSPELT = OWN._replace(fields=("alhpa",))
 MANY = OWN._replace(update_and_reward=rewards)
 UNFINISHED = OWN._replace(update_and_reward=unfinished)
 GROWS = OWN._replace(init=start, update_and_reward=grows)
+SHRINKS = OWN._replace(
+    init=lambda *_: {"count": jnp.zeros(3)}, update_and_reward=shrinks
+)
+TURNS = OWN._replace(
+    init=lambda *_: {"count": jnp.int32(0)},
+    update_and_reward=lambda state, context, key: (
+        {"count": state["count"] + 0.5}, context.rollout.reward, {}
+    ),
+)
+FORGETS = OWN._replace(update_policy=forgets)
+SILENT = OWN._replace(update_policy=lambda state, policy, *_: (state, policy, None))
 NO_CLASS = OWN._replace(hyperparameters={"my_weight": 0.5})
 TWO = OWN._replace(update_and_reward=lambda state, context, key: (state, {}))
 FOUR = OWN._replace(update_policy=lambda state, policy, *_: (state, policy, {}, {}))
@@ -151,8 +170,15 @@ def test_every_command_takes_it(tmp_path, capsys):
         ),
         (
             "my_agents:GROWS",
-            r"state\['count'\] is float32\[\] at the start and float32\[3\] after",
+            r"update_and_reward of .* state\['count'\] is of shape \(3,\): .* \(\), as",
         ),
+        ("my_agents:SHRINKS", r"state\['count'\] is of shape \(\): .* \(3,\), as"),
+        (
+            "my_agents:TURNS",
+            r"state\['count'\] is int32\[\] at the start and float32\[\] after",
+        ),
+        ("my_agents:FORGETS", r"update_policy of .* returned actor_critic.* missing:"),
+        ("my_agents:SILENT", "update_policy .* returns metrics None: .* be a dict"),
         ("leaves:OWN", "'leaves:OWN' can't be imported: SystemExit: 3"),
         ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
     ],
