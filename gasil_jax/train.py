@@ -80,14 +80,15 @@ def init(
 
     Args:
       env: one environment with Brax's interface, not wrapped to reset itself.
-      config: the agent and all sizes; only `make_train` checks it.
+      config: the agent and all sizes.
       key: random key; consumed.
       hyperparameters: scalars, which may be traced; default the config's.
 
     Raises:
-      ValueError: if the key is no single random key, or if a hyperparameter is out of
-        its range and not traced.
+      ValueError: if the config can't train in the environment, if the key is no single
+        random key, or if a hyperparameter is out of its range and not traced.
     """
+    checks.check(env, config)
     checks.check_key(key)
     if hyperparameters is None:
         hyperparameters = config.hyperparameters
@@ -101,17 +102,7 @@ def init(
         jax.random.split(key, 6)
     )
     sizes = (env.observation_size, env.action_size)
-    episode_steps = max_episode_steps(env, config)
-    history = good_trajectories.init_history(
-        config.num_envs,
-        config.num_steps,
-        episode_steps,
-        *sizes,
-        keep_next=config.decompose_rewards,
-        num_episodes=(
-            config.decomposition_history_episodes if config.decompose_rewards else 1
-        ),
-    )
+    history = _init_history(env, config)
     return TrainState(
         actor_critic=_init_actor_critic(
             env, config, hyperparameters, policy_key, value_key
@@ -133,7 +124,9 @@ def init(
             env,
             env_key,
             config.num_envs,
-            age_limit=episode_steps if config.stagger_episodes else None,
+            age_limit=(
+                max_episode_steps(env, config) if config.stagger_episodes else None
+            ),
         ),
         history=history,
         # The config's buffer_steps is the size of the arrays. That of this run, which
@@ -145,6 +138,20 @@ def init(
         hyperparameters=hyperparameters,
         key=key,
         iteration=jnp.int32(0),
+    )
+
+
+def _init_history(env: Any, config: Config) -> good_trajectories.History:
+    return good_trajectories.init_history(
+        config.num_envs,
+        config.num_steps,
+        max_episode_steps(env, config),
+        env.observation_size,
+        env.action_size,
+        keep_next=config.decompose_rewards,
+        num_episodes=(
+            config.decomposition_history_episodes if config.decompose_rewards else 1
+        ),
     )
 
 
@@ -178,13 +185,30 @@ def _init_actor_critic(
     )
 
 
+def _check_state(env: Any, config: Config, state: TrainState) -> None:
+    """Raise `ValueError` where arrays would be broadcast, or steps lost, unnoticed."""
+    if shape := jnp.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
+    validate_hyperparameters(config, state.hyperparameters)
+    given = state.history.reward.shape
+    needed = jax.eval_shape(lambda: _init_history(env, config)).reward.shape
+    if given != needed:
+        raise ValueError(
+            f"state has a history of {given[1]} steps of {given[0]} environments: this "
+            f"config needs {needed[1]} steps of {needed[0]}, begin with its own init"
+        )
+
+
 @full_precision
 def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
     """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
     Args:
       env: the environment that `init` was given.
-      config: the config that `init` was given.
+      config: the config that `init` was given. Of its `hyperparameters` only the counts
+        matter, as upper limits: the state has its own, which may be replaced.
       state: the state before the iteration.
 
     Returns:
@@ -192,9 +216,12 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
       ended in the batch are NaN if none did.
 
     Raises:
-      ValueError: if an agent's metric has a name that another metric has, or if one of
-        the agent's functions returns too few or too many values, or a wrong shape.
+      ValueError: if the state is a batch of states, has a hyperparameter that is not
+        allowed, or is of a config with other sizes; if an agent's metric has a name
+        that another metric has; or if one of the agent's functions returns too few or
+        too many values, or a wrong shape.
     """
+    _check_state(env, config, state)
     agent = checked(find_agent(config.agent), config.agent)
     hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
     key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(

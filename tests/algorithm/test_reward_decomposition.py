@@ -18,6 +18,7 @@ NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT = 3, 8, 20, 2, 1
 CONFIG = gasil_jax.Config(
     num_envs=NUM_ENVS,
     batch_steps=NUM_ENVS * NUM_STEPS,
+    minibatch_size=NUM_STEPS,
     decompose_rewards=True,
     decomposition_window_steps=4,
     decomposition_minibatch_size=32,

@@ -161,6 +161,41 @@ def test_double_precision_is_refused():
     with jax.enable_x64(True):
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
             gasil_jax.make_train(env, SMALL)
+        with pytest.raises(ValueError, match="jax_enable_x64 is True"):
+            gasil_jax.init(env, SMALL, jax.random.key(0))
+
+
+def test_a_loop_of_ones_own_begins_with_a_config_that_is_allowed():
+    """Else minibatches would hold the batch's last step many times."""
+    env = gasil_jax.make_env("point_mass")
+    with pytest.raises(ValueError, match="num_envs is 3, which does not divide"):
+        gasil_jax.init(env, SMALL.replace(num_envs=3), jax.random.key(0))
+
+
+def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
+    env = gasil_jax.make_env("point_mass")
+    state = gasil_jax.init(env, SMALL, jax.random.key(0))
+    traced = lambda state, **changes: jax.eval_shape(
+        lambda state: gasil_jax.iterate(env, SMALL.replace(**changes), state), state
+    )
+    own = lambda **changes: state.replace(
+        hyperparameters=state.hyperparameters.replace(**changes)
+    )
+    # A weight for each environment would weight the rewards of each.
+    with pytest.raises(ValueError, match=r"alpha has shape \(\d+,\): .*vmap"):
+        traced(own(alpha=jnp.ones(SMALL.num_envs)))
+    with pytest.raises(ValueError, match=r"alpha is -1.0: it must be 0 or more"):
+        gasil_jax.iterate(env, SMALL, own(alpha=-1.0))
+    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), state, state)
+    with pytest.raises(ValueError, match=r"batch of 2 states: .*jax.vmap this"):
+        traced(pair)
+    # Minibatches would hold the batch's last step many times.
+    changes = {"num_envs": 2 * SMALL.num_envs}, {"batch_steps": 2 * SMALL.batch_steps}
+    for change in changes:
+        with pytest.raises(ValueError, match=r"environments: this config needs .* of"):
+            traced(state, **change)
+    # What training may go on with.
+    traced(own(alpha=0.3), total_steps=10 * SMALL.total_steps)
 
 
 @pytest.mark.parametrize("agent", ["ppo+sil", "ppo+gasil", "ppo+gasil-adaptive"])
