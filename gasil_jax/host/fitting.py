@@ -53,7 +53,7 @@ def fit(
     env: Any,
     config: Config,
     *,
-    seeds: int | Sequence[int] = 1,
+    seeds: int | Sequence[int] | np.ndarray | jax.Array = 1,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
     checkpoint_every: int | None = None,
@@ -148,7 +148,7 @@ def fit(
         )
 
 
-def _numbers(seeds: int | Sequence[int]) -> Sequence[int]:
+def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:
     """Return the numbers of the seeds, which may also be an array of integers.
 
     Raises:
