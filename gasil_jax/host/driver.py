@@ -292,9 +292,11 @@ def _save(
 ) -> None:
     """Write the tables to the disk, and a checkpoint if any are kept."""
     with progress.aside("saving a checkpoint"):
-        states = training.members.trim(training.states)
         checkpoints.save(
-            training.done, states, record=tables.record(), score=tables.score
+            training.done,
+            training.states,
+            record=tables.record(),
+            score=tables.score,
         )
 
 
@@ -347,7 +349,7 @@ def drive(
             record=record,
         )
     on_restored()
-    checkpoints = PeriodicCheckpoints(root, schedule, members.config.batch_steps)
+    checkpoints = PeriodicCheckpoints(members, root, schedule)
     first = training.done
     steps_of = lambda done: steps_before + members.env_steps(done)
 

@@ -8,6 +8,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from gasil_jax.host import checkpoint
+from gasil_jax.host.members import Members
 
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
 
@@ -32,17 +33,18 @@ class PeriodicCheckpoints:
     """Writes the checkpoints of training, and decides when.
 
     Args:
+      members: the members in training.
       root: the folder of the checkpoints.
       schedule: the times of checkpoints and the number to keep.
-      batch_steps: environment steps of a seed in an iteration.
     """
 
     def __init__(
-        self, root: pathlib.Path, schedule: CheckpointSchedule, batch_steps: int
+        self, members: Members, root: pathlib.Path, schedule: CheckpointSchedule
     ):
-        self._root, self._keep, self._interval = root, schedule.keep, None
+        self._members, self._root = members, root
+        self._keep, self._interval = schedule.keep, None
         if schedule.every is not None:
-            self._interval = math.ceil(schedule.every / batch_steps)
+            self._interval = math.ceil(schedule.every / members.config.batch_steps)
         self._saved_at = time.monotonic()
         self._best_score = checkpoint.best_score(root)
 
@@ -72,7 +74,7 @@ class PeriodicCheckpoints:
 
         Args:
           iteration: number of iterations so far.
-          states: the members' states.
+          states: the members' states, padded.
           record: what the checkpoint records beside them.
           score: the mean score of the current policies; None if they were not
             evaluated.
@@ -80,6 +82,7 @@ class PeriodicCheckpoints:
         if score is not None:
             self._best_score = max(self._best_score, score)
         if self._keep:
+            states = self._members.trim(states)
             checkpoint.write(self._root, iteration, states, record)
             checkpoint.prune(self._root, self._keep)
             self._saved_at = time.monotonic()
