@@ -14,6 +14,7 @@ With ``over=("reward_delay", "delay")`` the second is drawn over the delay.
 import dataclasses
 import functools
 import itertools
+import math
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -318,37 +319,40 @@ _LOGIT, _CENTERED = (
     for form in ("logit", "centered")
 )
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
-#: The lambda that the preset `scaled` had on all tasks before it had a rule for it.
-_LAMBDA: Point = {"gae_lambda": 0.95}
 
 
-def _up_to_eight_dimensions(size: int) -> Point:
-    """Return settings that change linearly from two dimensions to eight, then stay."""
-    share = min((size - 2) / 6, 1.0)
-    between = lambda two, eight: two * (1 - share) + eight * share
+def _by_root(size: int) -> Point:
+    """Return what the preset `scaled` had when most of its settings followed a root."""
     return {
-        "learning_rate": between(7.5e-4, 1e-4),
-        "gae_lambda": between(0.975, 0.9),
-        "initial_deviation": between(0.7, 0.25),
+        "learning_rate": 1.5e-3 / size,
+        "initial_deviation": 1 / math.sqrt(size),
+        "gae_lambda": 1 - math.sqrt(size) / 40,
     }
 
 
 #: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
-    "lambda 0.95": lambda size: _LAMBDA,
+    "by the root": _by_root,
+    "lambda 0.95": lambda size: {**_by_root(size), "gae_lambda": 0.95},
     "deviation scaled inversely, lambda 0.95": lambda size: {
-        **_LAMBDA,
+        **_by_root(size),
+        "gae_lambda": 0.95,
         "initial_deviation": 2 / size,
     },
     "lambda and gamma scaled linearly": lambda size: {
+        **_by_root(size),
         "gae_lambda": max(0.9, 1 - size / 80),
         "gamma": max(0.99, 1 - size / 800),
     },
-    "all linear up to eight dimensions": _up_to_eight_dimensions,
 }
-_LAMBDA_WITH_AND_WITHOUT = (
-    Arm("ppo (decomposed, scaled, lambda 0.95)", "ppo", _LAMBDA),
-    Arm("ppo (scaled, lambda 0.95)", "ppo", {**_LAMBDA, "decompose_rewards": False}),
+#: The first is the preset `scaled`.
+_SCALED_WITH_AND_WITHOUT = (
+    _SCALED,
+    Arm("ppo (scaled)", "ppo", {"decompose_rewards": False}),
+)
+#: The preset `scaled` had these settings when this was trained, and now similar ones.
+_BY_ROOT = Arm(
+    "ppo (decomposed, by the root)", "ppo", _by_root(presets.ACTION_SIZES["humanoid"])
 )
 _LONG_HISTORY = Arm(
     "ppo (decomposed, scaled, long history)",
@@ -379,10 +383,13 @@ def _usual_delay(env: str, agent: str, delay: int) -> Search:
     return Search(env, agent, DELAY)
 
 
+def _seeds(env: str, delay: int) -> int:
+    """Return the number of seeds: more where delayed outcomes are bimodal."""
+    return 20 if delay > 1 and env in TASKS[:4] else 10
+
+
 def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
     """Return all agents on tasks, each with what its search on the task chose.
-
-    Four tasks whose outcomes are bimodal get more seeds where rewards are delayed.
 
     Args:
       cells: tasks, each with its delay; default all.
@@ -393,7 +400,7 @@ def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
             [Arm(name, search.agent)],
             (delay,),
             base=functools.partial(Search, decompose_rewards=search.decompose_rewards),
-            seeds=20 if delay > 1 and env in TASKS[:4] else 10,
+            seeds=_seeds(env, delay),
         )
         for env, delay in cells
         for name, search in searches(env, delay).items()
@@ -425,7 +432,16 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             [
                 _matrix(cell for cell in CELLS if cell[1] > 1),
-                grid(TASKS, [_SCALED], (DELAY,), base="scaled"),
+                *(
+                    grid(
+                        (env,),
+                        [_SCALED],
+                        (DELAY,),
+                        base="scaled",
+                        seeds=_seeds(env, DELAY),
+                    )
+                    for env in TASKS
+                ),
             ]
         ),
         favourite="ppo (decomposed)",
@@ -436,7 +452,7 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             grid(TASKS, arms, (DELAY,), base=base)
             for arms, base in (
-                ([_SCALED, *_LAMBDA_WITH_AND_WITHOUT], "scaled"),
+                (_SCALED_WITH_AND_WITHOUT, "scaled"),
                 (
                     [Arm("ppo (decomposed, best mean rank)", "ppo")],
                     functools.partial(SingleSetting, decompose_rewards=True),
@@ -521,7 +537,7 @@ FIGURES: Mapping[str, Figure] = {
                     DELAY,
                     functools.partial(Search, decompose_rewards=True),
                 ),
-                ([_SCALED], DELAY, "scaled"),
+                ([_BY_ROOT], DELAY, "scaled"),
             )
         ),
     ),

@@ -24,7 +24,6 @@ parallel.
 """
 
 import json
-import math
 import pathlib
 import types
 from collections.abc import Mapping
@@ -91,21 +90,25 @@ def _scaled(decompose_rewards: bool) -> Rows:
     """Return rows for PPO whose settings depend on the dimension of an action.
 
     The searches suggest that the learning rate and the exploration must be smaller for
-    actions with more dimensions (experiments/results/matrix.md). With these rows the
-    noise on an untrained policy's action has a length of about 1 in every task. Noise
-    with more dimensions makes the returns after an action vary more, so lambda falls
-    too, from 0.96 for two dimensions to 0.90 for seventeen
-    (experiments/results/action_dimension.md).
+    actions with more dimensions (experiments/results/matrix.md). Noise in more
+    dimensions also makes the returns after an action vary more, so lambda falls too.
+    All three fall linearly from two dimensions to eight; more dimensions have the
+    values of eight (experiments/results/action_dimension.md).
     """
+
+    def between(size: int, two: float, eight: float) -> float:
+        share = min((size - 2) / 6, 1.0)
+        return two * (1 - share) + eight * share
+
     return {
         (env, "ppo"): {
             "normalize_rewards": True,
             "decompose_rewards": decompose_rewards,
             "num_envs": 32,
             "gamma": 0.995,
-            "learning_rate": 1.5e-3 / size,
-            "initial_deviation": 1 / math.sqrt(size),
-            "gae_lambda": 1 - math.sqrt(size) / 40,
+            "learning_rate": between(size, 7.5e-4, 1e-4),
+            "initial_deviation": between(size, 0.7, 0.25),
+            "gae_lambda": between(size, 0.975, 0.9),
         }
         for env, size in ACTION_SIZES.items()
     }

@@ -4,6 +4,7 @@ import pathlib
 
 import gymnasium
 import mujoco
+import numpy as np
 import pytest
 
 import gasil_envs
@@ -55,12 +56,17 @@ def test_scaled_rows_follow_the_number_of_actions(env):
     # An environment would take seconds to build.
     assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
     actions = mujoco.MjModel.from_xml_path(str(assets / locomotion.TASKS[env].xml)).nu
+    # Straight lines from two dimensions to eight; more have the values of eight.
+    ends = {
+        "learning_rate": (7.5e-4, 1e-4),
+        "initial_deviation": (0.7, 0.25),
+        "gae_lambda": (0.975, 0.9),
+    }
     for delay in (1, DELAY):
         row = gasil_jax.preset(env, "ppo", "scaled", reward_delay=delay)
-        assert row.hyperparameters.learning_rate * actions == pytest.approx(1.5e-3)
-        assert row.hyperparameters.initial_deviation**2 * actions == pytest.approx(1.0)
-        fall = 1 - row.hyperparameters.gae_lambda
-        assert (40 * fall) ** 2 == pytest.approx(actions)
+        for name, values in ends.items():
+            expected = np.interp(actions, (2, 8), values)
+            assert getattr(row.hyperparameters, name) == pytest.approx(expected)
         assert row.decompose_rewards == (delay > 1)
 
 

@@ -1,6 +1,7 @@
 """The runs that the figures request."""
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
@@ -118,12 +119,16 @@ def test_a_figure_over_delays_is_a_row():
 
 def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path):
     panels = FIGURES["action_dimension"].panels
-    changed = ("learning_rate", "gae_lambda", "initial_deviation")
-    for env, inverse, both, linear in (
-        ("swimmer", 1.0, (0.975, 0.9975), (7.5e-4, 0.975, 0.7)),
-        ("humanoid", 2 / 17, (0.9, 0.99), (1e-4, 0.9, 0.25)),
+    for env, size, inverse, both in (
+        ("swimmer", 2, 1.0, (0.975, 0.9975)),
+        ("humanoid", 17, 2 / 17, (0.9, 0.99)),
     ):
         scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
+        by_root = scaled.replace(
+            learning_rate=1.5e-3 / size,
+            initial_deviation=1 / math.sqrt(size),
+            gae_lambda=1 - math.sqrt(size) / 40,
+        )
         configs = [
             curve.runs(Store(tmp_path))[0].config
             for name, curve in panels[f"{env}-delayed"].items()
@@ -132,8 +137,8 @@ def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path
         assert scaled.decompose_rewards
         assert configs == [
             scaled,
-            scaled.replace(gae_lambda=0.95),
-            scaled.replace(gae_lambda=0.95, initial_deviation=inverse),
-            scaled.replace(gae_lambda=both[0], gamma=both[1]),
-            scaled.replace(**dict(zip(changed, linear, strict=True))),
+            by_root,
+            by_root.replace(gae_lambda=0.95),
+            by_root.replace(gae_lambda=0.95, initial_deviation=inverse),
+            by_root.replace(gae_lambda=both[0], gamma=both[1]),
         ]
