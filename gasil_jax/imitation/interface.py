@@ -130,7 +130,7 @@ def checked(agent: Imitation, name: str) -> Imitation:
     Returns:
       The agent. Its functions raise `ValueError` if they return too few or too many
       values, metrics that are no dict, rewards or an advantage of a wrong shape, or a
-      state or networks of other shapes than they were given.
+      state or networks of other shapes or dtypes than they were given.
     """
 
     def call(function: str, *arguments: Any) -> Any:
@@ -149,12 +149,14 @@ def checked(agent: Imitation, name: str) -> Imitation:
             )
         return outputs
 
-    def check_shapes(function: str, what: str, value: Any, before: Any) -> None:
-        # Undoing an update that is not finite would broadcast other shapes.
+    def check_leaves(function: str, what: str, value: Any, before: Any) -> None:
+        # Undoing an update that is not finite would broadcast or convert others.
         described = [
             {
-                jax.tree_util.keystr(path): f"of shape {jnp.shape(leaf)}"
-                for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+                jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}"
+                for path, leaf in jax.tree_util.tree_leaves_with_path(
+                    jax.eval_shape(lambda tree=tree: tree)
+                )
             }
             for tree in (before, value)
         ]
@@ -175,7 +177,7 @@ def checked(agent: Imitation, name: str) -> Imitation:
 
     def update_and_reward(state: Any, context: Context, key: jax.Array) -> Any:
         outputs = call("update_and_reward", state, context, key)
-        check_shapes("update_and_reward", "state", outputs[0], state)
+        check_leaves("update_and_reward", "state", outputs[0], state)
         rewards, expected = outputs[1], context.rollout.reward.shape
         if agent.num_streams > 1 or jnp.ndim(rewards) == 3:
             expected = (*expected, agent.num_streams)
@@ -186,8 +188,8 @@ def checked(agent: Imitation, name: str) -> Imitation:
         state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
     ) -> Any:
         outputs = call("update_policy", state, actor_critic, context, key)
-        check_shapes("update_policy", "state", outputs[0], state)
-        check_shapes("update_policy", "actor_critic", outputs[1], actor_critic)
+        check_leaves("update_policy", "state", outputs[0], state)
+        check_leaves("update_policy", "actor_critic", outputs[1], actor_critic)
         return outputs
 
     def mix(state: Any, advantages: jax.Array, context: Context) -> Any:
