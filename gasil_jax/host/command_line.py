@@ -7,6 +7,7 @@ import errno
 import functools
 import io
 import itertools
+import os
 import re
 import signal
 import sys
@@ -257,14 +258,18 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
 
     The status is 1 if a folder or file can't be read or written, or if a program that
     it started failed; 2 for bad input, which includes a file name that is too long; and
-    128 plus the signal's number if it was interrupted. Without an error it is what
-    `main` returns.
+    128 plus the signal's number if it was interrupted, or if nobody reads its output to
+    the end. Without an error it is what `main` returns.
     """
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
         try:
             return main(*args, **kwargs)
+        except BrokenPipeError:
+            # `head` reads a few lines only. Python would still try to write the rest.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            return 128 + signal.SIGPIPE
         except (InputError, OSError) as error:
             print(f"error: {error}", file=sys.stderr)
             too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import re
+import signal
 import subprocess
 import sys
 import types
@@ -222,6 +223,22 @@ print(status, xla_bridge.backends_are_initialized(), "matplotlib" in sys.modules
     assert len(result.stderr.splitlines()) == 1
     assert "did you mean 'hopper'" in result.stderr
     assert list(tmp_path.iterdir()) == []
+
+
+def test_output_that_nobody_reads_to_the_end_is_no_error():
+    code = """
+import sys
+from gasil_jax.host import command_line
+sys.exit(command_line.reports_errors(lambda: print(100_000 * "line\\n"))())
+"""
+    command = [sys.executable, "-c", code]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout.readline() == "line\n"
+        process.stdout.close()
+        assert process.stderr.read() == ""
+    assert process.returncode == 128 + signal.SIGPIPE
 
 
 def test_a_run_in_which_no_episode_can_end_is_told(capsys):
