@@ -20,7 +20,8 @@ from experiments import (
     store,
     zoo,
 )
-from experiments.figures import FIGURES, Curve, Figure, name_of
+from experiments.curves import Curve, Figure, name_of
+from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import coverage
 from experiments.store import RESULTS, ResultsFolder, Store

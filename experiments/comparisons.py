@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments.figures import Comparisons
+from experiments.curves import Comparisons
 from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
 #: Significance level of a family of verdicts.

@@ -11,14 +11,21 @@ settings. For example, an ablation with the same settings on all tasks, and many
 With ``over=("reward_delay", "delay")`` the second is drawn over the delay.
 """
 
-import dataclasses
 import functools
-import itertools
 import math
-import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Mapping
 
+from experiments.curves import (
+    Arm,
+    Comparisons,
+    Figure,
+    Panels,
+    Terms,
+    difference,
+    grid,
+    joined,
+    name_of,
+)
 from experiments.search import (
     ADAPTIVE,
     CELLS,
@@ -31,221 +38,7 @@ from experiments.search import (
     SingleSetting,
     searches,
 )
-from experiments.store import Run, Store
 from gasil_jax import presets
-from gasil_jax.config import Config
-
-#: A weighted sum of the interquartile means of curves, by panel and curve.
-Terms = tuple[tuple[float, str, str], ...]
-#: Terms to compare with 0, by (panel, ours, other), or by (panel, ours, other, a panel
-#: whose difference is subtracted).
-Comparisons = Mapping[tuple[str, ...], Terms]
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """Seeds of one agent on one task.
-
-    Attributes:
-      env: name of the task.
-      agent: name of the agent.
-      changes: hyperparameters and other fields of `Config` to change.
-      reward_delay: the task's reward delay, in steps.
-      obs_noise: standard deviation of the task's observation noise.
-      base: the settings before the changes: a preset's, by its name; the defaults of
-        `Config`, by None; or what a search chose, by a function of task, agent and
-        delay that returns the search.
-      seeds: number of seeds, from seed 0 on.
-      total_steps: environment steps per seed.
-    """
-
-    env: str
-    agent: str
-    changes: Point = dataclasses.field(default_factory=dict)
-    reward_delay: int = 1
-    obs_noise: float = 0.0
-    base: str | Callable[[str, str, int], Search] | None = "tuned"
-    seeds: int = 10
-    total_steps: int = 1_000_000
-
-    @property
-    def search(self) -> Search | None:
-        """The search that chooses the settings, or None."""
-        if callable(self.base):
-            return self.base(self.env, self.agent, self.reward_delay)
-        return None
-
-    def point(self, searched: Store) -> Point | None:
-        """Return the settings that differ from the defaults or the preset.
-
-        They are None if the curve's search is not complete in the store `searched`.
-        """
-        chosen = self.search.chosen(searched) if self.search else {}
-        return None if chosen is None else {**chosen, **self.changes}
-
-    def runs(self, searched: Store) -> tuple[Run, ...]:
-        """Return the curve's runs, or none if its search is not complete."""
-        if (point := self.point(searched)) is None:
-            return ()
-        config = Config(agent=self.agent)
-        if self.search:
-            config = self.search.config({})
-        elif isinstance(self.base, str):
-            config = presets.preset(
-                self.env, self.agent, self.base, reward_delay=self.reward_delay
-            )
-        config = config.replace(**{"total_steps": self.total_steps, **point})
-        return tuple(
-            Run(self.env, config, seed, self.reward_delay, self.obs_noise)
-            for seed in range(self.seeds)
-        )
-
-
-Panels = Mapping[str, Mapping[str, Curve]]
-
-
-@dataclasses.dataclass(frozen=True)
-class Figure:
-    """A figure and its page.
-
-    Attributes:
-      title: title of the page.
-      claim: the paper's claim; empty if it has none about this.
-      panels: the curves by panel and name.
-      favourite: name of the curve that is compared with each other curve of its panel;
-        None compares each pair of curves.
-      comparisons: comparisons to make instead of those with the favourite.
-      searches: searches that are trained before the curves, by their names.
-      over: a field of `Curve` or `Config` that is the x-axis of final returns, and the
-        axis' label; None for learning curves. Curves whose names differ only in the
-        field's value are points of one line.
-      early: number of first environment steps whose mean return is compared too, as the
-        curve "NAME early".
-    """
-
-    title: str
-    claim: str
-    panels: Panels = dataclasses.field(default_factory=dict)
-    favourite: str | None = "ppo+gasil"
-    comparisons: Comparisons | None = None
-    searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
-    over: tuple[str, str] | None = None
-    early: int | None = None
-
-    def curves(self) -> list[tuple[str, str, Curve]]:
-        """Return all curves, each with its panel and name."""
-        panels = self.panels.items()
-        return [
-            (panel, name, x) for panel, curves in panels for name, x in curves.items()
-        ]
-
-    def names(self, panels: Iterable[str] | None = None) -> list[str]:
-        """Return the names of the curves of panels, each once; default all panels."""
-        chosen = self.panels if panels is None else panels
-        return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
-
-    def point_of(self, panel: str, name: str) -> tuple[str, Any]:
-        """Return the name of the line that a curve belongs to, and its x value."""
-        if self.over is None:
-            return name, None
-        curve = self.panels[panel][name]
-        value = {**vars(curve), **curve.changes}[self.over[0]]
-        return name.replace(f"-{value}", "", 1), value
-
-    def rival(self, panel: str, name: str) -> str | None:
-        """Return the favourite's curve at the x value of a curve, or None."""
-        place = (self.favourite, self.point_of(panel, name)[1])
-        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == place)
-        return next((x for x in curves if x != name), None)
-
-    def compared(self) -> Comparisons:
-        """Return all comparisons of the figure's page: one family of tests."""
-        if self.comparisons is not None:
-            return self.comparisons
-        compared: dict[tuple[str, ...], Terms] = {}
-        for panel, curves in self.panels.items():
-            pairs = [(self.rival(panel, name), name) for name in curves]
-            if self.favourite is None:
-                pairs = [*itertools.combinations(curves, 2)]
-            for part in ("", " early") if self.early else ("",):
-                for ours, other in pairs:
-                    if ours is not None:
-                        names = f"{ours}{part}", f"{other}{part}"
-                        compared[panel, *names] = difference(panel, *names)
-        return compared
-
-    def requested(self, searched: Store) -> list[Run]:
-        """Return all runs of the figure that are known so far.
-
-        Runs that depend on the result of an incomplete search are not known yet.
-
-        Args:
-          searched: the store of the searches' runs.
-        """
-        runs = [run for x in self.searches.values() for run in x.requested(searched)]
-        runs += [run for *_, curve in self.curves() for run in curve.runs(searched)]
-        return list(dict.fromkeys(runs))
-
-
-def difference(panel: str, ours: str, other: str) -> Terms:
-    """Return the terms of one curve less another of the same panel."""
-    return ((1.0, panel, ours), (-1.0, panel, other))
-
-
-def name_of(env: str, reward_delay: int = 1) -> str:
-    """Return the name of a task with its delay, such as hopper-delayed."""
-    delayed = {1: "", DELAY: "-delayed"}.get(reward_delay, f"-delayed-{reward_delay}")
-    return f"{env}{delayed}"
-
-
-class Arm(NamedTuple):
-    """A curve of each panel of a grid: its name, its agent and what it changes."""
-
-    name: str
-    agent: str
-    changes: Point = types.MappingProxyType({})
-
-
-def grid(
-    tasks: Sequence[str],
-    arms: Sequence[Arm | str],
-    delays: Sequence[int] = (1,),
-    *,
-    panel: str = "{task}",
-    curve: str = "{arm}",
-    changes: Point = types.MappingProxyType({}),
-    **shared: Any,
-) -> Panels:
-    """Return the panels of all tasks and delays, with a curve for each arm.
-
-    Args:
-      tasks: names of the tasks.
-      arms: the arms; an agent's name alone is the agent without changes.
-      delays: reward delays of the tasks.
-      panel: name of a panel, of {task} with its delay, {env} without, and {delay}.
-      curve: name of a curve, of {arm} and {delay}.
-      changes: what all arms change.
-      **shared: other fields of all curves.
-    """
-    panels: dict[str, dict[str, Curve]] = {}
-    for env, delay, arm in itertools.product(tasks, delays, arms):
-        name, agent, own = Arm(arm, arm) if isinstance(arm, str) else arm
-        curves = panels.setdefault(
-            panel.format(task=name_of(env, delay), env=env, delay=delay), {}
-        )
-        curves[curve.format(arm=name, delay=delay)] = Curve(
-            env, agent, {**changes, **own}, delay, **shared
-        )
-    return panels
-
-
-def joined(grids: Iterable[Panels]) -> Panels:
-    """Merge the panels of several grids: panels with the same name become one."""
-    panels: dict[str, dict[str, Curve]] = {}
-    for name, curves in itertools.chain(*(panels.items() for panels in grids)):
-        panels.setdefault(name, {}).update(curves)
-    return panels
-
 
 #: The standard deviations of noise on observations (paper, figure 6).
 _NOISES = (0.0, 0.05, 0.1, 0.5)

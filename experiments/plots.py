@@ -13,7 +13,7 @@ from matplotlib.figure import Figure as Picture
 from PIL import Image
 
 from experiments.comparisons import Scores
-from experiments.figures import Figure
+from experiments.curves import Figure
 from experiments.search import AGENTS
 from experiments.store import Record
 from gasil_jax.figures import plotting

@@ -27,7 +27,8 @@ from experiments.comparisons import (
     number,
     over_tasks,
 )
-from experiments.figures import FIGURES, Curve, Figure, name_of
+from experiments.curves import Curve, Figure, name_of
+from experiments.figures import FIGURES
 from experiments.search import (
     AGENTS,
     BEYOND,

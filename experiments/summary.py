@@ -10,7 +10,8 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from experiments import report
-from experiments.figures import FIGURES, name_of
+from experiments.curves import name_of
+from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import ADAPTIVE, DELAY, TASKS
 from experiments.store import RESULTS, Store

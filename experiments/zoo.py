@@ -14,7 +14,7 @@ import numpy as np
 import tyro
 
 from experiments import report
-from experiments.figures import name_of
+from experiments.curves import name_of
 from gasil_jax import npz, numpy_policy
 from gasil_jax.errors import InputError
 from gasil_jax.evaluate import evaluate_in_gymnasium

@@ -12,8 +12,9 @@ import pytest
 
 import gasil_jax
 from experiments import __main__, engine
+from experiments.curves import Curve, Figure
 from experiments.engine import Program, Setup
-from experiments.figures import FIGURES, Curve, Figure
+from experiments.figures import FIGURES
 from experiments.store import RESULTS, Run, Store
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from experiments import search
-from experiments.figures import FIGURES, Arm, Curve, Figure, grid
+from experiments.curves import Arm, Curve, Figure, grid
+from experiments.figures import FIGURES
 from experiments.search import DELAY, PAIR, Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets

@@ -10,7 +10,8 @@ from test_figures import DELAYS
 
 from experiments import comparisons, plots, report, search, summary
 from experiments.comparisons import compare
-from experiments.figures import FIGURES, Arm, Curve, Figure, difference, grid
+from experiments.curves import Arm, Curve, Figure, difference, grid
+from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
