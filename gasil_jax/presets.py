@@ -13,8 +13,8 @@ without a row for a task starts from the defaults.
 "decomposed" has the settings that a search chose on each task for PPO on decomposed
 rewards, where rewards are delayed.
 
-"scaled" has one setting for PPO on all locomotion tasks, whose learning rate,
-exploration and lambda depend on the dimension of an action. Delayed rewards are
+"scaled" has one rule for PPO on all locomotion tasks: learning rate, exploration and
+lambda depend on the dimension of an action. Delayed rewards are
 decomposed.
 
 "paper" has the paper's batch, one environment x 2,048 steps, and what its appendix says
