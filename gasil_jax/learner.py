@@ -47,6 +47,11 @@ def descend(
     return Learner(params, optimizer_state)
 
 
+def select(condition: jax.Array, new: Any, old: Any) -> Any:
+    """Return the pytree `new` where the condition, bool (), holds, else `old`."""
+    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+
+
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
     """Undo an update that is not finite.
 
@@ -59,4 +64,4 @@ def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
     """
     finite = [jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(new)]
     healthy = jnp.all(jnp.stack(finite))
-    return healthy, jax.tree.map(lambda x, y: jnp.where(healthy, x, y), new, old)
+    return healthy, select(healthy, new, old)

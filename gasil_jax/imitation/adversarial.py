@@ -221,10 +221,6 @@ def _train_discriminator(
             value += penalty * gradient_penalty(logit, policy_pair, good_pair, share)
         return value, metrics
 
-    select = lambda condition, new, old: jax.tree.map(
-        lambda a, b: jnp.where(condition, a, b), new, old
-    )
-
     def step(state: Learner, key_and_is_taken: tuple[Any, Any]) -> Any:
         key, is_taken = key_and_is_taken
         policy_key, good_key, between_key = jax.random.split(key, 3)
@@ -240,7 +236,7 @@ def _train_discriminator(
         stepped = learner.descend(
             state, gradient, transform, hyperparameters.discriminator_learning_rate
         )
-        return select(is_taken, stepped, state), metrics
+        return learner.select(is_taken, stepped, state), metrics
 
     num_updates = config.hyperparameters.discriminator_updates
     is_taken = jnp.arange(num_updates) < jnp.asarray(
@@ -256,7 +252,7 @@ def _train_discriminator(
     metrics = {
         name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
     }
-    return select(ready, trained, state), metrics
+    return learner.select(ready, trained, state), metrics
 
 
 @jax.named_scope("discriminator")

@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gasil_jax import good_trajectories, normalization, ppo
+from gasil_jax import good_trajectories, learner, normalization, ppo
 from gasil_jax.imitation.interface import Context, Imitation, Metrics
 from gasil_jax.imitation.none import no_state, plain_reward
 from gasil_jax.learner import Learner
@@ -56,9 +56,7 @@ def _update_policy(
         jax.random.split(key, config.behavior_cloning_updates),
     )
     filled = context.good_trajectories.size > 0
-    policy = jax.tree.map(
-        lambda new, old: jnp.where(filled, new, old), cloned, actor_critic.policy
-    )
+    policy = learner.select(filled, cloned, actor_critic.policy)
     cloning_loss = jnp.where(filled, jnp.mean(values), jnp.nan)
     metrics = {"behavior_cloning_loss": cloning_loss}
     return state, actor_critic.replace(policy=policy), metrics

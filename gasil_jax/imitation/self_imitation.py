@@ -27,7 +27,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_jax import normalization, ppo
+from gasil_jax import learner, normalization, ppo
 from gasil_jax.config import Config
 from gasil_jax.good_trajectories import History
 from gasil_jax.imitation.interface import Context, Imitation, Metrics
@@ -121,7 +121,7 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
     """Return the replay with the steps of the episodes that ended in the last batch.
 
     Steps are added one environment after the other, each in time order. They get the
-    highest priority in the replay, so that each is drawn soon.
+    highest priority that a step can have, so that each is drawn soon.
     """
     return_, complete = returns_to_go(history, num_steps, gamma)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
@@ -134,15 +134,13 @@ def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Repl
     kept = complete & (rank >= count - capacity)
     index = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
     write = lambda ring, new: ring.at[index].set(new, mode="drop")
-    highest = jnp.maximum(jnp.max(replay.priority), _MIN_PRIORITY)
-    highest = jnp.where(jnp.any(replay.priority > 0), highest, 1.0)
     return Replay(
         observation=write(
             replay.observation, flat(history.in_time(history.observation))
         ),
         action=write(replay.action, flat(history.in_time(history.action))),
         return_=write(replay.return_, flat(return_)),
-        priority=write(replay.priority, highest),
+        priority=write(replay.priority, _MAX_ADVANTAGE),
         cursor=(replay.cursor + count) % capacity,
     )
 
@@ -268,9 +266,7 @@ def _update_policy(
         step, before, jax.random.split(key, config.sil_updates)
     )
     filled = jnp.any(replay.priority > 0)
-    actor_critic, priority = jax.tree.map(
-        lambda a, b: jnp.where(filled, a, b), after, before
-    )
+    actor_critic, priority = learner.select(filled, after, before)
     metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}
     return replay.replace(priority=priority), actor_critic, metrics
 

@@ -47,7 +47,14 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
         np.testing.assert_allclose(replay.observation[index, 0], kept[:, 0])
         np.testing.assert_allclose(replay.action[index, 0], -kept[:, 0])
         np.testing.assert_allclose(replay.return_[index], kept[:, 1], rtol=1e-5)
+        if batch == 3:
+            # As if the values predicted all stored returns.
+            low = jnp.where(replay.priority > 0, 1e-6, 0.0)
+            replay = replay.replace(priority=low)
     assert len(expected) > capacity
+    # New steps come first, whatever the priorities of the others.
+    assert set(np.unique(replay.priority)) <= {np.float32(1e-6), np.float32(1.0)}
+    assert jnp.max(replay.priority) == 1.0
 
 
 def test_sampling_follows_the_priorities():
