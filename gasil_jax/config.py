@@ -187,8 +187,8 @@ class Config:
       buffer_discounts: whether the good-trajectory buffer ranks episodes by their
         discounted return, as the paper does; otherwise by the undiscounted one.
       sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
-        return of their episode and s its standard deviation over the buffer; otherwise
-        uniformly.
+        return of their episode and s its standard deviation over the buffer's steps;
+        otherwise uniformly.
       learning_rate_schedule: factor that multiplies the learning rate, over environment
         steps: STEPS FACTOR pairs, linear between them (from Python also any Optax
         schedule).

@@ -43,6 +43,11 @@ class GoodTrajectories(struct.PyTreeNode):
         """The largest number of steps that fit."""
         return self.return_.shape[-1]
 
+    @property
+    def filled(self) -> jax.Array:
+        """Which slots hold a step, bool (C,)."""
+        return jnp.arange(self.capacity) < self.size
+
 
 class History(struct.PyTreeNode):
     """The last H steps of each environment, as a ring buffer over time.
@@ -220,7 +225,7 @@ def insert(
     """
     capacity = good_trajectories.capacity
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    filled = slot < good_trajectories.size
+    filled = good_trajectories.filled
     # The buffer's own content as episodes: one at each first step, and elsewhere
     # entries of length 0. An episode ends where the next one starts.
     starts = filled & (good_trajectories.time == 0)
@@ -244,7 +249,7 @@ def insert(
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]
-    time = slot - (end[rank] - length[order][rank])
+    time = slot - (end[rank] - length[source])
     is_kept = source < capacity
     kept_index = jnp.where(is_kept, source + time, 0)
     offer = jnp.where(is_kept, 0, source - capacity)
@@ -299,7 +304,7 @@ def return_weights(good_trajectories: GoodTrajectories) -> jax.Array:
 
     R is the return of the step's episode.
     """
-    filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
+    filled = good_trajectories.filled
     return_ = jnp.where(filled, good_trajectories.return_, 0.0)
     deviation = jnp.std(return_, where=filled)
     # The best episode comes first.
@@ -309,7 +314,7 @@ def return_weights(good_trajectories: GoodTrajectories) -> jax.Array:
 
 def mean_return(good_trajectories: GoodTrajectories) -> jax.Array:
     """Return the mean of `return_` over all kept steps, (); NaN if there are none."""
-    filled = jnp.arange(good_trajectories.capacity) < good_trajectories.size
+    filled = good_trajectories.filled
     total = jnp.sum(jnp.where(filled, good_trajectories.return_, 0.0))
     return jnp.where(good_trajectories.size > 0, total, jnp.nan) / jnp.maximum(
         good_trajectories.size, 1

@@ -259,7 +259,7 @@ def update(
 
     Args:
       actor_critic: the networks before the update.
-      batch: the batch, (steps, ...), with standardized advantages.
+      batch: the batch, (steps, ...), whose advantages are standardized and mixed.
       key: random key; consumed.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.

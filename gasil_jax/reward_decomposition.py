@@ -112,7 +112,7 @@ def init(
     )
 
 
-def pays(reward: jax.Array, ended: jax.Array) -> jax.Array:
+def ends_window(reward: jax.Array, ended: jax.Array) -> jax.Array:
     """Return whether a window ends with a step, bool, the shape of both arguments."""
     return (reward != 0) | ended
 
@@ -120,18 +120,19 @@ def pays(reward: jax.Array, ended: jax.Array) -> jax.Array:
 def windows(history: History, recorded_steps: jax.Array) -> Windows:
     """Return the complete windows of a history, (N, H), in time order.
 
-    A window whose first step is no longer in the history, and one whose payout is not
-    finite, is left out.
+    A window whose first step is no longer in the history, and one that ends with a NaN
+    reward, is left out.
 
     Args:
-      history: the history, with NaN rewards where a payout is not known.
+      history: the history, with NaN rewards at faulty steps and at the last step of an
+        episode that was cut short, whose return is not known.
       recorded_steps: int32 (), number of steps of each environment in the history.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     steps = reward.shape[1]
     index = jnp.arange(steps, dtype=jnp.int32)
     recorded = index >= steps - recorded_steps
-    last = pays(reward, ended) | ~recorded
+    last = ends_window(reward, ended) | ~recorded
     latest = jax.lax.cummax(jnp.where(last, index, -1), axis=1)
     before = jnp.pad(latest[:, :-1], ((0, 0), (1, 0)), constant_values=-1)
     return Windows(
@@ -271,7 +272,7 @@ def decompose(
         return mean[0] + scale[0] * output
 
     # Measure how well the windows that ended in the batch are predicted, then train.
-    ends = pays(batch.reward, batch.ended)
+    ends = ends_window(batch.reward, batch.ended)
     scored = ends & ~batch.faulty
     running = (decomposition.open_reward, decomposition.open_steps)
     before = step_rewards(decomposition.network.params, decomposition.rates)
@@ -367,15 +368,15 @@ def _train(
     return jax.lax.fori_loop(0, jnp.where(is_delayed, len(keys), 0), step, network)
 
 
-def num_parts(num_windows: int, window_numbers: int) -> int:
+def num_parts(num_windows: int, numbers_per_window: int) -> int:
     """Return the fewest equal parts of a minibatch that each fit a CPU's cache.
 
     Args:
       num_windows: W; the result divides it.
-      window_numbers: count of the network's input numbers for a window.
+      numbers_per_window: count of the network's input numbers for a window.
     """
     divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
-    fits = lambda parts: num_windows // parts * window_numbers <= _PART_NUMBERS
+    fits = lambda parts: num_windows // parts * numbers_per_window <= _PART_NUMBERS
     return next((parts for parts in divisors if fits(parts)), num_windows)
 
 

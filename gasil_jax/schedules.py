@@ -29,13 +29,13 @@ def at(
     # In float32, because int32 would overflow at 2^31 steps.
     env_steps = iteration.astype(jnp.float32) * config.batch_steps
     # A user's own loop may run for more iterations than the config has.
-    left = jnp.maximum(
+    remaining_share = jnp.maximum(
         1.0 - hyperparameters.learning_rate_decay * (iteration / config.num_iterations),
         0.0,
     )
     return hyperparameters.replace(
         learning_rate=hyperparameters.learning_rate
-        * left
+        * remaining_share
         * factor(config.learning_rate_schedule, env_steps),
         clip_epsilon=hyperparameters.clip_epsilon
         * factor(config.clip_epsilon_schedule, env_steps),

@@ -15,8 +15,9 @@ def example_context(env: Any, config: Config, key: jax.Array) -> Context:
     """Return the `Context` that an agent's functions get in the first iteration.
 
     The batch is collected with the untrained policy. The buffer holds the whole
-    episodes that ended in the batch, so it is empty if a batch is shorter than an
-    episode.
+    episodes that ended in the batch, so it is empty unless one ends within
+    `config.num_steps` steps of its environment. With `config.stagger_episodes` first
+    episodes that are cut short don't count.
 
     Args:
       env: one environment.

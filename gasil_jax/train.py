@@ -197,8 +197,18 @@ def _check_state(env: Any, config: Config, state: TrainState) -> None:
     if given != needed:
         raise ValueError(
             f"state has a history of {given[1]} steps of {given[0]} environments: this "
-            f"config needs {needed[1]} steps of {needed[0]}, begin with its own init"
+            f"config needs {needed[1]} steps of {needed[0]}: make a new state with init"
         )
+    parts = {
+        "decompose_rewards": state.reward_decomposition,
+        "normalize_rewards": state.reward_normalizer,
+    }
+    for name, part in parts.items():
+        if getattr(config, name) != (part is not None):
+            raise ValueError(
+                f"{name} is {getattr(config, name)}, but the state was made with "
+                f"{part is not None}: make a new state with init"
+            )
 
 
 @full_precision
@@ -341,10 +351,10 @@ def update_good_trajectories(
     """Insert the whole episodes that ended in a batch into the buffer.
 
     Args:
-      config: the largest number of episodes in the buffer.
+      config: its `buffer_episodes` limits the buffer.
       state: with the history and the buffer before the batch.
       batch: the batch, with the environment's own rewards.
-      hyperparameters: the largest number of steps in the buffer.
+      hyperparameters: its `buffer_steps` limits the buffer.
 
     Returns:
       The history with the batch recorded in it, and the buffer after the batch.
@@ -530,7 +540,9 @@ def advantages(
         log_prob=flat(batch.log_prob),
         advantage=flat(mixed),
         returns=flat(returns),
-    ), {"explained_variance": jnp.mean(explained), **metrics}
+    ), merge_metrics(
+        context.config.agent, {"explained_variance": jnp.mean(explained)}, metrics
+    )
 
 
 @jax.named_scope("update_policy")
@@ -602,7 +614,7 @@ def rollout_metrics(
 
 
 def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
-    """Return all metrics of an iteration as float32 scalars, by name.
+    """Return several groups of metrics as one, float32 scalars by name.
 
     Raises:
       ValueError: if two metrics have the same name, or one is not a single number.

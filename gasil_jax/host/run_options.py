@@ -52,7 +52,7 @@ class Options:
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
-        setting of PPO for all locomotion tasks; or paper, with the paper's single
+        rule of PPO for all locomotion tasks; or paper, with the paper's single
         environment per seed, which is slow with few seeds. Options override them. The
         defaults that this help shows are those without a preset.
       devices: number of CPU devices that share the seeds; default one for each core.

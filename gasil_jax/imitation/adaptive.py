@@ -11,9 +11,10 @@ Standardized advantages have no unit, so there is no alpha to tune. The weight w
 
 - the agreement max(0, corr(A_r, A_b)) over the batch: imitation counts more, the more
   the two advantages favour the same actions;
-- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between the mean returns R_B of the
-  buffer and R_pi of the policy's latest episodes, both discounted as the buffer ranks
-  them: imitation counts more, the better the buffer is than the policy.
+- the gap clip((R_B - R_pi) / (|R_B| / 4), 0, 1) between R_B, the mean return over the
+  buffer's steps, each with its episode's return, and R_pi, the mean over the policy's
+  latest episodes, both discounted as the buffer ranks them: imitation counts more, the
+  better the buffer is than the policy.
 
 `Config.imitation_rule` names the factors that are used. While the buffer is empty, w
 is 0.

@@ -70,7 +70,8 @@ def one_advantage(
 class Imitation(NamedTuple):
     """An imitation method: pure functions, and settings, for the training loop.
 
-    The method's state is a pytree that the training loop carries.
+    The method's state is a pytree that the training loop carries. Its numbers must be
+    finite from `init` on: an update after which one of them is not is undone.
 
     Attributes:
       init: (key, config, observation size, action size) -> state.
@@ -131,7 +132,15 @@ def checked(agent: Imitation, name: str) -> Imitation:
       The agent. Its functions raise `ValueError` if they return too few or too many
       values, metrics that are no dict, rewards or an advantage of a wrong shape, or a
       state or networks of other shapes or dtypes than they were given.
+
+    Raises:
+      ValueError: if the agent has several reward streams and no `mix`.
     """
+    if agent.num_streams > 1 and agent.mix is one_advantage:
+        raise ValueError(
+            f"agent {name!r} has {agent.num_streams} reward streams: it must have a "
+            "function mix that combines their advantages"
+        )
 
     def call(function: str, *arguments: Any) -> Any:
         outputs, names = getattr(agent, function)(*arguments), _OUTPUTS[function]

@@ -194,6 +194,10 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
     for change in changes:
         with pytest.raises(ValueError, match=r"environments: this config needs .* of"):
             traced(state, **change)
+    # The state decides what the rewards are, not the config.
+    for name in ("normalize_rewards", "decompose_rewards"):
+        with pytest.raises(ValueError, match=f"{name} is True, but the state .* False"):
+            traced(state, **{name: True}, decomposition_history_episodes=1)
     # What training may go on with.
     traced(own(alpha=0.3), total_steps=10 * SMALL.total_steps)
 

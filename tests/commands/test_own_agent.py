@@ -101,6 +101,12 @@ SUMMED = OWN._replace(
     )
 )
 UNMIXED = OWN._replace(mix=lambda state, advantages, context: (advantages, {}))
+STREAMS = OWN._replace(num_streams=2)
+NAMED = OWN._replace(
+    mix=lambda state, advantages, context: (
+        advantages[..., 0], {"explained_variance": 0.5}
+    )
+)
 '''
 SMALL = (*FLAGS, "--agent", "my_agents:OWN", "--devices", "1")
 
@@ -164,6 +170,8 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:ONE", "mix of agent .* returns 1 value: .* 2, advantage, metrics"),
         ("my_agents:SUMMED", r"returns rewards of shape \(4,\): it must be \(32, 4\)"),
         ("my_agents:UNMIXED", r"mix .* advantage of shape \(32, 4, 1\): .* \(32, 4\)"),
+        ("my_agents:STREAMS", "has 2 reward streams: it must have a function mix that"),
+        ("my_agents:NAMED", "names that other metrics have: explained_variance"),
         (
             "my_agents:UNFINISHED",
             r"can't be traced: AttributeError: .*my_agents.py, li",
