@@ -16,8 +16,9 @@ PPO then learns from m + s g instead of the environment's reward. The difference
 between a window's payout and the sum of m + s g over its steps is added to them in
 equal shares. So a window's rewards sum to its payout; an untrained network spreads the
 payout almost evenly; and where every step pays, the reward is the environment's own. If
-a window began in an earlier batch, only its steps in this batch get their share,
-because PPO has already learned from the earlier ones, whose shares are lost.
+a window began in an earlier batch, PPO has already learned from its earlier steps
+without their share. In the history they get it, so that a replay of whole episodes has
+it.
 """
 
 from collections.abc import Callable
@@ -296,18 +297,22 @@ def decompose(
         step_size=hyperparameters.decomposition_learning_rate,
     )
     healthy, trained = learner.keep_if_finite(trained, decomposition.network)
-    # What the network does not explain of a payout is shared by the window's steps; the
-    # shares of steps in earlier batches are lost.
+    # What the network does not explain of a payout is shared by the window's steps.
     reward = step_rewards(trained.params, rates)
     total, length, running = window_sums(reward, ends, *running)
     share = jnp.where(scored, (batch.reward - total) / length, 0.0)
-    reward = reward + at_window_end(share, ends)
+    share = at_window_end(share, ends)
+    # Steps of the history, in earlier batches, of the window that goes on in this one.
+    age = (cursor - 1 - jnp.arange(ring)) % ring
+    is_open = age < decomposition.open_steps[:, None]
+    recorded = decomposition.reward + jnp.where(is_open, share[0][:, None], 0.0)
+    reward = reward + share
     reward = jnp.where(ends & (length == 1), batch.reward, reward)
     reward = jnp.where(batch.faulty, 0.0, reward)
     decomposition = decomposition.replace(
         network=trained,
         rates=rates,
-        reward=good_trajectories.write(decomposition.reward, reward, cursor),
+        reward=good_trajectories.write(recorded, reward, cursor),
         open_reward=running[0],
         open_steps=running[1],
         recorded_steps=recorded_steps,

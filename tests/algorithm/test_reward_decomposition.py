@@ -195,6 +195,24 @@ def test_a_window_is_given_what_it_paid():
         np.testing.assert_array_equal(reward[batch.faulty], 0.0)
 
 
+def test_in_the_history_every_window_has_what_it_paid():
+    """Also one that began in an earlier batch, for a replay of whole episodes."""
+    begin_before = 0
+    for decomposition, history, _, _ in decompose_all(random_batches(1, 9)):
+        complete = reward_decomposition.windows(history, decomposition.recorded_steps)
+        reward = np.asarray(history.in_time(decomposition.reward))
+        for env, end in zip(*np.nonzero(np.asarray(complete.ends)), strict=True):
+            begin = end + 1 - int(complete.length[env, end])
+            begin_before += begin < reward.shape[1] - NUM_STEPS <= end
+            np.testing.assert_allclose(
+                reward[env, begin : end + 1].sum(),
+                complete.payout[env, end],
+                rtol=1e-4,
+                atol=1e-5,
+            )
+    assert begin_before > 5
+
+
 def test_a_failed_update_leaves_the_network_and_nothing_else():
     batches = list(random_batches(2, 5))
     usual = list(decompose_all(batches))
