@@ -138,11 +138,7 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
         "gamma": max(0.99, 1 - size / 800),
     },
 }
-#: The first is the preset `scaled`.
-_SCALED_WITH_AND_WITHOUT = (
-    _SCALED,
-    Arm("ppo (scaled)", "ppo", {"decompose_rewards": False}),
-)
+_NOT_DECOMPOSED = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
 #: The preset `scaled` had these settings when this was trained, and now similar ones.
 _BY_ROOT = Arm(
     "ppo (decomposed, by the root)", "ppo", _by_root(presets.ACTION_SIZES["humanoid"])
@@ -243,15 +239,18 @@ FIGURES: Mapping[str, Figure] = {
         "Delayed rewards: one setting for all tasks beside others tuned on each",
         "",
         joined(
-            grid(TASKS, arms, (DELAY,), base=base)
-            for arms, base in (
-                (_SCALED_WITH_AND_WITHOUT, "scaled"),
+            grid((env,), arms, (DELAY,), base=base, seeds=seeds)
+            for env in TASKS
+            for arms, base, seeds in (
+                ([_SCALED], "scaled", _seeds(env, DELAY)),
+                ([_NOT_DECOMPOSED], "scaled", 10),
                 (
                     [Arm("ppo (decomposed, best mean rank)", "ppo")],
                     functools.partial(SingleSetting, decompose_rewards=True),
+                    10,
                 ),
-                (_ADAPTIVE_WITH_AND_WITHOUT, "tuned"),
-                (_PAPERS, Search),
+                (_ADAPTIVE_WITH_AND_WITHOUT, "tuned", 10),
+                (_PAPERS, Search, _seeds(env, DELAY)),
             )
         ),
         favourite=_SCALED.name,
