@@ -227,9 +227,9 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
 
     Raises:
       ValueError: if the state is a batch of states, has a hyperparameter that is not
-        allowed, or is of a config with other sizes; if an agent's metric has a name
-        that another metric has; or if one of the agent's functions returns too few or
-        too many values, or a wrong shape.
+        allowed, or is of a config with other sizes or rewards; if an agent's metric has
+        a name that another metric has; or if one of the agent's functions returns too
+        few or too many values, or a wrong shape or dtype.
     """
     _check_state(env, config, state)
     agent = checked(find_agent(config.agent), config.agent)

@@ -159,7 +159,7 @@ def checked(agent: Imitation, name: str) -> Imitation:
         return outputs
 
     def check_leaves(function: str, what: str, value: Any, before: Any) -> None:
-        # Undoing an update that is not finite would broadcast or convert others.
+        # Undoing an update would broadcast other shapes and convert other dtypes.
         described = [
             {
                 jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}"
