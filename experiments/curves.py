@@ -130,8 +130,8 @@ class Figure:
 
     def rival(self, panel: str, name: str) -> str | None:
         """Return the favourite's curve at the x value of a curve, or None."""
-        place = (self.favourite, self.point_of(panel, name)[1])
-        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == place)
+        point = (self.favourite, self.point_of(panel, name)[1])
+        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == point)
         return next((x for x in curves if x != name), None)
 
     def compared(self) -> Comparisons:
@@ -151,9 +151,9 @@ class Figure:
         return compared
 
     def requested(self, searched: Store) -> list[Run]:
-        """Return all runs of the figure that are known so far.
+        """Return all runs of the figure whose settings are decided.
 
-        Runs that depend on the result of an incomplete search are not known yet.
+        Runs that depend on the result of an incomplete search are left out.
 
         Args:
           searched: the store of the searches' runs.

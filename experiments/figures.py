@@ -13,7 +13,8 @@ With ``over=("reward_delay", "delay")`` the second is drawn over the delay.
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 from experiments.curves import (
     Arm,
@@ -177,6 +178,14 @@ def _seeds(env: str, delay: int) -> int:
     return 20 if delay > 1 and env in TASKS[:4] else 10
 
 
+def _delayed(arms: Sequence[Arm | str], base: Any) -> Panels:
+    """Return arms on all delayed tasks, with as many seeds as `_matrix` has."""
+    return joined(
+        grid((env,), arms, (DELAY,), base=base, seeds=_seeds(env, DELAY))
+        for env in TASKS
+    )
+
+
 def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
     """Return all agents on tasks, each with what its search on the task chose.
 
@@ -221,16 +230,7 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             [
                 _matrix(cell for cell in CELLS if cell[1] > 1),
-                *(
-                    grid(
-                        (env,),
-                        [_SCALED],
-                        (DELAY,),
-                        base="scaled",
-                        seeds=_seeds(env, DELAY),
-                    )
-                    for env in TASKS
-                ),
+                _delayed([_SCALED], "scaled"),
             ]
         ),
         favourite="ppo (decomposed)",
@@ -239,19 +239,18 @@ FIGURES: Mapping[str, Figure] = {
         "Delayed rewards: one setting for all tasks beside others tuned on each",
         "",
         joined(
-            grid((env,), arms, (DELAY,), base=base, seeds=seeds)
-            for env in TASKS
-            for arms, base, seeds in (
-                ([_SCALED], "scaled", _seeds(env, DELAY)),
-                ([_NOT_DECOMPOSED], "scaled", 10),
-                (
+            [
+                _delayed([_SCALED], "scaled"),
+                grid(TASKS, [_NOT_DECOMPOSED], (DELAY,), base="scaled"),
+                grid(
+                    TASKS,
                     [Arm("ppo (decomposed, best mean rank)", "ppo")],
-                    functools.partial(SingleSetting, decompose_rewards=True),
-                    10,
+                    (DELAY,),
+                    base=functools.partial(SingleSetting, decompose_rewards=True),
                 ),
-                (_ADAPTIVE_WITH_AND_WITHOUT, "tuned", 10),
-                (_PAPERS, Search, _seeds(env, DELAY)),
-            )
+                grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,)),
+                _delayed(_PAPERS, Search),
+            ]
         ),
         favourite=_SCALED.name,
     ),

@@ -51,9 +51,25 @@ def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
     return message if plain else typed
 
 
-def described(leaf: Any) -> str:
-    """Return an array's dtype and shape, such as float32[3]; None is missing."""
-    return "missing" if leaf is None else f"{leaf.dtype}{list(leaf.shape)}"
+def first_change(before: Any, after: Any) -> tuple[str, str, str] | None:
+    """Return the first leaf of two pytrees of arrays whose dtype or shape differs.
+
+    Returns:
+      Its path and what it is in each, such as float32[3], or "missing"; None if all
+      leaves are the same.
+    """
+    described = [
+        {
+            jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}"
+            for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        }
+        for tree in (before, after)
+    ]
+    for path in described[0] | described[1]:
+        first, then = (leaves.get(path, "missing") for leaves in described)
+        if first != then:
+            return path, first, then
+    return None
 
 
 _NOT_THE_USERS = (

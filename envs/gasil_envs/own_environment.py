@@ -154,14 +154,9 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
                     f"env {name!r}: the {field} of its {where} is {value.dtype}: it "
                     "must be float32"
                 )
-    flat = [
-        {jax.tree_util.keystr(path): leaf for path, leaf in leaves}
-        for leaves in map(jax.tree_util.tree_leaves_with_path, (first, then))
-    ]
-    for path in flat[0] | flat[1]:
-        before, after = (own_code.described(leaves.get(path)) for leaves in flat)
-        if before != after:
-            raise ValueError(
-                f"env {name!r}: state{path} is {before} after its reset and {after} "
-                "after its step: both must be the same"
-            )
+    if change := own_code.first_change(first, then):
+        path, before, after = change
+        raise ValueError(
+            f"env {name!r}: state{path} is {before} after its reset and {after} after "
+            "its step: both must be the same"
+        )

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
+from gasil_envs import own_code
 from gasil_jax.config import Config, Hyperparameters
 from gasil_jax.good_trajectories import GoodTrajectories, History
 from gasil_jax.normalization import Normalizer
@@ -160,22 +161,14 @@ def checked(agent: Imitation, name: str) -> Imitation:
 
     def check_leaves(function: str, what: str, value: Any, before: Any) -> None:
         # Undoing an update would broadcast other shapes and convert other dtypes.
-        described = [
-            {
-                jax.tree_util.keystr(path): f"{leaf.dtype}{list(leaf.shape)}"
-                for path, leaf in jax.tree_util.tree_leaves_with_path(
-                    jax.eval_shape(lambda tree=tree: tree)
-                )
-            }
-            for tree in (before, value)
-        ]
-        for path in described[0] | described[1]:
-            expected, given = (leaves.get(path, "missing") for leaves in described)
-            if given != expected:
-                raise ValueError(
-                    f"{function} of agent {name!r}: the returned {what}{path} is "
-                    f"{given}: it must be {expected}, as before"
-                )
+        # Leaves may be Python's numbers until their shapes are evaluated.
+        shapes = jax.eval_shape(lambda: (before, value))
+        if change := own_code.first_change(*shapes):
+            path, expected, given = change
+            raise ValueError(
+                f"{function} of agent {name!r}: the returned {what}{path} is {given}: "
+                f"it must be {expected}, as before"
+            )
 
     def check_shape(function: str, what: str, value: Any, expected: Any) -> None:
         if jnp.shape(value) != expected:

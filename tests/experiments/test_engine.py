@@ -280,7 +280,7 @@ def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, caps
         (("benchmark", "--repeats", "0"), "repeats is 0: it must be 1 or more"),
         (
             # JAX is running with two devices.
-            (*"benchmark --devices 2 --tables scaling --training-envs 100".split(),),
+            "benchmark --devices 2 --tables scaling --training-envs 100".split(),
             "num_envs is 100, which does not divide batch_steps 2048",
         ),
         (("point_mass_moments", "--total-steps", "0"), "total_steps is 0"),
