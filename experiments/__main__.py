@@ -24,7 +24,7 @@ from experiments.curves import Curve, Figure, name_of
 from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import coverage
-from experiments.store import RESULTS, ResultsFolder, Store
+from experiments.store import RESULTS, ResultsFolder, Run, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
@@ -111,7 +111,9 @@ def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then write its page."""
     setup, results, figure = options.setup, options.results, FIGURES[name]
     shard = shards.parse(options.shard)
-    command_line.check_minimum(setup, devices=1, evaluate_episodes=0)
+    command_line.check_minimum(
+        setup, devices=1, evaluate_episodes=0, processes=1, members=1
+    )
     published = results.resolve() == RESULTS.resolve()
     if options.quick and not published:
         raise InputError(
@@ -129,15 +131,22 @@ def _train(name: str, options: Options) -> None:
         searched = results if figure.searches else RESULTS
         return Store(results / "runs"), Store(searched / "runs")
 
-    while True:
+    def lacking() -> tuple[Store, list[Run]]:
+        """Return the store of the figure's runs, and the runs that it lacks."""
         stored, searched = stores()
         requested = chosen.requested(searched)
-        missing = stored.missing(engine.select_by_key(requested, shard))
+        return stored, stored.missing(engine.select_by_key(requested, shard))
+
+    while True:
+        stored, missing = lacking()
         print(f"{name}: {len(missing)} runs are missing", flush=True)
         if options.list or not missing:
             break
         # When a stage of a search has ended, the points of the next one are known.
-        engine.train_missing(missing, stored, setup)
+        if setup.processes > 1:
+            engine.train_in_processes(lambda: lacking()[1], stored, setup)
+        else:
+            engine.train_missing(missing, stored, setup)
     if options.list:
         for program in engine.programs(missing, setup):
             print(f"  {program}")
@@ -146,7 +155,7 @@ def _train(name: str, options: Options) -> None:
         # Other pages may have some of the same runs.
         _write_all_pages()
     else:
-        Page(name, stored, searched, figure if options.quick else None).write(results)
+        Page(name, *stores(), figure if options.quick else None).write(results)
     print(f"in {results / name}.md")
 
 

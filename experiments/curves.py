@@ -151,15 +151,20 @@ class Figure:
         return compared
 
     def requested(self, searched: Store) -> list[Run]:
-        """Return all runs of the figure whose settings are decided.
+        """Return all runs of the figure whose settings are decided, panel by panel.
 
         Runs that depend on the result of an incomplete search are left out.
 
         Args:
           searched: the store of the searches' runs.
         """
-        runs = [run for x in self.searches.values() for run in x.requested(searched)]
-        runs += [run for *_, curve in self.curves() for run in curve.runs(searched)]
+        runs: list[Run] = []
+        for curves in self.panels.values():
+            own = [x.search for x in curves.values() if x.search]
+            own = [x for x in self.searches.values() if x in own]
+            runs += [run for search in own for run in search.requested(searched)]
+            runs += [run for curve in curves.values() for run in curve.runs(searched)]
+        runs += [run for x in self.searches.values() for run in x.requested(searched)]
         return list(dict.fromkeys(runs))
 
 

@@ -9,16 +9,22 @@ folder never mixes two programs. Interrupted training is only continued if
 import dataclasses
 import functools
 import hashlib
+import itertools
 import json
 import math
+import multiprocessing
+import multiprocessing.connection
+import os
 import pathlib
 import subprocess
-from collections.abc import Iterable, Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
+from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Run, Store, run_of
 from gasil_jax.config import Config
 from gasil_jax.errors import InputError
@@ -52,7 +58,11 @@ class Setup:
       devices: number of CPU devices to shard members over; default one per core. All
         visible GPUs are used in any case.
       evaluate_episodes: episodes of each of the ten evaluations during training; 0
-        for no evaluations.
+        for no evaluations. Runs of a search are not evaluated.
+      processes: number of programs that are trained at once, each by a process of its
+        own on one core. Where each run has few environments this is the fastest way.
+        With 1 the program's runs are sharded over `devices`.
+      members: largest number of runs in a program; default no limit.
       share_counts: train runs that differ in buffer_steps or discriminator_updates in
         one program: it compiles once, and each run costs what the largest does.
       commit: commit of the code, to be recorded if there is no repository.
@@ -63,6 +73,8 @@ class Setup:
     physics: str = "mjx"
     devices: int | None = None
     evaluate_episodes: int = 10
+    processes: int = 1
+    members: int | None = None
     share_counts: bool = False
     commit: str | None = None
 
@@ -111,11 +123,16 @@ class Program:
         return self.runs[0].config.replace(**counts)
 
     @property
+    def evaluate_episodes(self) -> int:
+        """The number of episodes of each evaluation."""
+        return 0 if _is_of_search(self.runs[0]) else self.setup.evaluate_episodes
+
+    @property
     def folder(self) -> pathlib.Path:
         """The program's scratch folder."""
         # Physics and evaluations are not in a run's key, but checkpoints and tables
         # depend on them.
-        names = [self.setup.physics, str(self.setup.evaluate_episodes)]
+        names = [self.setup.physics, str(self.evaluate_episodes)]
         text = " ".join([*names, *(run.key for run in self.runs)])
         return self.setup.runs / hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -128,9 +145,13 @@ class Program:
         return ", ".join(words)
 
 
+def _is_of_search(run: Run) -> bool:
+    return run.seed in FINALIST_SEEDS
+
+
 def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
-    """Group runs into as few programs as possible."""
-    groups: dict[Run, list[Run]] = {}
+    """Group runs into as few programs as possible, of at most `setup.members`."""
+    groups: dict[tuple[Run, bool], list[Run]] = {}
     for run in runs:
         # Only counts decide shapes, so only they may need separate programs.
         counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
@@ -138,9 +159,14 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
         own = kind() if setup.share_counts else kind(**counts)
         config = run.config.replace(hyperparameters=own)
         shared = dataclasses.replace(run, config=config, seed=0)
-        groups.setdefault(shared, []).append(run)
-    ordered = lambda group: tuple(sorted(group, key=lambda run: run.key))
-    return [Program(ordered(group), setup) for group in groups.values()]
+        groups.setdefault((shared, _is_of_search(run)), []).append(run)
+    parts = []
+    for group in groups.values():
+        ordered = sorted(group, key=lambda run: run.key)
+        count = math.ceil(len(ordered) / (setup.members or len(ordered)))
+        cuts = [len(ordered) * part // count for part in range(count + 1)]
+        parts += [tuple(ordered[a:b]) for a, b in itertools.pairwise(cuts)]
+    return [Program(part, setup) for part in parts]
 
 
 def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
@@ -160,7 +186,7 @@ def train(program: Program) -> dict[Run, Record]:
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     run, setup, folder = program.runs[0], program.setup, program.folder
-    episodes = setup.evaluate_episodes or None
+    episodes = program.evaluate_episodes or None
     settings = Settings(
         reward_delay=run.reward_delay,
         obs_noise=run.obs_noise,
@@ -288,13 +314,12 @@ def _listed(path: pathlib.Path, setup: Setup) -> Program:
         raise InputError(f"{path} is not a list of runs: {error}") from None
 
 
-def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
-    """Train runs and add them to the store, each program as soon as it has ended.
+def _requested(missing: Sequence[Run], setup: Setup) -> list[Program]:
+    """Return the programs that train the missing runs, those in training first.
 
     Raises:
       InputError: if the scratch folder holds training of these runs and `Setup.resume`
         is not set.
-      Interrupted: if a signal was received; a checkpoint was written first.
     """
     unfinished = begun(missing, setup)
     continued = {run for program in unfinished for run in program.runs}
@@ -306,7 +331,78 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
             f"runs is {setup.runs}, which holds training of these runs in "
             f"{', '.join(used)}: continue it with --resume, or name another folder"
         )
-    for program in requested:
+    return requested
+
+
+def _train_on_core(program: Program, store: pathlib.Path, core: int) -> None:
+    """Train a program on one core; what this process prints goes to a log file."""
+    os.sched_setaffinity(0, {core})
+    with open(f"{program.folder}.log", "a") as log:
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(log.fileno(), stream.fileno())
+        Store(store).add(train(program))
+
+
+def train_in_processes(
+    missing: Callable[[], Sequence[Run]], store: Store, setup: Setup
+) -> None:
+    """Train runs in `setup.processes` processes of one core each; see `train_missing`.
+
+    Args:
+      missing: returns the runs that are not stored, the most important first. It is
+        called again after each program, because the result of a search decides which
+        runs are needed.
+      store: the store that the runs are added to.
+      setup: how they are trained.
+
+    Raises:
+      InputError: if there are more processes than cores, as `train_missing`, or if the
+        training of a program failed; the others are trained first.
+    """
+    cores = sorted(os.sched_getaffinity(0))
+    if setup.processes > len(cores):
+        raise InputError(
+            f"processes is {setup.processes}: it must be at most the number of cores, "
+            f"{len(cores)}"
+        )
+    setup.runs.mkdir(parents=True, exist_ok=True)
+    spawn = multiprocessing.get_context("spawn")
+    free = cores[: setup.processes]
+    failed: list[Program] = []
+    running: dict[Any, tuple[Any, Program, int]] = {}
+    while True:
+        begun_here = [*failed, *(program for _, program, _ in running.values())]
+        not_waiting = {run for program in begun_here for run in program.runs}
+        waiting = [run for run in missing() if run not in not_waiting]
+        for program in _requested(waiting, setup)[: len(free)]:
+            core = free.pop()
+            process = spawn.Process(
+                target=_train_on_core, args=(program, store.folder, core)
+            )
+            process.start()
+            running[process.sentinel] = process, program, core
+        if not running:
+            break
+        for sentinel in multiprocessing.connection.wait(list(running)):
+            process, program, core = running.pop(sentinel)
+            process.join()
+            free.append(core)
+            failed += [program] if process.exitcode else []
+            print(f"{'failed' if process.exitcode else 'done'}: {program}", flush=True)
+    if failed:
+        logs = ", ".join(f"{program.folder}.log" for program in failed)
+        raise InputError(f"the training of {len(failed)} programs failed: see {logs}")
+
+
+def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
+    """Train runs and add them to the store, each program as soon as it has ended.
+
+    Raises:
+      InputError: if the scratch folder holds training of these runs and `Setup.resume`
+        is not set.
+      Interrupted: if a signal was received; a checkpoint was written first.
+    """
+    for program in _requested(missing, setup):
         # Another process may have added them since.
         if Store(store.folder).missing(program.runs):
             store.add(train(program))

@@ -33,6 +33,7 @@ from experiments.search import (
     DELAY,
     PAIR,
     TASKS,
+    PaperSearch,
     Point,
     PPOValues,
     Search,
@@ -205,6 +206,39 @@ def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
     )
 
 
+def _paper_panel(
+    env: str, delay: int, normalize: bool, agents: Sequence[str]
+) -> Panels:
+    """Return agents on a task under the paper's protocol, each with its search there.
+
+    Where outcomes are bimodal, the agents whose comparison decides have more seeds.
+    """
+    bimodal = delay > 1 and env in ("hopper", "walker2d")
+    return joined(
+        grid(
+            (env,),
+            [agent],
+            (delay,),
+            panel="{task}" if normalize else "{task} (raw)",
+            base=functools.partial(PaperSearch, normalize_rewards=normalize),
+            seeds=40 if bimodal and agent != "ppo+bc" else 10,
+        )
+        for agent in agents
+    )
+
+
+#: The panels under the paper's protocol, those first that decide most.
+_PROTOCOL = joined(
+    _paper_panel(env, delay, normalize, agents)
+    for delay, normalize, agents in (
+        (DELAY, True, _PAPERS),
+        (DELAY, False, PAIR),
+        (1, True, _PAPERS),
+    )
+    for env in TASKS[:4]
+)
+
+
 FIGURES: Mapping[str, Figure] = {
     "point_mass": Figure(
         "2D point mass (paper, figures 2 to 4)",
@@ -222,6 +256,17 @@ FIGURES: Mapping[str, Figure] = {
             f"{name_of(*task)} {name}": search
             for task in CELLS
             for name, search in searches(*task).items()
+        },
+    ),
+    "paper_protocol": Figure(
+        "The paper's own protocol (paper, figures 5 and 7)",
+        f"{_DELAYED} {_DENSE}",
+        _PROTOCOL,
+        searches={
+            f"{panel} {name}": curve.search
+            for panel, curves in _PROTOCOL.items()
+            for name, curve in curves.items()
+            if curve.search
         },
     ),
     "delayed_rewards": Figure(

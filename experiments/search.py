@@ -91,20 +91,25 @@ BEYOND: Mapping[str, tuple[Any, Any]] = {
 
 
 def draw(agent: str) -> tuple[Point, ...]:
-    """Return the points of an agent's search, all different.
+    """Return the points of an agent's search, all different."""
+    return _drawn(SPACES[agent], _POINTS, agent)
+
+
+def _drawn(space: Space, count: int, name: str) -> tuple[Point, ...]:
+    """Return points of a space, all different and the same for the same name.
 
     Each value of a hyperparameter occurs equally often, or once more than another. The
     combinations are random.
     """
-    rng = np.random.default_rng(zlib.crc32(agent.encode()))
+    rng = np.random.default_rng(zlib.crc32(name.encode()))
     rows: list[tuple[Any, ...]] = []
-    while len(set(rows)) < _POINTS:
+    while len(set(rows)) < count:
         columns = [
-            rng.permutation([values[i % len(values)] for i in range(_POINTS)]).tolist()
-            for values in SPACES[agent].values()
+            rng.permutation([values[i % len(values)] for i in range(count)]).tolist()
+            for values in space.values()
         ]
         rows = list(zip(*columns, strict=True))
-    return tuple(dict(zip(SPACES[agent], row, strict=True)) for row in rows)
+    return tuple(dict(zip(space, row, strict=True)) for row in rows)
 
 
 def beyond(agent: str, point: Point) -> Iterator[Point]:
@@ -144,6 +149,10 @@ class Search:
     # A page asks for each config many times, and to make one takes 0.1 ms.
     @functools.cache  # noqa: B019
     def _config(self, point: tuple[tuple[str, Any], ...]) -> Config:
+        return self._base().replace(**dict(point))
+
+    def _base(self) -> Config:
+        """Return the settings that all points share."""
         decompose = self.decompose_rewards or self.agent == ADAPTIVE
         return Config(
             agent=self.agent,
@@ -151,7 +160,7 @@ class Search:
             num_envs=32,
             normalize_rewards=True,
             decompose_rewards=decompose and self.reward_delay > 1,
-        ).replace(**dict(point))
+        )
 
     def runs(
         self, points: Iterable[Point], seeds: Iterable[int] = SEEDS
@@ -228,6 +237,80 @@ class Search:
         drawn = draw(self.agent)
         scores = self.scores(drawn, store)
         return None if scores is None else drawn[int(scores.mean(axis=1).argmax())]
+
+
+#: The values of the paper's appendix, and for PPO+BC and PPO+SIL, of which it gives
+#: none, those around what the authors of SIL used.
+_PAPER_RATES: Space = {"learning_rate": (3e-5, 5e-5, 1e-4, 3e-4)}
+_COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
+PAPER_SPACES: Mapping[str, Space] = {
+    "ppo": _PAPER_RATES,
+    "ppo+bc": {**_PAPER_RATES, "behavior_cloning_coefficient": _COEFFICIENTS},
+    "ppo+sil": {**_PAPER_RATES, "sil_coefficient": _COEFFICIENTS},
+    "ppo+gasil": {
+        **_PAPER_RATES,
+        "discriminator_updates": (1, 5, 10, 20),
+        "discriminator_learning_rate": (1e-5, 2e-5, 1e-4, 3e-4),
+        "buffer_steps": (1000, 10_000),
+        "alpha": (0.02, 0.1, 0.2, 1.0),
+    },
+}
+#: The largest number of points that are tried; of more, as many are drawn.
+_PAPER_POINTS = 32
+
+
+@functools.cache
+def paper_points(agent: str) -> tuple[Point, ...]:
+    """Return the points of an agent's search under the paper's protocol."""
+    space = PAPER_SPACES[agent]
+    every = tuple(
+        dict(zip(space, row, strict=True)) for row in itertools.product(*space.values())
+    )
+    if len(every) <= _PAPER_POINTS:
+        return every
+    return _drawn(space, _PAPER_POINTS, f"paper {agent}")
+
+
+@dataclasses.dataclass(frozen=True)
+class PaperSearch(Search):
+    """The search of one agent on one task under the paper's own protocol.
+
+    It has the paper's batch, 2,048 steps of one environment that starts at age 0, and
+    all else of its appendix. The best of `paper_points` by the mean of two seeds is
+    chosen.
+
+    Attributes:
+      normalize_rewards: whether rewards are normalized, as in the code of the authors'
+        SIL, or raw, as in baselines' ppo1 and GAIL. The paper does not say which.
+    """
+
+    normalize_rewards: bool = True
+
+    def _base(self) -> Config:
+        return Config(
+            agent=self.agent,
+            total_steps=STEPS,
+            num_envs=1,
+            stagger_episodes=False,
+            normalize_rewards=self.normalize_rewards,
+        )
+
+    def points(self, store: Store) -> tuple[Point, ...]:
+        """Return all points of the search."""
+        return paper_points(self.agent)
+
+    def requested(self, store: Store) -> list[Run]:
+        """Return all runs of the search."""
+        return list(itertools.chain(*self.runs(self.points(store))))
+
+    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
+        """Return the best point and its scores, or None if runs are missing."""
+        points = self.points(store)
+        scores = self.scores(points, store)
+        if scores is None:
+            return None
+        chosen = int(scores.mean(axis=1).argmax())
+        return points[chosen], scores[chosen]
 
 
 #: Every task with its delay, delayed ones first.

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from brax.envs import Env, Wrapper
 
 from gasil_envs import locomotion, own_environment, point_mass, wrappers
-from gasil_envs.physics import native
+from gasil_envs.physics import batching, native
 from gasil_envs.physics.mjx import SOLVERS
 
 
@@ -192,6 +192,7 @@ def without_effect(name: str, settings: Settings) -> list[str]:
 
 def prepare(settings: Settings, num_devices: int) -> None:
     """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
+    batching.keep_loops()
     if settings.physics == "mujoco":
         native.reserve_threads(num_devices)
 
@@ -216,6 +217,7 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
     check(name, chosen)
+    batching.keep_loops()
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if max_episode_steps is not None:

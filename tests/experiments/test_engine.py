@@ -297,3 +297,40 @@ def test_without_a_name_the_figures_are_listed(capsys):
     assert __main__.main([]) == 0
     printed = capsys.readouterr().out
     assert all(name in printed for name in (*FIGURES, "merge", "benchmark"))
+
+
+@pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
+def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
+    """The second run is only requested once the first is stored, as after a search."""
+    store = Store(tmp_path / "store")
+    setup = Setup(tmp_path / "runs", evaluate_episodes=2, processes=2, members=1)
+
+    def missing():
+        stored = Store(store.folder)
+        later = RUNS[2:] if not stored.missing(RUNS[:2]) else []
+        return stored.missing([*RUNS[:2], *later])
+
+    engine.train_in_processes(missing, store, setup)
+    stored, (_, alone) = Store(store.folder), trained
+    for one in RUNS:
+        same = np.testing.assert_allclose
+        same(stored[one].episode_return, alone[one].episode_return, rtol=1e-4)
+        assert len(stored[one].evaluation_return)
+    logs = list((tmp_path / "runs").glob("*.log"))
+    assert len(logs) == 3
+    broken = run(7, num_envs=256, batch_steps=128)
+    with pytest.raises(InputError, match=r"1 programs failed: see .*\.log"):
+        engine.train_in_processes(lambda: [broken], store, setup)
+    with pytest.raises(InputError, match=r"processes is 9999: it must be at most"):
+        many = dataclasses.replace(setup, processes=9999)
+        engine.train_in_processes(missing, store, many)
+
+
+def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
+    runs = [run(seed) for seed in range(5)] + [run(seed) for seed in (1000, 1001)]
+    programs = engine.programs(runs, Setup(members=2))
+    assert sorted(len(program.runs) for program in programs) == [1, 2, 2, 2]
+    assert {x for program in programs for x in program.runs} == set(runs)
+    for program in programs:
+        of_search = program.runs[0].seed >= 1000
+        assert program.evaluate_episodes == (0 if of_search else 10)

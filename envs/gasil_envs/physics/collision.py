@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from gasil_envs.physics import tree
-from gasil_envs.physics.batching import materialize
+from gasil_envs.physics.batching import materialize, take, total
 
 _PLANE, _SPHERE, _CAPSULE = (
     int(mujoco.mjtGeom.mjGEOM_PLANE),
@@ -153,8 +153,9 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     constant = lambda x: x.astype(np.float32)[..., None]
     height = constant(np.sum(normal * data.geom_xpos[plane], axis=1))
     radius = constant(model.geom_size[geom, 0])
-    centre = lines.middle[geom] + constant(pairs.end[:, None]) * lines.half[geom]
-    distance = jnp.sum(constant(normal) * centre, axis=1) - height - radius
+    axis = take(lines.half, geom)
+    centre = take(lines.middle, geom) + constant(pairs.end[:, None]) * axis
+    distance = total(constant(normal) * centre, 1) - height - radius
     position = centre - constant(normal) * (radius + 0.5 * distance)[:, None]
     if np.allclose(normal, normal[0]):
         normal = normal[:1]
@@ -164,9 +165,9 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
         tangent = np.cross(pairs.motion_normal, normal)
         return Touch(distance, position, constant(np.stack([normal, tangent], axis=1)))
     # mjc_PlaneCapsule gives the capsule's axis, mju_makeFrame projects it.
-    up, axis = constant(normal), lines.half[geom]
-    across = axis - up * jnp.sum(axis * up, axis=1, keepdims=True)
-    length = jnp.sqrt(jnp.sum(across**2, axis=1, keepdims=True))
+    up = constant(normal)
+    across = axis - up * total(axis * up, 1)[:, None]
+    length = jnp.sqrt(total(across**2, 1)[:, None])
     along = across / jnp.maximum(length, 1e-15)
     along = jnp.where(length > 1e-15, along, _orthogonal(up))
     up = jnp.broadcast_to(up, along.shape)
@@ -184,14 +185,14 @@ def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
 
 def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     first, second = pairs.between
-    a, b = (Segments(lines.middle[i], lines.half[i]) for i in (first, second))
+    a, b = (Segments(take(lines.middle, i), take(lines.half, i)) for i in pairs.between)
     length = lambda i: np.where(
         model.geom_type[i] == _CAPSULE, model.geom_size[i, 1], 0.0
     ).astype(np.float32)[:, None]
     near_a, near_b = _nearest_points(a, b, length(first), length(second))
     radius = model.geom_size[pairs.between, 0].astype(np.float32)[..., None]
     away = materialize(near_b - near_a)
-    apart = jnp.sqrt(jnp.sum(away**2, axis=1))
+    apart = jnp.sqrt(total(away**2, 1))
     normal = jnp.where(
         apart[:, None] > 0.0,
         away / jnp.maximum(apart, 1e-15)[:, None],
@@ -217,7 +218,7 @@ def _nearest_points(
     The lengths (C, 1) are halves. The nearest points of the two lines are moved onto
     the segments; then the better of two corrections is taken.
     """
-    dot = lambda x, y: jnp.sum(x * y, axis=1)
+    dot = lambda x, y: total(x * y, 1)
     along_a = a.half / np.maximum(length_a, 1e-15)[..., None]
     along_b = b.half / np.maximum(length_b, 1e-15)[..., None]
     between = a.middle - b.middle

@@ -19,7 +19,7 @@ from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import collision, newton, tree
-from gasil_envs.physics.batching import add, materialize
+from gasil_envs.physics.batching import add, materialize, take, total
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
@@ -290,7 +290,7 @@ def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
 @jax.named_scope("constraint_rows")
 def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.LimitRows:
     """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
-    joint = qpos[limits.qpos]
+    joint = take(qpos, limits.qpos)
     above_low, below_high = joint - limits.low, limits.high - joint
     distance = jnp.minimum(above_low, below_high) - limits.margin
     inside = jnp.where(above_low < below_high, 1.0, -1.0)
@@ -298,13 +298,15 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     distance = jnp.minimum(distance, 0.0)
     impedance = limits.impedance(distance)
     pull = limits.impedance.stiffness * impedance * distance
-    damp = limits.impedance.damping * sign * qvel[limits.dof]
+    damp = limits.impedance.damping * sign * take(qvel, limits.dof)
     of_limit = (sign, -damp - pull, _weight(impedance, limits.inverse_weight))
     # Put each limit at the index of its degree of freedom, without a scatter.
     index = np.full(qvel.shape[0], limits.dof.size)
     index[limits.dof] = np.arange(limits.dof.size)
     none = jnp.zeros((1, qvel.shape[1]), jnp.float32)
-    return newton.LimitRows(*(jnp.concatenate([x, none])[index] for x in of_limit))
+    return newton.LimitRows(
+        *(take(jnp.concatenate([x, none]), index) for x in map(materialize, of_limit))
+    )
 
 
 @jax.named_scope("constraint_rows")
@@ -327,9 +329,9 @@ def contact_rows(
     along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
     scale = [along[:, :1], along[:, 1:] * constants.friction[:, None, None]]
     along = materialize(jnp.concatenate(scale, axis=1))  # (C, A, V, B)
-    speed = materialize(jnp.sum(along * qvel, axis=2))
+    speed = materialize(total(along * qvel, 2))
     signs = np.array([(1, *signs) for signs in edges], np.float32)[..., None]
-    speed = jnp.sum(speed[:, None] * signs, axis=2)  # (C, edges, B)
+    speed = total(speed[:, None] * signs, 2)  # (C, edges, B)
     impedance = constants.impedance(gap)
     pull = constants.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
     weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from gasil_envs.physics import constraints, newton, tree
-from gasil_envs.physics.batching import materialize, on_cpu
+from gasil_envs.physics.batching import materialize, on_cpu, total
 from gasil_envs.physics.interface import Fields, PhysicsState
 
 _JOINT_TRANSMISSION = [
@@ -205,7 +205,7 @@ def step(
 ) -> tuple[PhysicsState, Fields]:
     """Advance `frame_skip` time steps; the fields are of the last evaluation."""
     control = jnp.clip(control, *dynamics.control_range)
-    actuation = jnp.broadcast_to(dynamics.motor @ control, state.qvel.shape)
+    actuation = total(jnp.asarray(dynamics.motor)[..., None] * control, 1)
     is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     integrate = _euler if is_euler else _runge_kutta
     one = functools.partial(integrate, dynamics, actuation)

@@ -23,6 +23,7 @@ It is not reverse-mode differentiable. Neither is MJX's own solver, because its 
 dynamic.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -31,7 +32,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs.physics import newton_kernel
-from gasil_envs.physics.batching import add, materialize, on_cpu, on_gpu
+from gasil_envs.physics.batching import add, materialize, on_cpu, on_gpu, total
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges.
@@ -102,7 +103,7 @@ class Solution(struct.PyTreeNode):
 
 
 def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    return jnp.sum(a * b, axis=0)
+    return total(a * b)
 
 
 # Sums over matrices with more entries than this are left to reductions. Spelled out
@@ -137,8 +138,13 @@ def _matvec_transposed(
 def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> jax.Array:
     """Return left' right, if it is symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
     num_rows, size, _ = left.shape
-    if not spell_out:
+    if not spell_out and on_gpu():
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
+    if not spell_out:
+        # Not a matrix product, which a kernel of many operations can't hold.
+        outer = lambda n, sum_: sum_ + left[n][:, None] * right[n]
+        zero = jnp.zeros((size, size, left.shape[-1]), left.dtype)
+        return jax.lax.fori_loop(0, num_rows, outer, zero)
     rows = [
         add(left[n, i] * right[n, : i + 1] for n in range(num_rows))
         for i in range(size)
@@ -322,18 +328,21 @@ def solve_many(
     spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
     each = jax.tree.map
-    total = lambda parts: sum(jnp.sum(x, axis=tuple(range(x.ndim - 1))) for x in parts)
+    flat = lambda x: x.reshape(-1, x.shape[-1])
+    of_rows = lambda parts: add(total(flat(x)) for x in parts)
     # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
     jaref_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
     qacc_smooth = eliminate(inertia, force)
 
     is_pushing = lambda jaref: each(lambda d: d < 0.0, jaref)
-    changes = lambda a, b: jnp.any(total(each(jnp.not_equal, a, b)) > 0)
+    changes = lambda a, b: functools.reduce(
+        jnp.logical_or, (jnp.any(x != y) for x, y in zip(a, b, strict=True))
+    )
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
         square = lambda d, w: w * jnp.minimum(d, 0.0) ** 2
-        constraint_cost = total(each(square, jaref_at(qacc), weight))
+        constraint_cost = of_rows(each(square, materialize(jaref_at(qacc)), weight))
         return _dot(away, _matvec(inertia, away, spell_out)) + constraint_cost
 
     better = cost(problem.warmstart) < cost(qacc_smooth)
@@ -359,9 +368,9 @@ def solve_many(
             pushed = each(
                 lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
             )
-            second = quadratic + total(each(jnp.multiply, pushed, slope))
+            second = quadratic + of_rows(each(jnp.multiply, pushed, slope))
             first = linear + step * quadratic
-            first = first + total(each(jnp.multiply, pushed, there))
+            first = first + of_rows(each(jnp.multiply, pushed, there))
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import add, materialize
+from gasil_envs.physics.batching import add, materialize, take, total
 
 FREE, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -270,25 +270,25 @@ def _sum_down(model: mujoco.MjModel, of_dof: jax.Array) -> tuple[jax.Array, jax.
     """
     before, to_body = [], [jnp.zeros_like(of_dof[0])]
     for body in range(1, model.nbody):
-        total = to_body[model.body_parentid[body]]
+        running = to_body[model.body_parentid[body]]
         first = model.body_jntadr[body]
         for joint in range(first, first + model.body_jntnum[body]):
             dof = model.jnt_dofadr[joint]
             for width in (3, 3) if model.jnt_type[joint] == FREE else (1,):
-                before += [total] * width
-                total = add([total, *of_dof[dof : dof + width]])
+                before += [running] * width
+                running = add([running, *of_dof[dof : dof + width]])
                 dof += width
-        to_body.append(total)
+        to_body.append(running)
     return jnp.stack(before), jnp.stack(to_body)
 
 
 def _sum_up(model: mujoco.MjModel, of_body: jax.Array) -> list[jax.Array]:
     """Sum over each body's subtree: (N, K, B) -> N times (K, B)."""
-    total = list(of_body)
+    subtree = list(of_body)
     for body in range(model.nbody - 1, 0, -1):
         parent = model.body_parentid[body]
-        total[parent] = total[parent] + total[body]
-    return total
+        subtree[parent] = subtree[parent] + subtree[body]
+    return subtree
 
 
 class Smooth(NamedTuple):
@@ -328,17 +328,19 @@ def smooth(
         of_body = of_body - _drag(model, at, cvel)
     in_subtree = _sum_up(model, materialize(jnp.concatenate([cinert, of_body], axis=1)))
     moved = materialize(jnp.stack([in_subtree[i] for i in model.dof_bodyid]))
-    bias = jnp.sum(cdof * moved[:, 10:], axis=1)
+    bias = total(cdof * moved[:, 10:], 1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
     scalar = model.jnt_type != FREE
     if model.jnt_stiffness.any():
         index = model.jnt_qposadr[scalar]
-        stretch = qpos[index] - model.qpos_spring[index].astype(np.float32)[:, None]
+        stretch = (
+            take(qpos, index) - model.qpos_spring[index].astype(np.float32)[:, None]
+        )
         stiffness = np.zeros((model.nv, scalar.sum()), np.float32)
         stiffness[model.jnt_dofadr[scalar], np.arange(scalar.sum())] = (
             model.jnt_stiffness[scalar]
         )
-        passive = passive - stiffness @ stretch
+        passive = passive - total(stiffness[..., None] * stretch, 1)
     unit_momentum = materialize(_momentum(moved[:, :10], cdof))
     return Smooth(_joint_inertia(model, unit_momentum, cdof), passive - bias, cvel)
 
@@ -366,8 +368,8 @@ def _joint_inertia(
 def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
     """Return the force of a medium on each body, taken as a box, (N, 6, B)."""
     mass = np.maximum(model.body_mass, 1e-12)[:, None]
-    total = model.body_inertia.sum(axis=1, keepdims=True)
-    square = 6.0 * np.maximum(total - 2 * model.body_inertia, 1e-12) / mass
+    trace = model.body_inertia.sum(axis=1, keepdims=True)
+    square = 6.0 * np.maximum(trace - 2 * model.body_inertia, 1e-12) / mass
     box = np.sqrt(square) * (model.body_mass[:, None] > 0)
     diameter = box.mean(axis=1, keepdims=True)
     area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, 1e-12)
@@ -386,8 +388,8 @@ def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
     arm = at.xipos - at.com
     turn = cvel[:, :3]
     local = jnp.stack([turn, cvel[:, 3:] - cross(arm, turn)])  # (2, N, 3, B)
-    local = jnp.sum(axes * local[:, :, None], axis=-2)
+    local = total(axes * local[:, :, None], 3)
     factor = lambda x: x.astype(np.float32)[..., None]
     against = -(factor(linear) + factor(square) * jnp.abs(local)) * local
-    torque, force = jnp.sum(axes * against[:, :, :, None], axis=2)
+    torque, force = total(axes * against[:, :, :, None], 2)
     return jnp.concatenate([torque + cross(arm, force), force], axis=1)
