@@ -20,7 +20,7 @@ from experiments import (
     store,
     zoo,
 )
-from experiments.curves import Curve, Figure, name_of
+from experiments.curves import Curve, Figure
 from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import coverage
@@ -191,14 +191,21 @@ class CoverageOptions:
 
 
 def _coverage(options: CoverageOptions) -> int:
-    curves = [curve for *_, curve in FIGURES["matrix"].curves()]
-    rows = coverage(Store(options.results / "runs"), curves)
-    print("task               agent                   search    seeds")
-    for x in rows:
-        task = f"{name_of(x.search.env, x.search.reward_delay):18} {x.name:20}"
-        searched = f"{x.searched} of {x.to_search}"
-        print(f"{task} {searched:>9} {f'{x.trained} of {x.to_train}':>8}")
-    return int(not all(x.complete for x in rows))
+    store, complete = Store(options.results / "runs"), True
+    for name in ("matrix", "paper_protocol"):
+        rows = coverage(store, FIGURES[name].curves())
+        complete &= all(x.complete for x in rows)
+        print(f"{name:22} agent                   search    seeds")
+        for x in rows:
+            searched, trained = (
+                f"{done} of {all_}"
+                for done, all_ in (
+                    (x.searched, x.to_search),
+                    (x.trained, x.to_train),
+                )
+            )
+            print(f"{x.panel:22} {x.name:20} {searched:>9} {trained:>8}")
+    return int(not complete)
 
 
 @dataclasses.dataclass(frozen=True)

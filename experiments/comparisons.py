@@ -6,6 +6,7 @@ Verdicts are corrected by Holm's method for the number of comparisons in their f
 import dataclasses
 import functools
 import math
+import statistics
 import zlib
 from collections.abc import Mapping, Sequence
 
@@ -16,6 +17,8 @@ from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 
 #: Significance level of a family of verdicts.
 LEVEL = 0.05
+#: The probability with which the effect `Comparison.visible` would be found.
+_POWER = 0.8
 _DRAWS = 10_000
 #: With fewer seeds there is no verdict, and no interval, which would be far too narrow.
 FEWEST_SEEDS = 5
@@ -26,12 +29,22 @@ Scores = Mapping[tuple[str, str], np.ndarray]
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """A difference, its 95% interval, and its p-value, corrected by Holm's method."""
+    """A difference of interquartile means.
+
+    Attributes:
+      middle: the difference.
+      low: the low end of its 95% interval.
+      high: the high end.
+      p: its p-value, corrected by Holm's method.
+      visible: the smallest true difference that would be found with a probability of
+        80%, at the level of the family's smallest p-value.
+    """
 
     middle: float
     low: float
     high: float
     p: float
+    visible: float
 
     @property
     def verdict(self) -> str:
@@ -91,10 +104,15 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
     of comparisons, the next by one less, and so on, and makes none smaller than the one
     before.
     """
+    complete = {
+        key: terms
+        for key, terms in family.items()
+        if all((panel, curve) in scores for _, panel, curve in terms)
+    }
+    quantile = statistics.NormalDist().inv_cdf
+    errors = quantile(1 - LEVEL / (2 * max(1, len(complete)))) + quantile(_POWER)
     raw = {}
-    for key, terms in family.items():
-        if not all((panel, curve) in scores for _, panel, curve in terms):
-            continue
+    for key, terms in complete.items():
         sides = [scores[panel, curve] for _, panel, curve in terms]
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
@@ -104,7 +122,8 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
-        raw[key] = Comparison(middle, low, high, p_value)
+        visible = errors * float(np.std(drawn))
+        raw[key] = Comparison(middle, low, high, p_value, visible)
     corrected, least = {}, 0.0
     for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):
         least = max(least, min(1.0, raw[key].p * (len(raw) - i)))

@@ -6,7 +6,7 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments.search import DELAY, Point, Search
+from experiments.search import DELAY, PAPERS, Point, Search
 from experiments.store import Run, Store
 from gasil_jax import presets
 from gasil_jax.config import Config
@@ -28,6 +28,7 @@ class Curve:
       changes: hyperparameters and other fields of `Config` to change.
       reward_delay: the task's reward delay, in steps.
       obs_noise: standard deviation of the task's observation noise.
+      terminal_limits: whether the task's step limit terminates an episode.
       base: the settings before the changes: a preset's, by its name; the defaults of
         `Config`, by None; or what a search chose, by a function of task, agent and
         delay that returns the search.
@@ -40,6 +41,7 @@ class Curve:
     changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
     obs_noise: float = 0.0
+    terminal_limits: bool = False
     base: str | Callable[[str, str, int], Search] | None = "tuned"
     seeds: int = 10
     total_steps: int = 1_000_000
@@ -50,6 +52,17 @@ class Curve:
         if callable(self.base):
             return self.base(self.env, self.agent, self.reward_delay)
         return None
+
+    @property
+    def family(self) -> tuple[bool, bool, bool]:
+        """Whether rewards are delayed and raw, and whether the agent is the paper's.
+
+        Comparisons of curves that differ in none of these are a family.
+        """
+        search = self.search
+        raw = not getattr(search, "normalize_rewards", True)
+        own = search is not None and not (self.changes or search.decompose_rewards)
+        return self.reward_delay > 1, raw, own and self.agent in PAPERS
 
     def point(self, searched: Store) -> Point | None:
         """Return the settings that differ from the defaults or the preset.
@@ -72,7 +85,14 @@ class Curve:
             )
         config = config.replace(**{"total_steps": self.total_steps, **point})
         return tuple(
-            Run(self.env, config, seed, self.reward_delay, self.obs_noise)
+            Run(
+                self.env,
+                config,
+                seed,
+                self.reward_delay,
+                self.obs_noise,
+                terminal_limits=self.terminal_limits,
+            )
             for seed in range(self.seeds)
         )
 
@@ -149,6 +169,22 @@ class Figure:
                         names = f"{ours}{part}", f"{other}{part}"
                         compared[panel, *names] = difference(panel, *names)
         return compared
+
+    def families(self) -> list[Comparisons]:
+        """Return the comparisons of the page in families, each corrected on its own.
+
+        Comparisons with dense and with delayed rewards, those with normalized and with
+        raw ones, and those among the paper's agents and others are separate families.
+        """
+        families: dict[Any, dict[tuple[str, ...], Terms]] = {}
+        for key, terms in self.compared().items():
+            curves = [
+                self.panels[panel][name.removesuffix(" early")]
+                for _, panel, name in terms
+            ]
+            kind = None if self.over else frozenset(x.family for x in curves)
+            families.setdefault(kind, {})[key] = terms
+        return list(families.values())
 
     def requested(self, searched: Store) -> list[Run]:
         """Return all runs of the figure whose settings are decided, panel by panel.

@@ -192,6 +192,7 @@ def train(program: Program) -> dict[Run, Record]:
         obs_noise=run.obs_noise,
         physics=setup.physics,
         integrator=run.integrator,
+        terminal_limits=run.terminal_limits,
     )
     options = run_options.Options(
         env=run.env,

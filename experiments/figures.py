@@ -32,11 +32,14 @@ from experiments.search import (
     CELLS,
     DELAY,
     PAIR,
+    PAPER_STEPS_OF,
+    PAPERS,
+    STEPS,
     TASKS,
     PaperSearch,
     Point,
-    PPOValues,
     Search,
+    SharedValues,
     SingleSetting,
     searches,
 )
@@ -96,7 +99,6 @@ _SCHEDULED = Arm(
     "ppo+gasil",
     {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
 )
-_PAPERS = ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
 #: Adaptive imitation as a whole, and with one part at a time removed.
 _PARTS = [
     Arm("whole", ADAPTIVE),
@@ -206,6 +208,31 @@ def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
     )
 
 
+_WITH_PPOS, _WITH_GASILS = "{} (PPO's values)", "{} (PPO+GASIL's values)"
+#: The paper's agents with the values that PPO's search chose, and PPO with PPO+GASIL's.
+_EQUAL = joined(
+    grid(TASKS, arms, (delay,), base=base)
+    for delay in (1, DELAY)
+    for arms, base in (
+        (PAIR, Search),
+        ([Arm(_WITH_PPOS.format(x), x) for x in PAPERS[1:]], SharedValues),
+        (
+            [Arm(_WITH_GASILS.format("ppo"), "ppo")],
+            functools.partial(SharedValues, chooser="ppo+gasil"),
+        ),
+    )
+)
+
+
+def _equal_comparisons() -> Comparisons:
+    """Compare PPO+GASIL with each other agent that has the same values."""
+    gasil = _WITH_PPOS.format("ppo+gasil")
+    pairs = [(gasil, "ppo")]
+    pairs += [(gasil, _WITH_PPOS.format(x)) for x in ("ppo+bc", "ppo+sil")]
+    pairs += [("ppo+gasil", _WITH_GASILS.format("ppo"))]
+    return {(panel, *x): difference(panel, *x) for panel in _EQUAL for x in pairs}
+
+
 def _paper_panel(
     env: str, delay: int, normalize: bool, agents: Sequence[str]
 ) -> Panels:
@@ -222,6 +249,7 @@ def _paper_panel(
             panel="{task}" if normalize else "{task} (raw)",
             base=functools.partial(PaperSearch, normalize_rewards=normalize),
             seeds=40 if bimodal and agent != "ppo+bc" else 10,
+            total_steps=PAPER_STEPS_OF.get(env, STEPS),
         )
         for agent in agents
     )
@@ -230,12 +258,28 @@ def _paper_panel(
 #: The panels under the paper's protocol, those first that decide most.
 _PROTOCOL = joined(
     _paper_panel(env, delay, normalize, agents)
-    for delay, normalize, agents in (
-        (DELAY, True, _PAPERS),
-        (DELAY, False, PAIR),
-        (1, True, _PAPERS),
+    for tasks, delay, normalize, agents in (
+        (TASKS[:4], DELAY, True, PAPERS),
+        (TASKS[:4], DELAY, False, PAIR),
+        (TASKS[:4], 1, True, PAPERS),
+        (TASKS[4:], DELAY, True, PAPERS),
+        (TASKS[4:], 1, True, PAPERS),
+        (TASKS, 1, False, PAIR),
+        (TASKS[4:], DELAY, False, PAIR),
     )
-    for env in TASKS[:4]
+    for env in tasks
+)
+
+
+_LIMITS = joined(
+    grid(
+        TASKS[:4],
+        [Arm(f"{x} (terminal limits)" if terminal else x, x) for x in PAIR],
+        (DELAY,),
+        base=PaperSearch,
+        terminal_limits=terminal,
+    )
+    for terminal in (False, True)
 )
 
 
@@ -269,6 +313,19 @@ FIGURES: Mapping[str, Figure] = {
             if curve.search
         },
     ),
+    "time_limits": Figure(
+        "The paper's own protocol with terminal time limits",
+        "",
+        _LIMITS,
+        comparisons={
+            (panel, ours, other): difference(panel, ours, other)
+            for panel in _LIMITS
+            for ours, other in (
+                *((f"{x} (terminal limits)", x) for x in PAIR),
+                tuple(f"{x} (terminal limits)" for x in PAIR[::-1]),
+            )
+        },
+    ),
     "delayed_rewards": Figure(
         "Delayed rewards: PPO on decomposed rewards beside all others",
         "",
@@ -294,7 +351,7 @@ FIGURES: Mapping[str, Figure] = {
                     base=functools.partial(SingleSetting, decompose_rewards=True),
                 ),
                 grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,)),
-                _delayed(_PAPERS, Search),
+                _delayed(PAPERS, Search),
             ]
         ),
         favourite=_SCALED.name,
@@ -331,16 +388,10 @@ FIGURES: Mapping[str, Figure] = {
         favourite=_LOGIT.name,
     ),
     "ppo_values": Figure(
-        "Dense rewards: the paper's agents with the values that PPO's search chose",
+        "The paper's agents with equal settings",
         "",
-        joined(
-            grid(TASKS, arms, base=base)
-            for arms, base in (
-                (["ppo"], Search),
-                ([Arm(f"{x} (PPO's values)", x) for x in _PAPERS[1:]], PPOValues),
-            )
-        ),
-        favourite="ppo",
+        _EQUAL,
+        comparisons=_equal_comparisons(),
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",

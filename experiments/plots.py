@@ -152,6 +152,27 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
     axes.minorticks_off()
 
 
+#: What the best of k points returns, for k from 1 on, by panel and agent.
+Budgets = dict[tuple[str, str], np.ndarray]
+
+
+def draw_search_budget(budgets: Budgets) -> Picture:
+    """Return a plot of what the best of k points of a search returns."""
+    panels = list(dict.fromkeys(panel for panel, _ in budgets))
+    picture = Picture(figsize=(7.2, 3.0), layout="constrained")
+    grid = picture.subplots(1, max(1, len(panels)), squeeze=False, sharey=True)[0]
+    for axes, panel in zip(grid, panels, strict=False):
+        for (of, agent), returns in budgets.items():
+            if of == panel:
+                count = np.arange(1, len(returns) + 1)
+                color = _COLOR_OF[agent]
+                axes.plot(count, returns, ".-", color=color, label=agent)
+        axes.set(title=f"{panel} rewards", xlabel="points that the search may try")
+        axes.legend(frameon=False, fontsize=7)
+    grid[0].set_ylabel("return of the best, in units\nof dense PPO's best")
+    return picture
+
+
 def save_png(picture: Picture, path: pathlib.Path, dpi: int = 80) -> None:
     """Write a small PNG, of 256 colors."""
     with io.BytesIO() as buffer:

@@ -34,7 +34,6 @@ from experiments.search import (
     BEYOND,
     CELLS,
     DELAY,
-    FINALIST_SEEDS,
     PROTOCOL,
     SEEDS,
     SPACES,
@@ -63,9 +62,11 @@ _READING = """## How to read this
   not all were.
 - **Better, worse:** verdicts on differences, by a permutation test and the bootstrap
   together (differences of differences: by the bootstrap alone), corrected by Holm's
-  method for the {} comparisons of final returns on this page. If no two curves
-  differed, the chance of even one "better" or "worse" would be at most 5% (about 5% for
-  differences of differences). Verdicts on evaluated returns are corrected on their own.
+  method within a family of comparisons (here of {}). Dense and delayed rewards,
+  normalized and raw ones, and comparisons among the paper's agents and others are
+  separate families. If no two curves of a family differed, the chance of even one
+  "better" or "worse" would be at most 5% (about 5% for differences of differences).
+  Verdicts on evaluated returns are corrected on their own.
   All verdicts are about these settings: the intervals leave out that another search
   might have chosen others.
 - **Not clear:** neither; it does not mean that two are equal.
@@ -178,6 +179,7 @@ class Page:
     SLOTS = (
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "grids", "searches", "importance", "ranks", "published"),
+        "passing",
     )
 
     def __init__(
@@ -205,7 +207,12 @@ class Page:
                     share = self.figure.early / curve.total_steps
                     early = [x.part(0.0, share) for x in results.records.values()]
                     self.scores[panel, f"{label} early"] = np.array(early)
-        self.comparisons = compare(self.scores, self.figure.compared())
+        self.comparisons = self._compared(self.scores)
+
+    def _compared(self, scores: Scores) -> dict[tuple[str, ...], Comparison]:
+        """Return the figure's comparisons of scores, corrected family by family."""
+        families = self.figure.families()
+        return {k: x for one in families for k, x in compare(scores, one).items()}
 
     def table(self) -> str:
         """Return the final returns: a row for each panel and curve."""
@@ -271,7 +278,7 @@ class Page:
             for key, results in self.results.items()
             if results.complete and len(results.evaluated) >= FEWEST_SEEDS
         }
-        comparisons = compare(scores, self.figure.compared())
+        comparisons = self._compared(scores)
         return self._tally(scores, comparisons, lacking="without enough evaluations")
 
     def _tally(
@@ -347,8 +354,8 @@ class Page:
 
     def searches(self) -> str:
         """Return a table of the results of the figure's searches."""
-        few, more = len(SEEDS), len(FINALIST_SEEDS)
-        head = ["task", "points", "best point", f"its mean of {more} seeds"]
+        few = len(SEEDS)
+        head = ["task", "points", "best point", "its mean (seeds)"]
         head += [f"all points' median of {few} seeds", "worst"]
         rows = []
         for name, search in self.figure.searches.items():
@@ -358,8 +365,9 @@ class Page:
             cells = ["not complete", "", "", ""]
             if scores is not None and best is not None:
                 means = scores.mean(axis=1)
-                values = (best[1].mean(), np.median(means), means.min())
-                cells = [point_in_words(best[0]), *(f"{x:.0f}" for x in values)]
+                mean = f"{best[1].mean():.0f} ({len(best[1])})"
+                cells = [point_in_words(best[0]), mean]
+                cells += [f"{x:.0f}" for x in (np.median(means), means.min())]
             rows.append([name, f"{len(points)}", *cells])
         return markdown_table(head, rows)
 
@@ -412,6 +420,26 @@ class Page:
         columns = ("source", "tasks", "seeds", *TASKS)
         rows += [[row[column] for column in columns] for row in others]
         return markdown_table(columns, rows)
+
+    def passing(self, panel: str, threshold: str) -> str:
+        """Return which share of each curve's seeds returns more than a threshold.
+
+        Where some seeds learn a task and others don't, this says more than a mean.
+
+        Args:
+          panel: the panel.
+          threshold: the return.
+        """
+        rows = []
+        for name in self.figure.panels.get(panel, ()):
+            if (panel, name) in self.scores:
+                finals = self.scores[panel, name]
+                count = int(np.sum(finals > float(threshold)))
+                share = f"{count} of {len(finals)}"
+                rows.append([name, f"{count / len(finals):.0%} ({share})"])
+                rows[-1] += [interval(finals)]
+        head = [panel, f"seeds above {threshold}", "interquartile mean"]
+        return markdown_table(head, rows)
 
     def settings(self) -> str:
         """Return a table of each curve's settings that are not the defaults."""
@@ -466,7 +494,8 @@ class Page:
                 words += f", and at least {searched} of the searches"
             parts.append(f"{words}.")
         if self.results:
-            parts += [_READING.format(len(self.comparisons)), "## Settings"]
+            sizes = [f"{len(family)}" for family in self.figure.families()]
+            parts += [_READING.format(" and ".join(sizes)), "## Settings"]
             parts.append(self.settings())
         return "\n\n".join(parts) + "\n"
 

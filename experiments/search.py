@@ -12,6 +12,7 @@ the chosen points with other seeds than the searches.
 import dataclasses
 import functools
 import itertools
+import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -28,8 +29,9 @@ Space = Mapping[str, tuple[Any, ...]]
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 #: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
-#: The two agents that most figures compare, and the adaptive one.
-PAIR, ADAPTIVE = ("ppo", "ppo+gasil"), "ppo+gasil-adaptive"
+#: The two agents that most figures compare, the paper's, and the adaptive one.
+PAIR, PAPERS = ("ppo", "ppo+gasil"), ("ppo", "ppo+bc", "ppo+sil", "ppo+gasil")
+ADAPTIVE = "ppo+gasil-adaptive"
 #: Steps of a run in a search.
 STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
 #: Number of points of each agent's search, and their seeds.
@@ -259,6 +261,13 @@ PAPER_SPACES: Mapping[str, Space] = {
 _PAPER_POINTS = 32
 
 
+#: The paper's rule for humanoid with dense rewards: alpha is 0 for 2M steps and then
+#: raised to 0.02 until 3M.
+_HUMANOID: Point = {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))}
+#: The steps of a run under the paper's protocol where they are not `STEPS`.
+PAPER_STEPS_OF = {"humanoid": 3_000_000}
+
+
 @functools.cache
 def paper_points(agent: str) -> tuple[Point, ...]:
     """Return the points of an agent's search under the paper's protocol."""
@@ -287,17 +296,25 @@ class PaperSearch(Search):
     normalize_rewards: bool = True
 
     def _base(self) -> Config:
-        return Config(
+        config = Config(
             agent=self.agent,
-            total_steps=STEPS,
+            total_steps=PAPER_STEPS_OF.get(self.env, STEPS),
             num_envs=1,
             stagger_episodes=False,
             normalize_rewards=self.normalize_rewards,
         )
+        return config.replace(**_HUMANOID) if self._has_schedule else config
+
+    @property
+    def _has_schedule(self) -> bool:
+        task = (self.env, self.agent, self.reward_delay)
+        return task == ("humanoid", "ppo+gasil", 1)
 
     def points(self, store: Store) -> tuple[Point, ...]:
         """Return all points of the search."""
-        return paper_points(self.agent)
+        points = paper_points(self.agent)
+        own = {"alpha": _HUMANOID["alpha"]} if self._has_schedule else {}
+        return tuple({**point, **own} for point in points)
 
     def requested(self, store: Store) -> list[Run]:
         """Return all runs of the search."""
@@ -350,14 +367,23 @@ class SingleSetting(Search):
 
 
 @dataclasses.dataclass(frozen=True)
-class PPOValues(Search):
-    """The search of an agent on a task, with PPO's choice of all values it shares."""
+class SharedValues(Search):
+    """The search of an agent on a task, with another agent's choice of shared values.
+
+    Attributes:
+      chooser: the other agent. Values of hyperparameters that it does not have are
+        those that the agent's own search chose.
+    """
+
+    chooser: str = "ppo"
 
     def chosen(self, store: Store) -> Point | None:
-        """Return the chosen point with PPO's values, or None if runs are missing."""
+        """Return the chosen point with the shared values, or None if runs lack."""
         own = super().chosen(store)
-        of_ppo = Search(self.env, "ppo", self.reward_delay).chosen(store)
-        return None if own is None or of_ppo is None else {**own, **of_ppo}
+        shared = Search(self.env, self.chooser, self.reward_delay).chosen(store)
+        if own is None or shared is None:
+            return None
+        return {**own, **{name: shared[name] for name in _SHARED}}
 
 
 def importance(agent: str, store: Store) -> dict[str, float]:
@@ -401,6 +427,32 @@ def mean_ranks(
     return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}
 
 
+def best_of(search: Search, store: Store) -> np.ndarray | None:
+    """Return what the best of k random points returns, for k from 1 on: (points,).
+
+    It is the expected return of the point that is chosen by one seed, measured with the
+    other one, so that a lucky choice gains nothing; the mean of both ways round. None
+    if runs of drawn points are missing.
+    """
+    scores = search.scores(draw(search.agent), store)
+    if scores is None:
+        return None
+    count = len(scores)
+    returns = []
+    for choosing, other in (scores.T, scores.T[::-1]):
+        # In order of the choosing seed, the best of k is the point of rank i if the
+        # other k - 1 are among the i points below it.
+        measured = other[np.argsort(choosing, kind="stable")]
+        returns.append(
+            [
+                sum(math.comb(i, k - 1) * x for i, x in enumerate(measured))
+                / math.comb(count, k)
+                for k in range(1, count + 1)
+            ]
+        )
+    return np.mean(returns, axis=0)
+
+
 class Coverage(NamedTuple):
     """The numbers of stored and planned runs of an agent on a task.
 
@@ -408,6 +460,7 @@ class Coverage(NamedTuple):
     once they are known. An incomplete search has no final runs yet.
     """
 
+    panel: str
     name: str
     search: Search
     searched: int
@@ -421,20 +474,17 @@ class Coverage(NamedTuple):
         return (self.searched, self.trained) == (self.to_search, self.to_train)
 
 
-def coverage(store: Store, curves: Iterable[Any]) -> list[Coverage]:
-    """Return the coverage of each task, delay and agent.
+def coverage(store: Store, curves: Iterable[tuple[str, str, Any]]) -> list[Coverage]:
+    """Return the coverage of each curve whose settings a search chooses.
 
     Args:
       store: the store of all runs.
-      curves: the curves of the figure that trains what the searches chose.
+      curves: the curves, each with its panel and name.
     """
     stored = lambda runs: sum(run in store for run in runs)
-    of = {curve.search: curve for curve in curves}
     rows = []
-    for task in CELLS:
-        for name, search in searches(*task).items():
-            runs = search.requested(store)
-            final = of[search].runs(store)
-            counts = (stored(runs), len(runs), stored(final), of[search].seeds)
-            rows.append(Coverage(name, search, *counts))
+    for panel, name, curve in curves:
+        runs = curve.search.requested(store)
+        counts = (stored(runs), len(runs), stored(curve.runs(store)), curve.seeds)
+        rows.append(Coverage(panel, name, curve.search, *counts))
     return rows

@@ -49,6 +49,7 @@ class Run:
     reward_delay: int = 1
     obs_noise: float = 0.0
     integrator: str = "model"
+    terminal_limits: bool = False
     algorithm_version: int = ALGORITHM_VERSION
 
     @functools.cached_property

@@ -3,17 +3,29 @@
 A claim's verdict is computed from the comparisons on its figure's page.
 """
 
+import itertools
 import json
 import pathlib
 import shlex
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from experiments import report
+import numpy as np
+
+from experiments import plots, report
+from experiments.comparisons import number
 from experiments.curves import name_of
 from experiments.figures import FIGURES
 from experiments.report import Page
-from experiments.search import ADAPTIVE, DELAY, TASKS
+from experiments.search import (
+    ADAPTIVE,
+    DELAY,
+    PAPERS,
+    TASKS,
+    PaperSearch,
+    Search,
+    best_of,
+)
 from experiments.store import RESULTS, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
@@ -25,11 +37,10 @@ _Expected = tuple[tuple[str, ...], str]
 _OPPOSITE = {"better": "worse", "worse": "better"}
 
 
-class Claim(NamedTuple):
-    """A claim, and the verdicts with which it holds.
+class Test(NamedTuple):
+    """The verdicts of one figure with which a claim holds.
 
     Attributes:
-      words: the claim as text.
       figure: name of the figure whose comparisons decide.
       cases: the expected verdicts by case, such as a task. A case agrees if all of its
         comparisons have the expected verdict.
@@ -37,16 +48,53 @@ class Claim(NamedTuple):
         it holds in part.
     """
 
-    words: str
     figure: str
     cases: Mapping[str, Sequence[_Expected]]
     needed: int
 
 
-def _ahead(delay: int, others: Sequence[str]) -> dict[str, list[_Expected]]:
+#: The protocols that claims are tested under, in the order of the table's columns.
+PROTOCOLS = ("the paper's protocol", "equal settings", "all tuned")
+
+
+class Claim(NamedTuple):
+    """A claim as text, and its tests by protocol."""
+
+    words: str
+    tests: Mapping[str, Test]
+
+
+def _tuned(words: str, *test: Any, **more: Any) -> Claim:
+    """Return a claim that was tested only where all agents are tuned."""
+    return Claim(words, {PROTOCOLS[-1]: Test(*test, **more)})
+
+
+def _ahead(
+    delay: int,
+    others: Sequence[str],
+    ours: str = "ppo+gasil",
+) -> dict[str, list[_Expected]]:
     """Expect PPO+GASIL to be better than other agents on each task."""
     panels = [name_of(env, delay) for env in TASKS]
-    return {p: [((p, "ppo+gasil", x), "better") for x in others] for p in panels}
+    return {p: [((p, ours, x), "better") for x in others] for p in panels}
+
+
+def _on_tasks(words: str, delay: int, share: float) -> Claim:
+    """Return the claim that PPO+GASIL is ahead of the paper's other agents on tasks.
+
+    Args:
+      words: the claim as text.
+      delay: the tasks' reward delay.
+      share: the share of the tasks on which it must be ahead, for the claim to hold.
+    """
+    equal = tuple(x if x == "ppo" else f"{x} (PPO's values)" for x in _OTHERS)
+    of = {
+        "paper_protocol": _ahead(delay, _OTHERS),
+        "ppo_values": _ahead(delay, equal, ours="ppo+gasil (PPO's values)"),
+        "matrix": _ahead(delay, _OTHERS),
+    }
+    tests = [Test(name, cases, round(share * len(cases))) for name, cases in of.items()]
+    return Claim(words, dict(zip(PROTOCOLS, tests, strict=True)))
 
 
 def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
@@ -60,10 +108,10 @@ def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
     return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
 
 
-_OTHERS, _CONTROL = ("ppo", "ppo+bc", "ppo+sil"), ("ppo+bonus",)
+_OTHERS, _CONTROL = PAPERS[:-1], ("ppo+bonus",)
 _GROWS = [key for key in FIGURES["stochastic_walker2d"].compared() if len(key) == 4]
 CLAIMS = (
-    Claim(
+    _tuned(
         "Point mass, in a layout that was chosen for it: PPO+GASIL is slower at first "
         "and ends higher than PPO",
         "point_mass",
@@ -73,39 +121,35 @@ CLAIMS = (
         },
         needed=2,
     ),
-    Claim(
-        "Dense rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on most tasks",
-        "matrix",
-        _ahead(1, _OTHERS),
-        needed=4,
+    _on_tasks(
+        "Delayed rewards: PPO+GASIL is ahead of PPO, PPO+BC and PPO+SIL on all tasks "
+        "(in the paper by a large margin, which is not judged here)",
+        DELAY,
+        share=1.0,
     ),
-    Claim(
-        "Delayed rewards: PPO+GASIL is ahead of these three on all tasks (in the paper "
-        "by a large margin, which is not judged here)",
-        "matrix",
-        _ahead(DELAY, _OTHERS),
-        needed=6,
+    _on_tasks(
+        "Dense rewards: PPO+GASIL is ahead of these three on most tasks", 1, share=2 / 3
     ),
-    Claim(
+    _tuned(
         "Noise on observations: PPO+GASIL's lead over PPO is larger with it",
         "stochastic_walker2d",
         {key[0]: [(key, "better")] for key in _GROWS},
         needed=3,
     ),
-    Claim(
+    _tuned(
         "Discriminator updates: PPO+GASIL does poorly with too few (1) or too many "
         "(20)",
         "hyperparameters",
         _comparisons("hyperparameters", "discriminator_updates"),
         needed=4,
     ),
-    Claim(
+    _tuned(
         "Buffer: PPO+GASIL does poorly if it is too small (500 steps) or large (5000)",
         "hyperparameters",
         _comparisons("hyperparameters", "buffer_steps"),
         needed=4,
     ),
-    Claim(
+    _tuned(
         "Control, not a claim of the paper: with delayed rewards PPO+GASIL is ahead of "
         "the same survival bonus without imitation (PPO+BONUS)",
         "matrix",
@@ -119,45 +163,92 @@ class Summary:
     """The page of all claims and the README's blocks, from one store."""
 
     #: The methods that slots may name. Other slots are a figure's name and its slot.
-    SLOTS = ("claims", "figures")
+    SLOTS = ("claims", "effects", "figures")
 
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
 
-    def verdict(self, claim: Claim) -> str:
+    def verdict(self, test: Test | None) -> str:
         """Return as text whether a claim holds, judged by the complete curves."""
-        compared = self.pages[claim.figure].comparisons
+        if test is None:
+            return ""
+        compared = self.pages[test.figure].comparisons
         measured = {
             case: all(compared[key].verdict == verdict for key, verdict in expected)
-            for case, expected in claim.cases.items()
+            for case, expected in test.cases.items()
             if all(key in compared for key, _ in expected)
         }
         if not measured:
             return "not measured yet"
         agree = [case for case, agrees in measured.items() if agrees]
-        opposite = [
-            case if len(claim.cases[case]) == 1 else f"{case} against {key[2]}"
-            for case in measured
-            for key, verdict in claim.cases[case]
-            if compared[key].verdict == _OPPOSITE[verdict]
-        ]
-        lacking = len(claim.cases) - len(measured)
-        if len(agree) >= claim.needed:
+        judged = [x for case in measured for x in test.cases[case]]
+        opposite = sum(compared[key].verdict == _OPPOSITE[x] for key, x in judged)
+        lacking = len(test.cases) - len(measured)
+        if len(agree) >= test.needed:
             word = "holds"
-        elif len(agree) + lacking >= claim.needed:
+        elif len(agree) + lacking >= test.needed:
             word = "open so far"
         else:
             word = "holds in part" if agree else "does not hold"
         words = f"{word}: in {len(agree)} of {len(measured)} cases"
         words += f" ({'; '.join(agree)})" if agree else ""
         if opposite:
-            words += f"; the opposite ({'; '.join(opposite)})"
+            words += f"; the opposite in {opposite} of {len(judged)} comparisons"
         return words + (f"; {lacking} not measured yet" if lacking else "")
 
     def claims(self) -> str:
-        """Return a table with each claim and what was measured."""
-        rows = [(claim.words, self.verdict(claim)) for claim in CLAIMS]
-        return report.markdown_table(["The paper's claim", "Here"], rows)
+        """Return a table with each claim and what was measured by each protocol."""
+        rows = [
+            (claim.words, *(self.verdict(claim.tests.get(x)) for x in PROTOCOLS))
+            for claim in CLAIMS
+        ]
+        return report.markdown_table(["The paper's claim", *PROTOCOLS], rows)
+
+    def effects(self, rewards: str) -> str:
+        """Return a table of how far PPO+GASIL is ahead of others on each task.
+
+        Args:
+          rewards: "dense" or "delayed".
+        """
+        claim = next((x for x in CLAIMS if x.words.lower().startswith(rewards)), None)
+        if claim is None:
+            raise InputError(f"rewards is {rewards}: it must be dense or delayed")
+        rows: dict[tuple[str, str], dict[str, str]] = {}
+        for protocol, test in claim.tests.items():
+            compared = self.pages[test.figure].comparisons
+            for key, _ in itertools.chain(*test.cases.values()):
+                words = "not measured yet"
+                if key in compared:
+                    one = compared[key]
+                    words = f"{one}, {one.verdict}"
+                    if one.verdict == "not clear":
+                        words += f" (visible from {number(one.visible)} on)"
+                other = key[2].partition(" (")[0]
+                rows.setdefault((key[0], other), {})[protocol] = words
+        return report.markdown_table(
+            ["task", "ahead of", *PROTOCOLS],
+            [[*names, *(x.get(y, "") for y in PROTOCOLS)] for names, x in rows.items()],
+        )
+
+    def budgets(self) -> plots.Budgets:
+        """Return what the best of k points returns, by rewards and agent of the paper.
+
+        The unit of a task is what the best of all of PPO's points returns with dense
+        rewards. The values are means over the tasks whose searches are all stored.
+        """
+        store = self.pages["matrix"].searched
+        budgets: plots.Budgets = {}
+        for delay, rewards in ((DELAY, "delayed"), (1, "dense")):
+            for agent in PAPERS:
+                curves = []
+                for env in TASKS:
+                    unit = best_of(Search(env, "ppo"), store)
+                    curve = best_of(Search(env, agent, delay), store)
+                    if unit is not None and curve is not None:
+                        curves.append(curve / unit[-1])
+                if curves:
+                    budgets[rewards, agent] = np.mean(curves, axis=0)
+        return budgets
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""
@@ -170,8 +261,8 @@ class Summary:
         Raises:
           InputError: if there is no such slot.
         """
-        if name in self.SLOTS and not arguments:
-            return getattr(self, name)()
+        if name in self.SLOTS and len(arguments) == (name == "effects"):
+            return getattr(self, name)(*arguments)
         if name in self.pages and arguments:
             return self.pages[name].value(*arguments)
         raise InputError(
@@ -194,19 +285,24 @@ class Summary:
             for search in page.figure.searches.values():
                 choose = search.leading if search.decompose_rewards else search.chosen
                 point = choose(page.searched)
-                # Adaptive imitation has one setting for all tasks.
-                if point is None or search.agent == ADAPTIVE:
+                # Adaptive imitation has one setting for all tasks, and the preset
+                # "paper" has normalized rewards.
+                raw = not getattr(search, "normalize_rewards", True)
+                if point is None or search.agent == ADAPTIVE or raw:
                     continue
                 config = report.changed(search.config(point))
                 kind = "delayed" if search.reward_delay > 1 else "dense"
                 kind = "decomposed" if search.decompose_rewards else kind
-                of_task = rows[kind].setdefault(search.env, {})
+                kind = f"paper {kind}" if isinstance(search, PaperSearch) else kind
+                of_task = rows.setdefault(kind, {}).setdefault(search.env, {})
                 of_task[search.agent] = dict(sorted(config.items()))
         return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
     def write(self) -> None:
         """Write the page of all claims, the README's blocks and the presets."""
         text = report.fill_blocks(README.read_text(), self.value)
+        picture = plots.draw_search_budget(self.budgets())
+        plots.save_png(picture, RESULTS / "search_budget.png")
         for path, content in (
             (RESULTS / "README.md", self.text()),
             (README, text),

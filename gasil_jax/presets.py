@@ -17,10 +17,10 @@ rewards, where rewards are delayed.
 lambda depend on the dimension of an action. Delayed rewards are
 decomposed.
 
-"paper" has the paper's batch, one environment x 2,048 steps, and what its appendix says
-about individual tasks. The rest are the defaults, which are the appendix's where it
-gives them. A single environment is slow, because only the seeds are stepped in
-parallel.
+"paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
+values of its appendix. Of what the appendix searches it has what our search chose on
+each task (experiments/results/paper_protocol.md), and the defaults where we did not
+search. Rewards are normalized.
 """
 
 import json
@@ -41,9 +41,10 @@ Overrides = Mapping[str, Any]
 Rows = Mapping[tuple[str, str], Overrides]
 
 
-#: File of the settings that searches chose, by "dense", "delayed" or "decomposed",
-#: environment and agent. `python -m experiments report` writes the rows of complete
-#: searches and leaves the others as they are.
+#: File of the settings that searches chose: by "dense", "delayed", "decomposed", "paper
+#: dense" or "paper delayed"; then by environment; then by agent.
+#: `python -m experiments report` writes the rows of complete searches and leaves the
+#: others as they are.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
@@ -75,7 +76,7 @@ def _searched(rewards: str) -> Rows:
     """Return the rows that searches chose."""
     return {
         (env, agent): row
-        for env, agents in _CHOSEN[rewards].items()
+        for env, agents in _CHOSEN.get(rewards, {}).items()
         for agent, row in agents.items()
     }
 
@@ -134,16 +135,17 @@ PRESETS: Mapping[str, Preset] = {
     "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
     "paper": Preset(
         {
+            **_searched("paper dense"),
             # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.
             ("humanoid", "ppo+gasil"): {
                 "alpha": 0.02,
                 "alpha_schedule": ((2e6, 0.0), (3e6, 1.0)),
             },
         },
-        {},
+        _searched("paper delayed"),
         # The paper's horizon is 2,048 steps of one environment. Staggering would only
         # matter with several.
-        every={"num_envs": 1, "stagger_episodes": False},
+        every={"num_envs": 1, "stagger_episodes": False, "normalize_rewards": True},
     ),
 }
 

@@ -33,6 +33,9 @@ class Settings:
         mjx, MJX's own step, which is slower.
       integrator: integrator of locomotion: model, the same as Gymnasium's, or euler,
         which is faster but changes the task.
+      terminal_limits: whether an episode that reaches the step limit counts as
+        terminated, without a future value, as in code of the paper's time. Otherwise it
+        is truncated, and the value of its last observation is bootstrapped.
     """
 
     reward_delay: int = 1
@@ -40,6 +43,7 @@ class Settings:
     physics: str = "mjx"
     solver: str = "small"
     integrator: str = "model"
+    terminal_limits: bool = False
 
 
 #: Prefix of the names of environments in ``brax.envs``.
@@ -164,6 +168,10 @@ def check(name: str, settings: Settings) -> None:
             f"solver is {settings.solver!r}: it needs physics 'mjx', and physics is "
             f"{settings.physics!r}"
         )
+    if not isinstance(settings.terminal_limits, bool):
+        raise ValueError(
+            f"terminal_limits is {settings.terminal_limits!r}: it must be True or False"
+        )
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
@@ -206,7 +214,7 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
       max_episode_steps: number of steps after which an episode is truncated; default
         the environment's own limit, or 1000 if it has none.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
-        integrator.
+        integrator, terminal_limits.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
@@ -227,7 +235,7 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
                 f"number from 1 to {limit}, the environment's own limit"
             )
         limit = int(max_episode_steps)
-    env = wrappers.EpisodeLimit(env, limit)
+    env = wrappers.EpisodeLimit(env, limit, terminal=chosen.terminal_limits)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, int(chosen.reward_delay))
     if chosen.obs_noise > 0:

@@ -43,13 +43,16 @@ def _refuse_taken(state: State, *names: str) -> None:
 class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
+    If `terminal` is true, an episode that ends there counts as terminated.
+
     Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
     limit and not the environment ended the episode, or where the environment sets it).
     """
 
-    def __init__(self, env: Env, episode_length: int):
+    def __init__(self, env: Env, episode_length: int, terminal: bool = False):
         super().__init__(env)
         self.episode_length = episode_length
+        self._terminal = terminal
 
     @property
     def unwrapped(self) -> Env:
@@ -73,7 +76,8 @@ class EpisodeLimit(Wrapper):
         # Truncation alone ends an episode too.
         ended = jnp.maximum(at_limit, truncated(state).astype(jnp.float32))
         own = state.info.get("truncation", jnp.float32(0))
-        truncation = jnp.maximum(own, at_limit * (1.0 - state.done))
+        cut_off = at_limit * (1.0 - state.done) * (not self._terminal)
+        truncation = jnp.maximum(own, cut_off)
         info = {**state.info, "steps": steps, "truncation": truncation}
         return state.replace(done=jnp.maximum(state.done, ended), info=info)
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from brax.envs import Env, State
 
+import gasil_envs
 from gasil_envs import wrappers
 
 
@@ -218,3 +219,16 @@ def test_auto_reset_starts_afresh_and_keeps_the_final_observation():
     np.testing.assert_array_equal(states.reward, [0, 0, 6, 4] * 2)
     starts = [float(start.obs[1]), float(states.obs[3, 1]), float(states.obs[7, 1])]
     assert len(set(starts)) == 3
+
+
+def test_a_terminal_limit_is_no_truncation():
+    for terminal in (False, True):
+        env = gasil_envs.make(
+            "point_mass", max_episode_steps=2, terminal_limits=terminal
+        )
+        state = env.reset(jax.random.key(0))
+        for _ in range(2):
+            state = env.step(state, jnp.zeros(env.action_size))
+        assert state.done == 1.0 and state.info["truncation"] == (not terminal)
+    with pytest.raises(ValueError, match="terminal_limits is 1: it must be True or F"):
+        gasil_envs.make("point_mass", terminal_limits=1)

@@ -1,6 +1,7 @@
 """The plan of all agents and tasks: alike for every agent, and its holes are told."""
 
 import collections
+import itertools
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from experiments.search import (
     Search,
     SingleSetting,
 )
-from experiments.store import Record, Store
+from experiments.store import RESULTS, Record, Store
 
 
 def fill(store, one, points, scores, seeds=(1000, 1001)):
@@ -104,7 +105,7 @@ def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
 
 
 def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
-    store, mixed = Store(tmp_path), search.PPOValues("hopper", "ppo+bc")
+    store, mixed = Store(tmp_path), search.SharedValues("hopper", "ppo+bc")
     chosen = {}
     for agent in ("ppo", "ppo+bc"):
         assert mixed.chosen(store) is None
@@ -153,7 +154,7 @@ def test_holes_of_the_plan_are_told(tmp_path, capsys):
     store, one = Store(tmp_path / "runs"), Search("hopper", "ppo", 20)
     drawn = one.points(store)
     fill(store, one, drawn, range(len(drawn)))
-    curves = [curve for *_, curve in FIGURES["matrix"].curves()]
+    curves = FIGURES["matrix"].curves()
     rows = {x.search: x for x in search.coverage(store, curves)}
     # Where rewards are delayed, there is PPO with decomposed rewards too.
     assert len(rows) == len(CELLS) * len(AGENTS) + len(TASKS)
@@ -164,5 +165,60 @@ def test_holes_of_the_plan_are_told(tmp_path, capsys):
     assert __main__.main(["coverage", "--results", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
     line = next(x for x in printed.splitlines() if x.startswith("hopper-delayed"))
+    assert "humanoid (raw) ppo+gasil 0 of 64 0 of 10" in " ".join(printed.split())
     words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 20"
     assert line.split() == words.split()
+
+
+def test_the_papers_protocol_has_the_appendix_s_values():
+    for agent, count in {
+        "ppo": 4,
+        "ppo+bc": 16,
+        "ppo+sil": 16,
+        "ppo+gasil": 32,
+    }.items():
+        points = search.paper_points(agent)
+        assert len(points) == len(set(map(str, points))) == count
+        for name, values in search.PAPER_SPACES[agent].items():
+            counts = collections.Counter(point[name] for point in points)
+            assert set(counts) == set(values) and len(set(counts.values())) == 1
+    one = search.PaperSearch("hopper", "ppo+gasil", 20)
+    for runs in one.runs(one.points(Store(RESULTS / "runs"))):
+        assert [run.seed for run in runs] == [1000, 1001]
+        config, numbers = runs[0].config, runs[0].config.hyperparameters
+        assert (config.num_envs, config.num_steps) == (1, 2048)
+        assert config.normalize_rewards and not config.stagger_episodes
+        assert (config.num_epochs, config.minibatch_size) == (10, 64)
+        assert (numbers.gamma, numbers.gae_lambda) == (0.99, 0.95)
+        assert numbers.initial_deviation == 1.0 and numbers.entropy_coefficient == 0.0
+
+
+def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
+    store, one = Store(tmp_path), search.PaperSearch("hopper", "ppo", 20)
+    raw = search.PaperSearch("hopper", "ppo", 20, normalize_rewards=False)
+    assert one.best(store) is None
+    fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
+    assert one.chosen(store) == {"learning_rate": 5e-5}
+    assert not store.missing(one.requested(store)) and raw.chosen(store) is None
+
+
+def test_the_best_of_k_points_is_chosen_by_one_seed_and_measured_with_the_other(
+    tmp_path,
+):
+    """Against all subsets of points."""
+    store, one = Store(tmp_path), Search("hopper", "ppo", 20)
+    assert search.best_of(one, store) is None
+    points, rng = search.draw("ppo"), np.random.default_rng(0)
+    scores = rng.permuted(np.tile(np.arange(12.0), (2, 1)), axis=1)
+    for seed, of_seed in zip((1000, 1001), scores, strict=True):
+        fill(store, one, points, of_seed, [seed])
+    expected = []
+    for k in range(1, 13):
+        subsets = list(itertools.combinations(range(12), k))
+        both = [
+            other[max(subset, key=chosen.__getitem__)]
+            for subset in subsets
+            for chosen, other in (scores, scores[::-1])
+        ]
+        expected.append(np.mean(both))
+    np.testing.assert_allclose(search.best_of(one, store), expected)
