@@ -163,7 +163,7 @@ class Summary:
     """The page of all claims and the README's blocks, from one store."""
 
     #: The methods that slots may name. Other slots are a figure's name and its slot.
-    SLOTS = ("claims", "effects", "figures")
+    SLOTS = ("claims", "effects", "figures", "front")
 
     def __init__(self, store: Store):
         self.pages = {name: Page(name, store) for name in FIGURES}
@@ -249,6 +249,40 @@ class Summary:
                 if curves:
                     budgets[rewards, agent] = np.mean(curves, axis=0)
         return budgets
+
+    def front(self) -> str:
+        """Return in three sentences what reproduces, what ends it, and what is better.
+
+        They are about delayed rewards.
+        """
+        protocol, tuned, decomposed = (
+            [self._lead(figure, ours, other) for other in others]
+            for figure, ours, others in (
+                ("paper_protocol", "ppo+gasil", _OTHERS),
+                ("matrix", "ppo+gasil", _OTHERS),
+                ("delayed_rewards", "ppo (decomposed)", ("ppo+gasil",)),
+            )
+        )
+        return (
+            "**With delayed rewards**, under [the paper's own protocol]"
+            "(experiments/results/paper_protocol.md), PPO+GASIL is better than "
+            f"{', than '.join(protocol)}. If lambda, gamma, exploration and the "
+            "learning rate are [tuned for every agent](experiments/results/matrix.md) "
+            f"too, it is better than {', than '.join(tuned)}. PPO that [learns which "
+            "steps earned a reward](experiments/results/delayed_rewards.md), without "
+            f"imitation, is better than the tuned {decomposed[0]}."
+        )
+
+    def _lead(self, name: str, ours: str, other: str) -> str:
+        """Return on how many delayed tasks an agent is better than another one."""
+        panels = [name_of(env, DELAY) for env in TASKS]
+        compared = self.pages[name].comparisons
+        found = [
+            compared[p, ours, other] for p in panels if (p, ours, other) in compared
+        ]
+        better = sum(x.verdict == "better" for x in found)
+        lacking = "" if len(found) == len(panels) else " measured"
+        return f"{other.upper()} on {better} of {len(found)}{lacking} tasks"
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""

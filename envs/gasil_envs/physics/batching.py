@@ -75,22 +75,6 @@ def take(x: jax.Array, index: Iterable[int]) -> jax.Array:
     return jnp.stack(rows) if rows else x[:0]
 
 
-def _as_one_kernel(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Make a CPU run all operations of a function as one kernel.
-
-    A kernel costs a microsecond to start, and a step of physics has a thousand
-    operations. A matrix product can't be among them.
-    """
-
-    def call(tree: Any) -> Any:
-        if not on_cpu():
-            return materialize(function(tree))
-        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
-            return jax.jit(function)(tree)
-
-    return call
-
-
 def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Make `jax.vmap`, nested if needed, extend a trailing batch axis.
 
@@ -117,7 +101,7 @@ def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return jnp.moveaxis(x, -2, 0)
 
         joined = materialize(jax.tree.map(join, tree, is_batched))
-        result = _as_one_kernel(function)(joined)
+        result = materialize(function(joined))
         result = jax.tree.map(part, result)
         return result, jax.tree.map(lambda _: True, result)
 
@@ -137,13 +121,13 @@ def in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """Make a function of arrays with a trailing batch run in parts on a CPU.
 
     The parts are of equal size, a multiple of the lanes of a vector: the last one is
-    padded with copies of the last entry.
+    padded with copies of the last entry. All of them are one kernel, because a kernel
+    costs a microsecond to start and a step of physics has a thousand operations. So
+    the function can have no matrix product, nor a sum over an axis.
     """
 
     def tiled(tree: Any) -> Any:
         batch = jax.tree.leaves(tree)[0].shape[-1]
-        if not on_cpu() or batch == 1:
-            return function(tree)
         tiles = -(-batch // _MOST_IN_A_TILE)
         size = -(-batch // (tiles * _LANES)) * _LANES
         padding = tiles * size - batch
@@ -163,4 +147,10 @@ def in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
             results = jax.lax.map(function, parts)
         return jax.tree.map(join, results)
 
-    return tiled
+    def call(tree: Any) -> Any:
+        if not on_cpu() or jax.tree.leaves(tree)[0].shape[-1] == 1:
+            return function(tree)
+        with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
+            return jax.jit(tiled)(tree)
+
+    return call

@@ -179,8 +179,8 @@ def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
     """Return MuJoCo's tangent of a normal: (C, 3, B) -> (C, 3, B)."""
     y, z = (np.eye(3, dtype=np.float32)[i][:, None] for i in (1, 2))
     start = jnp.where(jnp.abs(normal[:, 1:2]) < 0.5, y, z)
-    tangent = start - normal * jnp.sum(normal * start, axis=1, keepdims=True)
-    return tangent / jnp.sqrt(jnp.sum(tangent**2, axis=1, keepdims=True))
+    tangent = start - normal * total(jnp.asarray(normal * start), 1)[:, None]
+    return tangent / jnp.sqrt(total(tangent**2, 1)[:, None])
 
 
 def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:

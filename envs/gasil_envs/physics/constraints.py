@@ -363,13 +363,13 @@ def body_forces(
     """
     (_, position, axes), constants = contacts
     signs = np.array(edges, np.float32).reshape(len(edges), -1)
-    force = jnp.sum(edge_forces, axis=1)[:, None] * axes[:, 0]
+    force = total(edge_forces, 1)[:, None] * axes[:, 0]
     for t in range(signs.shape[1]):
-        along = jnp.sum(edge_forces * signs[:, t, None], axis=1) * constants.friction
+        along = total(edge_forces * signs[:, t, None], 1) * constants.friction
         force = force + along[:, None] * axes[:, t + 1]
     wrench = jnp.concatenate([tree.cross(position - com, force), force], axis=1)
     wrench = materialize(wrench)
-    return jnp.sum(constants.body[:, :, None] * wrench[:, None], axis=0)
+    return total(constants.body[:, :, None] * wrench[:, None])
 
 
 # Few of the possible contacts are in play at once: humanoid has 138 possible contacts,

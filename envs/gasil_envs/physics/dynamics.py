@@ -232,7 +232,7 @@ def _integrate_positions(
 
 def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: float) -> jax.Array:
     """Unit quaternions (4, B) after turning with `velocity` (3, B) rad/s for `dt`."""
-    norm = lambda x: jnp.sqrt(jnp.sum(x**2, axis=0))
+    norm = lambda x: jnp.sqrt(total(x**2))
     speed = norm(velocity)
     half = 0.5 * dt * speed
     scale = jnp.where(speed > 1e-10, jnp.sin(half) / jnp.maximum(speed, 1e-10), 0.0)

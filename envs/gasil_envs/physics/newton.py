@@ -119,11 +119,23 @@ def _spells_out(matrix: jax.Array) -> bool:
     return matrix.shape[0] * matrix.shape[1] <= most
 
 
+def _sum_in_a_loop(term: Callable[[Any], jax.Array], count: int) -> jax.Array:
+    """Sum terms by their index, compiled for size.
+
+    A CPU's kernel of many operations can hold neither a matrix product nor, from jaxlib
+    0.11 on, a sum over an axis: XLA hands both to libraries.
+    """
+    first = term(0)
+    return jax.lax.fori_loop(1, count, lambda i, sum_: sum_ + term(i), first)
+
+
 def _matvec(matrix: jax.Array, vector: jax.Array, spell_out: bool) -> jax.Array:
     """(N, V, B), (V, B) -> (N, B)."""
     if spell_out:
         return add(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
-    return jnp.sum(matrix * vector, axis=1)
+    if on_gpu():
+        return jnp.sum(matrix * vector, axis=1)
+    return _sum_in_a_loop(lambda i: matrix[:, i] * vector[i], vector.shape[0])
 
 
 def _matvec_transposed(
@@ -132,7 +144,9 @@ def _matvec_transposed(
     """(N, V, B), (N, B) -> (V, B)."""
     if spell_out:
         return add(matrix[n] * vector[n] for n in range(vector.shape[0]))
-    return jnp.sum(matrix * vector[:, None], axis=0)
+    if on_gpu():
+        return jnp.sum(matrix * vector[:, None], axis=0)
+    return _sum_in_a_loop(lambda n: matrix[n] * vector[n], vector.shape[0])
 
 
 def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> jax.Array:
@@ -141,10 +155,7 @@ def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> ja
     if not spell_out and on_gpu():
         return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
     if not spell_out:
-        # Not a matrix product, which a kernel of many operations can't hold.
-        outer = lambda n, sum_: sum_ + left[n][:, None] * right[n]
-        zero = jnp.zeros((size, size, left.shape[-1]), left.dtype)
-        return jax.lax.fori_loop(0, num_rows, outer, zero)
+        return _sum_in_a_loop(lambda n: left[n][:, None] * right[n], num_rows)
     rows = [
         add(left[n, i] * right[n, : i + 1] for n in range(num_rows))
         for i in range(size)

@@ -119,7 +119,7 @@ def _turn(
 
 def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
     """Return the rotation of a quaternion of any length, (4, B)."""
-    w, x, y, z = quaternion / jnp.sqrt(jnp.sum(quaternion**2, axis=0))
+    w, x, y, z = quaternion / jnp.sqrt(total(quaternion**2))
     return [
         jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
         jnp.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
