@@ -23,7 +23,7 @@ from experiments import (
 from experiments.curves import Curve, Figure
 from experiments.figures import FIGURES
 from experiments.report import Page
-from experiments.search import coverage
+from experiments.search import PaperSearch, coverage
 from experiments.store import RESULTS, ResultsFolder, Run, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
@@ -81,7 +81,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
     """Return the small version of a figure, of the named panels or the first one.
 
     Instead of what searches choose, which may not be known yet, it uses the presets
-    "tuned" and "decomposed".
+    "tuned", "decomposed" and "paper".
 
     Raises:
       InputError: if a name is no panel or search of the figure, or if only searches are
@@ -98,6 +98,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
         base = curve.base
         if search := curve.search:
             base = "decomposed" if search.decompose_rewards else "tuned"
+            base = "paper" if isinstance(search, PaperSearch) else base
         return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
 
     panels = {

@@ -7,6 +7,7 @@ alone, not from the members beside it or from the device it runs on.
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
+from concurrent import futures
 from typing import Any
 
 import jax
@@ -159,9 +160,18 @@ class Members:
         Args:
           states: states to continue from, (members, ...); default the first states.
         """
-        states = self.init() if states is None else self.to_devices(states)
-        states = jax.block_until_ready(states)
-        return states, self.advance.lower(states, np.int32(0)).compile()
+        shapes = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=self.sharding),
+            jax.eval_shape(self.init),
+        )
+        with futures.ThreadPoolExecutor(1) as pool:
+            # The first states have a program of their own, which takes seconds too.
+            compiled = pool.submit(
+                lambda: self.advance.lower(shapes, np.int32(0)).compile()
+            )
+            states = self.init() if states is None else self.to_devices(states)
+            states = jax.block_until_ready(states)
+            return states, compiled.result()
 
     def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function of one member's arrays as one of all members' arrays.
