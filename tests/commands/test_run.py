@@ -16,8 +16,8 @@ import pytest
 from small_training import FLAGS
 
 import gasil_jax
-from gasil_envs import locomotion
-from gasil_jax.host import run_options
+from gasil_envs import locomotion, own_code
+from gasil_jax.host import command_line, run_options
 from gasil_jax.run import main
 from gasil_jax.sweeps import assembly
 
@@ -239,6 +239,22 @@ sys.exit(command_line.reports_errors(lambda: print(100_000 * "line\\n"))())
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 128 + signal.SIGPIPE
+
+
+def test_code_that_exits_later_does_not_decide_the_status(capsys):
+    status = command_line.reports_errors(lambda: sys.exit())()
+    assert status == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: code of yours exits: SystemExit (")
+
+
+def test_ctrl_c_passes_through_what_checks_the_users_code():
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), own_code.refused("never said"):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def test_a_run_in_which_no_episode_can_end_is_told(capsys):

@@ -284,6 +284,20 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
             "def Env():\n    raise OSError('no licence')",
             "built: OSError: no licence .*2",
         ),
+        ("def Env():\n    import sys\n    sys.exit()", r"built: SystemExit \(.*line 3"),
+        ("raise KeyboardInterrupt", r"imported: KeyboardInterrupt \(.*line 1"),
+        (
+            _OWN.replace("return State", "raise SystemExit(4); State"),
+            r"can't be traced: SystemExit: 4 \(.*line 7",
+        ),
+        (
+            _OWN.replace("reward = action[0]", "exit(5)"),
+            r"can't be traced: SystemExit: 5 \(.*line 10",
+        ),
+        (
+            _OWN + "    @property\n    def observation_size(self):\n        exit()",
+            r"can't be built: SystemExit: None \(.*line 14",
+        ),
         ("class Env:\n    reset = step = 1", "it has no observation_size"),
         (
             _OWN.replace("2, 1, ", "2.5, 1, "),
