@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 import math
 import pickle
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import evaluate, merge, run, sweep
+from gasil_jax import evaluate, merge, npz, run, sweep
 from gasil_jax.config import validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
@@ -303,6 +304,21 @@ WHOLE = saved(
         WHOLE[:300] + b"xxxx" + WHOLE[304:],
         saved(np.save, np.zeros(3)),
         saved(np.savez, observation=np.zeros((3, 2))),
+        *[
+            saved(np.savez, observation=np.zeros((3, 2)), action=action)
+            for action in (
+                np.zeros((3, 1), complex),
+                np.full((3, 1), b"1"),
+                np.full((3, 1), "1"),
+                np.zeros((3, 1), "datetime64[s]"),
+                np.zeros((3, 1), bool),
+                np.full((3, 1), 1e300),
+                np.full((3, 1), np.nan),
+                np.zeros(3),
+                np.zeros((3, 0)),
+                np.zeros((2, 1)),
+            )
+        ],
         b"",
         b"PK\x03\x04 not a zip",
         b"\x80\x04N.",
@@ -315,6 +331,30 @@ def test_a_foreign_demonstration_file_is_refused(content, tmp_path):
     with pytest.raises(ValueError, match=r"must be an \.npz file") as refusal:
         expert.load(str(path))
     assert "\n" not in str(refusal.value)
+
+
+def test_a_file_with_an_altered_byte_is_read_or_refused(tmp_path):
+    path = tmp_path / "expert.npz"
+    arrays = {name: np.ones((2, 1)) for name in ("observation", "action")}
+    whole, refused = saved(np.savez, **arrays), 0
+    for position, value in itertools.product(range(len(whole)), (1, 64, 255)):
+        altered = bytearray(whole)
+        altered[position] ^= value
+        path.write_bytes(altered)
+        try:
+            npz.read(path)
+        except ValueError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 100
+
+
+def test_an_array_that_nobody_needs_may_be_of_any_kind(tmp_path):
+    path = tmp_path / "expert.npz"
+    arrays = {name: np.ones((2, 1)) for name in ("observation", "action")}
+    np.savez(path, **arrays, notes=np.array([{}]))
+    observation, _ = expert.load(str(path))
+    np.testing.assert_array_equal(observation, arrays["observation"])
 
 
 def test_a_demonstration_file_is_never_unpickled(tmp_path):
