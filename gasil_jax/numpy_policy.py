@@ -41,6 +41,8 @@ def zoo() -> tuple[str, ...]:
 
 def _file(path: str | pathlib.Path) -> pathlib.Path:
     """Return the file of a saved policy."""
+    if not isinstance(path, str | pathlib.PurePath):
+        raise ValueError(f"path is {path!r}: it must be a string or a pathlib.Path")
     if str(path).startswith(ZOO_PREFIX):
         name = str(path).removeprefix(ZOO_PREFIX)
         if name not in zoo():

@@ -238,19 +238,21 @@ def note(text: str) -> None:
 
 
 def check_minimum(options: Any, **minimum: int) -> None:
-    """Check that fields are not below their lowest allowed values; None is allowed.
+    """Check that fields are from their lowest allowed values to 2**63 - 1, or None.
 
     Args:
       options: a dataclass.
       **minimum: the lowest allowed value of each field to check, by name.
 
     Raises:
-      InputError: if a number is too low.
+      InputError: if a number is out of range.
     """
     for name, low in minimum.items():
         value = getattr(options, name)
         if value is not None and value < low:
             raise InputError(f"{name} is {value}: it must be {low} or more")
+        if value is not None and value >= 2**63:
+            raise InputError(f"{name} is {value}: it must be at most {2**63 - 1}")
 
 
 def check_key(key: int) -> None:

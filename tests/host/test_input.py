@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import evaluate, merge, npz, run, sweep
+from gasil_jax import evaluate, evaluation, merge, npz, run, sweep
 from gasil_jax.config import validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
@@ -51,6 +51,7 @@ OPTIONS = [
     "evaluate_every",
     "evaluate_episodes",
 ]
+SMALL = gasil_jax.Config(num_envs=4, batch_steps=64, minibatch_size=16)
 NEVER_VALID = st.one_of(
     st.sampled_from(["-1", "-0.5", "nan", "inf", "-inf", "", "true", "1e999", "0x10"]),
     st.text(
@@ -157,6 +158,8 @@ def schedules_at_fault():
 
 WRONG = [
     *[("gamma", x) for x in (None, [1], True, np.True_, 1j, math.nan, 2**2000, {})],
+    *[("learning_rate", x) for x in (1e-60, 1e-40, -1e300, 10**400, np.zeros((2, 2)))],
+    ("num_envs", np.zeros((2, 2))),
     *[("agent", x) for x in (3, None, [], "")],
     *[("hidden_sizes", x) for x in (3, (2**62,), [3], ("a",), (None,), (True,))],
     *[
@@ -177,6 +180,47 @@ def test_a_value_of_any_type_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name) as refusal:
         validate(gasil_jax.Config().replace(**{name: value}))
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_whole_number_beyond_all_floats_is_refused(name, capsys):
+    for sign in ("", "-"):
+        value = f"--{name.replace('_', '-')}={sign}{400 * '9'}"
+        arguments = ["--env", "point_mass", value, "--out", "/proc/no/run"]
+        assert run.main(arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert name in line.replace("-", "_")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**400, -(10**400), 0, None, "3", True],
+    ids=lambda value: str(value)[:4],
+)
+def test_a_count_that_is_none_is_refused_by_name(value):
+    env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
+    for name, call in (
+        ("reward_delay", lambda: gasil_jax.preset("hopper", "ppo", reward_delay=value)),
+        ("evaluate_every", lambda: gasil_jax.fit(env, SMALL, evaluate_every=value)),
+        (
+            "num_episodes",
+            lambda: evaluation.run_episodes(
+                env, None, key, num_episodes=value, num_steps=1
+            ),
+        ),
+        (
+            "key",
+            lambda: evaluation.run_episodes(
+                env, None, value, num_episodes=1, num_steps=1
+            ),
+        ),
+        ("path", lambda: gasil_jax.load_policy(value)),
+    ):
+        is_default = name == "evaluate_every" and value is None
+        is_path = name == "path" and isinstance(value, str)
+        if not is_default and not is_path:
+            with pytest.raises(ValueError, match=f"^{name} is "):
+                call()
 
 
 @pytest.mark.parametrize(
