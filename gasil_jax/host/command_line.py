@@ -273,6 +273,10 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
+        out = sys.stdout
+        if isinstance(out, io.TextIOWrapper) and out.errors == "strict":
+            # A name that the terminal can't show must not fail a finished command.
+            out.reconfigure(errors="backslashreplace")
         try:
             return main(*args, **kwargs)
         except BrokenPipeError:
@@ -280,7 +284,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 128 + signal.SIGPIPE
         except (InputError, OSError) as error:
-            print(f"error: {error}", file=sys.stderr)
+            # A name may hold a line break.
+            print(r"\n".join(f"error: {error}".splitlines()), file=sys.stderr)
             too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
             return 2 if too_long or isinstance(error, InputError) else 1
         except HelpShown:

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import io
 import itertools
 import json
 import math
@@ -239,6 +240,20 @@ sys.exit(command_line.reports_errors(lambda: print(100_000 * "line\\n"))())
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 128 + signal.SIGPIPE
+
+
+def test_a_name_that_the_terminal_can_not_show_is_no_error(monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    assert command_line.reports_errors(lambda: print("in r\u00e9sum\u00e9") or 0)() == 0
+    terminal.flush()
+    assert terminal.buffer.getvalue() == b"in r\\xe9sum\\xe9\n"
+
+
+def test_a_line_break_in_a_name_keeps_the_error_in_a_line(capsys):
+    assert main(["--env", "hopper", "--out", "/proc/no\nrun"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert r"/proc/no\nrun" in line
 
 
 def test_code_that_exits_later_does_not_decide_the_status(capsys):
