@@ -349,6 +349,15 @@ def test_a_fault_of_the_users_environment_is_one_line(
     assert "\n" not in str(refused.value)
 
 
+def test_a_warning_of_mujoco_writes_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = gasil_envs.make("hopper", physics="mujoco").unwrapped
+    data = mujoco.MjData(env.model)
+    data.qvel[:] = np.nan
+    mujoco.mj_step(env.model, data)
+    assert data.warning.number.any() and list(tmp_path.iterdir()) == []
+
+
 def test_the_euler_integrator_is_mujocos():
     env = gasil_envs.make("hopper", physics="mujoco", integrator="euler")
     state, action = jax.jit(env.reset)(jax.random.key(0)), jnp.full(3, 0.5)
