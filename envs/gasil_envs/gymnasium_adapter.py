@@ -162,14 +162,14 @@ class GymnasiumEnv(gymnasium.Env):
         self._state = self._reset(_key(self.np_random))
         self._episode = []
         self._record()
-        return np.array(self._state.obs), {}
+        return np.array(self._state.obs), self._info()
 
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Return observation, reward, terminated, truncated and info.
 
-        ``info["true_reward"]`` is the reward without delay.
+        ``info["true_reward"]`` is the reward without delay, 0 after a reset.
 
         Raises:
           ResetNeeded: if there was no reset before.
@@ -181,8 +181,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._record()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
-        reward = float(state.reward)
-        info = {"true_reward": float(state.info.get("true_reward", reward))}
+        reward, info = float(state.reward), self._info()
         held = state.info.get("held_reward")
         last = any(x._elapsed_steps + 1 >= x._max_episode_steps for x in self._limits)
         if last and not terminated and held is not None:
@@ -201,6 +200,11 @@ class GymnasiumEnv(gymnasium.Env):
         """Free the resources of rendering."""
         if self._painter is not None:
             self._painter.close()
+
+    def _info(self) -> dict[str, Any]:
+        """Return info; its keys are the same after a reset and after a step."""
+        state = self._state
+        return {"true_reward": float(state.info.get("true_reward", state.reward))}
 
     def _record(self) -> None:
         if self._painter is not None:
@@ -279,7 +283,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         _refuse_fork()
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
-        return np.array(self._state.obs), {}
+        return np.array(self._state.obs), self._info()
 
     def step(
         self, actions: np.ndarray
@@ -298,12 +302,15 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         truncated = np.array(wrappers.truncated(state))
         terminated = np.array(state.done > 0) & ~truncated
         reward = np.array(state.reward, np.float64)
-        true_reward = np.array(state.info.get("true_reward", state.reward))
-        info = {
-            "true_reward": true_reward,
+        return np.array(state.obs), reward, terminated, truncated, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        """Return info; its keys are the same after a reset and after a step."""
+        state = self._state
+        return {
+            "true_reward": np.array(state.info.get("true_reward", state.reward)),
             "_true_reward": np.ones(self.num_envs, bool),
         }
-        return np.array(state.obs), reward, terminated, truncated, info
 
 
 def register() -> None:
