@@ -25,6 +25,12 @@ from gasil_jax.errors import unknown
 Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 
 
+#: Counts and shapes are int32.
+_LARGEST_COUNT = 2**31 - 1
+#: All other numbers are float32.
+_LARGEST_FLOAT = 3.4e38
+
+
 class Range(NamedTuple):
     """The range of finite numbers that a field allows.
 
@@ -46,15 +52,23 @@ class Range(NamedTuple):
         kind = numbers.Integral if self.whole else numbers.Real
         if not isinstance(value, kind) or isinstance(value, bool):
             return False
-        number = float(value)
-        above = number > self.low if self.excludes_low else number >= self.low
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number that is too large for a float
+            return False
+        if self.excludes_low:
+            # JAX computes in float32, and takes its subnormal numbers as 0.
+            single = np.float32(np.clip(number, -_LARGEST_FLOAT, _LARGEST_FLOAT))
+            above = bool(single - self.low >= np.finfo(np.float32).tiny)
+        else:
+            above = number >= self.low
         return above and number <= self.high and math.isfinite(number)
 
     def __str__(self) -> str:
         if self.whole:
             return f"a whole number, {self.low:g} or more"
         least = f"{'more than ' * self.excludes_low}{self.low:g}"
-        least += "" if self.excludes_low else " or more"
+        least += " in float32" if self.excludes_low else " or more"
         most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"
         return f"{least} and {most}"
 
@@ -388,12 +402,6 @@ def ranges(kind: type) -> Mapping[str, Range]:
     }
 
 
-#: Counts and shapes are int32.
-_LARGEST_COUNT = 2**31 - 1
-#: All other numbers are float32.
-_LARGEST_FLOAT = 3.4e38
-
-
 def validate(config: Config) -> None:
     """Check that every value of a config is allowed.
 
@@ -465,7 +473,9 @@ def _unboxed(value: Any, allowed: Range) -> Any:
 
 def _refusal(name: str, value: Any, allowed: object) -> ValueError:
     # The repr of NumPy's numbers also names their type.
-    shown = value if isinstance(value, numbers.Number) else repr(value)
+    is_number = isinstance(value, numbers.Number)
+    # The repr of an array may have several lines.
+    shown = value if is_number else " ".join(repr(value).split())
     return ValueError(f"{name} is {shown}: it must be {allowed}")
 
 
@@ -474,15 +484,12 @@ def _validate_number(
 ) -> None:
     if isinstance(value, str):
         raise _refusal(name, value, "a number")
-    try:
-        is_allowed = value in allowed
-    except OverflowError:  # a whole number that is too large for a float
-        is_allowed = False
-    if not is_allowed:
-        raise _refusal(name, value, allowed)
     most = most if allowed.whole else _LARGEST_FLOAT
-    if value > most:
+    is_real = isinstance(value, numbers.Real)
+    if is_real and value > most and math.isinf(allowed.high):
         raise _refusal(name, value, f"{allowed}, at most {most:g}")
+    if value not in allowed:
+        raise _refusal(name, value, allowed)
 
 
 def _validate_sizes(config: Config) -> None:

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import policy, train
-from gasil_jax.config import Config
+from gasil_jax import checks, policy, train
+from gasil_jax.config import Config, Range
+
+_EPISODES = Range(1, 2**31 - 1, whole=True)
 
 
 @full_precision
@@ -37,6 +39,10 @@ def evaluate(
 
     Returns:
       "episode_return" and "episode_length", (num_episodes,) each.
+
+    Raises:
+      ValueError: if the key is no single random key, or if the number of episodes is no
+        whole number from 1 on.
     """
     return run_episodes(
         env,
@@ -67,7 +73,13 @@ def run_episodes(
       num_episodes: number of episodes, which run in parallel.
       num_steps: steps after which an episode is truncated, at the latest.
       deterministic: whether to act with the policy's mean; else actions are drawn.
+
+    Raises:
+      ValueError: as in `evaluate`.
     """
+    checks.check_key(key)
+    if num_episodes not in _EPISODES:
+        raise ValueError(f"num_episodes is {num_episodes!r}: it must be {_EPISODES}")
     reset_key, act_key = jax.random.split(key)
 
     def step(carry: Any, key: jax.Array) -> Any:

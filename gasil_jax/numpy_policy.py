@@ -30,17 +30,8 @@ ZOO, ZOO_PREFIX = pathlib.Path(__file__).with_name("zoo"), "zoo:"
 #: Normalized observations are clipped to plus and minus this number.
 CLIP = 10.0
 
-_REQUIRED = (
-    "seeds",
-    "final_return",
-    "mean",
-    "scale",
-    "log_std",
-    "low",
-    "high",
-    "kernel_0",
-    "bias_0",
-)
+_PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
+_SHARED = ("low", "high")
 
 
 def zoo() -> tuple[str, ...]:
@@ -50,6 +41,8 @@ def zoo() -> tuple[str, ...]:
 
 def _file(path: str | pathlib.Path) -> pathlib.Path:
     """Return the file of a saved policy."""
+    if not isinstance(path, str | pathlib.PurePath):
+        raise ValueError(f"path is {path!r}: it must be a string or a pathlib.Path")
     if str(path).startswith(ZOO_PREFIX):
         name = str(path).removeprefix(ZOO_PREFIX)
         if name not in zoo():
@@ -59,7 +52,7 @@ def _file(path: str | pathlib.Path) -> pathlib.Path:
     return path / "policy.npz" if path.is_dir() else path
 
 
-def about(name: str) -> dict[str, Any]:
+def about(name: str | pathlib.Path) -> dict[str, Any]:
     """Return how a policy of the zoo was trained, and its score.
 
     Args:
@@ -72,6 +65,7 @@ def about(name: str) -> dict[str, Any]:
     Raises:
       ValueError: if there is no such policy.
     """
+    name = str(name)
     if not name.startswith(ZOO_PREFIX):
         raise ValueError(
             f"name is {name!r}: it must be zoo:NAME, with NAME one of "
@@ -82,21 +76,28 @@ def about(name: str) -> dict[str, Any]:
     return {"decompose_rewards": False, **stored}
 
 
-def _check(arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise `ValueError` unless these can be the arrays of a saved policy."""
-    num_layers = sum(name.startswith("kernel_") for name in arrays)
-    layers = [f"{kind}_{i}" for i in range(num_layers) for kind in ("kernel", "bias")]
-    if missing := [name for name in (*_REQUIRED, *layers) if name not in arrays]:
-        raise ValueError(f"{missing[0]} is missing")
-    count = arrays["seeds"].size
-    for name, value in arrays.items():
-        if name == "about":
-            continue
-        if value.dtype.kind not in "iuf":
-            raise ValueError(f"{name} holds no numbers")
-        per_seed = name not in ("low", "high")
-        if value.ndim == 0 or (per_seed and value.shape[0] != count) or not count:
-            raise ValueError(f"{name} has the shape {value.shape} for {count} seeds")
+def _is_a_weight(name: str) -> bool:
+    layer = name.startswith(("kernel_", "bias_"))
+    return layer or name in (*_PER_SEED, *_SHARED)
+
+
+def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
+    """Return the arrays of a saved policy; raise `ValueError` if it is none."""
+    arrays = npz.read(path, _is_a_weight)
+    number = lambda name, *shape, **finite: npz.numbers(arrays, name, shape, **finite)
+    (count,) = number("seeds", None).shape
+    number("final_return", count, finite=False)
+    _, width = number("mean", count, None).shape
+    number("scale", count, width)
+    _, num_actions = number("log_std", count, None).shape
+    for name in _SHARED:
+        number(name, num_actions, finite=False)
+    last = max(1, sum(name.startswith("kernel_") for name in arrays)) - 1
+    for i in range(last + 1):
+        outputs = num_actions if i == last else None
+        *_, width = number(f"kernel_{i}", count, width, outputs).shape
+        number(f"bias_{i}", count, width)
+    return arrays
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
@@ -116,14 +117,12 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
             f"policy.npz, or {ZOO_PREFIX}NAME"
         )
     try:
-        arrays = npz.read(path)
-        _check(arrays)
+        arrays = _read(path)
     except ValueError as error:
         raise ValueError(f"{path} is not a saved policy ({error})") from None
     seeds = arrays.pop("seeds").tolist()
-    arrays.pop("about", None)
     returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
-    shared = {name: arrays.pop(name) for name in ("low", "high")}
+    shared = {name: arrays.pop(name) for name in _SHARED}
     if seed is None:
         seed = seeds[int(np.argmax(returns))]
     if seed not in seeds:

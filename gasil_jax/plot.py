@@ -119,6 +119,8 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
     # Matplotlib would read formulas between dollars. The title names the environment.
     labels = [run.label.removeprefix(f"{run.env}, ") for run in runs]
     labels = [label.replace("$", r"\$") for label in labels]
+    # It would leave a label that begins with an underscore out of its legends.
+    labels = [f" {label}" if label.startswith("_") else label for label in labels]
     margin = 0.05 * (np.ptp(every) or 1.0)
     levels = np.linspace(every.min() - margin, every.max() + margin, 200)
     for number, run in enumerate(runs):

@@ -252,7 +252,8 @@ def _train_whole(options: Options, resumed: StoredRun | None) -> None:
     with run_options.open_folder(options, _PROGRAM) as folder:
         train(options, env, points, programs, folder)
         trained = trained_programs.TrainedPrograms(folder, programs)
-        summary = tables.write(folder, points, run_options.seeds_of(options), [trained])
+        results = tables.read(points, run_options.seeds_of(options), [trained])
+        summary = tables.write(folder, results)
     print(*tables.report(points, summary), f"in {folder}", sep="\n")
 
 

@@ -11,7 +11,9 @@ step.
 """
 
 import inspect
+import multiprocessing
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium
@@ -25,6 +27,11 @@ from gymnasium.wrappers import TimeLimit
 from gasil_envs import pictures, registry, wrappers
 
 _NAMESPACE = "gasil_envs"
+_NO_FORK = (
+    "JAX does not work in a process that was forked from one in which it runs: take "
+    'vectorization_mode="vector_entry_point", or vector_kwargs={"context": "spawn"} '
+    "for processes"
+)
 #: Id of the process that first used these environments; None before that.
 _process: int | None = None
 
@@ -40,6 +47,14 @@ def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
     )
 
 
+def _callers() -> Iterator[Any]:
+    """Yield the `self` of each function on the call stack, the innermost first."""
+    frame = inspect.currentframe()
+    while frame is not None:
+        yield frame.f_locals.get("self")
+        frame = frame.f_back
+
+
 def _refuse_fork() -> None:
     """Raise `RuntimeError` in a process forked from one that has used JAX.
 
@@ -48,11 +63,20 @@ def _refuse_fork() -> None:
     global _process
     _process = _process or os.getpid()
     if os.getpid() != _process:
-        raise RuntimeError(
-            "JAX does not work in a process that was forked from one in which it "
-            'runs: take vectorization_mode="vector_entry_point", or vector_kwargs='
-            '{"context": "spawn"} for processes'
-        )
+        raise RuntimeError(_NO_FORK)
+
+
+def _refuse_forking_caller() -> None:
+    """Raise `RuntimeError` if Gymnasium makes an environment before it forks.
+
+    Its `AsyncVectorEnv` makes one in the parent to see the spaces. What is raised in
+    its processes while they make theirs is lost.
+    """
+    for caller in _callers():
+        if isinstance(caller, gymnasium.vector.AsyncVectorEnv):
+            context = multiprocessing.get_context(caller.context)
+            if context.get_start_method() == "fork":
+                raise RuntimeError(_NO_FORK)
 
 
 def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
@@ -100,6 +124,7 @@ class GymnasiumEnv(gymnasium.Env):
         **settings: Any,
     ):
         _refuse_fork()
+        _refuse_forking_caller()
         self._env = env = wrappers.FaultyStepEnds(registry.make(name, **settings))
         self.observation_space, self.action_space = _spaces(env)
         if render_mode not in (None, *self.metadata["render_modes"]):
@@ -137,14 +162,14 @@ class GymnasiumEnv(gymnasium.Env):
         self._state = self._reset(_key(self.np_random))
         self._episode = []
         self._record()
-        return np.array(self._state.obs), {}
+        return np.array(self._state.obs), self._info()
 
     def step(
         self, action: np.ndarray
     ) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         """Return observation, reward, terminated, truncated and info.
 
-        ``info["true_reward"]`` is the reward without delay.
+        ``info["true_reward"]`` is the reward without delay, 0 after a reset.
 
         Raises:
           ResetNeeded: if there was no reset before.
@@ -156,8 +181,7 @@ class GymnasiumEnv(gymnasium.Env):
         self._record()
         truncated = bool(wrappers.truncated(state))
         terminated = bool(state.done > 0) and not truncated
-        reward = float(state.reward)
-        info = {"true_reward": float(state.info.get("true_reward", reward))}
+        reward, info = float(state.reward), self._info()
         held = state.info.get("held_reward")
         last = any(x._elapsed_steps + 1 >= x._max_episode_steps for x in self._limits)
         if last and not terminated and held is not None:
@@ -177,6 +201,11 @@ class GymnasiumEnv(gymnasium.Env):
         if self._painter is not None:
             self._painter.close()
 
+    def _info(self) -> dict[str, Any]:
+        """Return info; its keys are the same after a reset and after a step."""
+        state = self._state
+        return {"true_reward": float(state.info.get("true_reward", state.reward))}
+
     def _record(self) -> None:
         if self._painter is not None:
             self._episode.append(self._state.pipeline_state)
@@ -188,13 +217,11 @@ class GymnasiumEnv(gymnasium.Env):
         a `TimeLimit`. An environment has no reference to its wrappers, but their
         `reset` has called this one, so each is the `self` of a caller's frame.
         """
-        limits, frame = [], inspect.currentframe()
-        while frame is not None:
-            caller = frame.f_locals.get("self")
-            if isinstance(caller, TimeLimit) and caller.unwrapped is self:
-                limits.append(caller)
-            frame = frame.f_back
-        return limits
+        return [
+            caller
+            for caller in _callers()
+            if isinstance(caller, TimeLimit) and caller.unwrapped is self
+        ]
 
 
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
@@ -256,7 +283,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         _refuse_fork()
         super().reset(seed=seed)
         self._state = self._reset(_key(self.np_random))
-        return np.array(self._state.obs), {}
+        return np.array(self._state.obs), self._info()
 
     def step(
         self, actions: np.ndarray
@@ -275,12 +302,15 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         truncated = np.array(wrappers.truncated(state))
         terminated = np.array(state.done > 0) & ~truncated
         reward = np.array(state.reward, np.float64)
-        true_reward = np.array(state.info.get("true_reward", state.reward))
-        info = {
-            "true_reward": true_reward,
+        return np.array(state.obs), reward, terminated, truncated, self._info()
+
+    def _info(self) -> dict[str, Any]:
+        """Return info; its keys are the same after a reset and after a step."""
+        state = self._state
+        return {
+            "true_reward": np.array(state.info.get("true_reward", state.reward)),
             "_true_reward": np.ones(self.num_envs, bool),
         }
-        return np.array(state.obs), reward, terminated, truncated, info
 
 
 def register() -> None:

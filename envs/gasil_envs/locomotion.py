@@ -22,6 +22,11 @@ from gasil_envs.physics.interface import Fields, Physics, PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics
 from gasil_envs.physics.native import MujocoPhysics
 
+# MuJoCo would also write each of its warnings to MUJOCO_LOG.TXT in the user's folder.
+_log = mujoco.MjLogConfig.get()
+_log.logto_file = False
+_log.set()
+
 Range = tuple[float, float]
 _EVERYTHING: Range = (-float("inf"), float("inf"))
 

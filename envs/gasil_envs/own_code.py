@@ -1,9 +1,12 @@
 """Import an object that a user names as MODULE:NAME; report errors in one line."""
 
+import contextlib
+import dis
 import importlib
 import pathlib
 import sysconfig
 import traceback
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -20,12 +23,44 @@ def find(kind: str, name: str) -> Any:
       ValueError: if it can't be imported.
     """
     module, attribute = name.split(":", 1)
-    try:
+    with refused(f"{kind} {name!r} can't be imported"):
         return getattr(importlib.import_module(module), attribute)
-    # A script without `if __name__ == "__main__"` may exit.
-    except (Exception, SystemExit) as error:
-        why = in_a_line(error)
-    raise ValueError(f"{kind} {name!r} can't be imported: {why}")
+
+
+@contextlib.contextmanager
+def refused(
+    what: str, *packages: pathlib.Path, passing: type[Exception] | tuple[()] = ()
+) -> Iterator[None]:
+    """Turn all that a user's code raises in the `with` block into a `ValueError`.
+
+    That includes `SystemExit`, as of a script that ends with `sys.exit()`: the user's
+    code does not decide how this process ends. Only Ctrl-C does.
+
+    Args:
+      what: the beginning of the message, such as "agent 'a:B' can't be traced".
+      *packages: as in `in_a_line`.
+      passing: type of the errors that are raised as they are.
+    """
+    try:
+        yield
+    except passing:
+        raise
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and not _is_of_a_raise(error):
+            raise
+        why = in_a_line(error, *packages)
+        raise ValueError(f"{what}: {why}") from None
+
+
+def _is_of_a_raise(error: BaseException) -> bool:
+    """Return whether a `raise` in Python code raised an error, and not a signal."""
+    level = error.__traceback__
+    while level is not None and level.tb_next is not None:
+        level = level.tb_next
+    if level is None:
+        return False
+    code = level.tb_frame.f_code.co_code
+    return code[level.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
 def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
@@ -39,7 +74,7 @@ def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
       *packages: folders of other packages, whose code is not the user's.
     """
     message = str(error).partition("\n")[0]
-    typed = f"{type(error).__name__}: {message}"
+    typed = ": ".join(filter(None, (type(error).__name__, message)))
     if isinstance(error, SyntaxError):
         return typed  # It names file and line already.
     others = (*_NOT_THE_USERS, *packages)

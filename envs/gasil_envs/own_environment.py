@@ -42,15 +42,12 @@ def build(name: str) -> Env:
       ValueError: if it can't be built or does not have Brax's interface.
     """
     constructor = find(name)
-    try:
+    with own_code.refused(f"env {name!r} can't be built"):
         env = constructor()
-    except Exception as error:
-        raise ValueError(
-            f"env {name!r} can't be built: {own_code.in_a_line(error)}"
-        ) from None
-    for attribute in INTERFACE:
-        if not hasattr(env, attribute):
-            raise ValueError(f"env {name!r} is no environment: it has no {attribute}")
+        # An attribute may be a property, which is the user's code too.
+        missing = [x for x in INTERFACE if not hasattr(env, x)]
+    if missing:
+        raise ValueError(f"env {name!r} is no environment: it has no {missing[0]}")
     # `registry.make` wraps it in an `EpisodeLimit`, which adds fields to its states.
     check(name, env, wrappers.EpisodeLimit(env, 1))
     return env
@@ -103,12 +100,8 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
     Raises:
       ValueError: if it can't be traced, or returns something else than a state.
     """
-    try:
+    with own_code.refused(f"env {name!r} can't be traced"):
         state = jax.eval_shape(getattr(env, function), *arguments)
-    except Exception as error:
-        raise ValueError(
-            f"env {name!r} can't be traced: {own_code.in_a_line(error)}"
-        ) from None
     if not all(hasattr(state, x) for x in ("obs", "reward", "done", "info")):
         raise ValueError(
             f"env {name!r}: its {function} returns a {type(state).__name__}: it must "

@@ -21,6 +21,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
+from gasil_envs.own_code import in_a_line
 from gasil_jax.config import Schedule
 from gasil_jax.errors import InputError
 from gasil_jax.host.interruption import Interrupted
@@ -29,6 +30,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _REGISTRY = ConstructorRegistry()
+
+
+class HelpShown(SystemExit):
+    """Ends a command that has printed its help."""
 
 
 @contextlib.contextmanager
@@ -104,7 +109,7 @@ def parse(
     program: str,
     default: T | None = None,
 ) -> T:
-    """Return the options of a command line. With --help, print the help and exit.
+    """Return the options of a command line.
 
     Args:
       options: the dataclass of the options.
@@ -113,6 +118,7 @@ def parse(
       default: the values of options that are not given; default the dataclass's own.
 
     Raises:
+      HelpShown: with --help, once the help is printed.
       InputError: if tyro rejects the command line; the message is one line.
     """
     given = sys.argv[1:] if arguments is None else arguments
@@ -129,7 +135,7 @@ def parse(
             )
     except SystemExit as exit_:
         if exit_.code in (0, None):
-            raise
+            raise HelpShown(0) from None
         raise InputError(_in_one_line(printed.getvalue())) from None
 
 
@@ -232,19 +238,21 @@ def note(text: str) -> None:
 
 
 def check_minimum(options: Any, **minimum: int) -> None:
-    """Check that fields are not below their lowest allowed values; None is allowed.
+    """Check that fields are from their lowest allowed values to 2**63 - 1, or None.
 
     Args:
       options: a dataclass.
       **minimum: the lowest allowed value of each field to check, by name.
 
     Raises:
-      InputError: if a number is too low.
+      InputError: if a number is out of range.
     """
     for name, low in minimum.items():
         value = getattr(options, name)
         if value is not None and value < low:
             raise InputError(f"{name} is {value}: it must be {low} or more")
+        if value is not None and value >= 2**63:
+            raise InputError(f"{name} is {value}: it must be at most {2**63 - 1}")
 
 
 def check_key(key: int) -> None:
@@ -259,11 +267,16 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
     The status is 1 if a folder or file can't be read or written, or if a program that
     it started failed; 2 for bad input, which includes a file name that is too long; and
     128 plus the signal's number if it was interrupted, or if nobody reads its output to
-    the end. Without an error it is what `main` returns.
+    the end. Without an error it is what `main` returns. Code of the user's that exits,
+    in whatever it is called, is bad input.
     """
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
+        out = sys.stdout
+        if isinstance(out, io.TextIOWrapper) and out.errors == "strict":
+            # A name that the terminal can't show must not fail a finished command.
+            out.reconfigure(errors="backslashreplace")
         try:
             return main(*args, **kwargs)
         except BrokenPipeError:
@@ -271,9 +284,15 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 128 + signal.SIGPIPE
         except (InputError, OSError) as error:
-            print(f"error: {error}", file=sys.stderr)
+            # A name may hold a line break.
+            print(r"\n".join(f"error: {error}".splitlines()), file=sys.stderr)
             too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
             return 2 if too_long or isinstance(error, InputError) else 1
+        except HelpShown:
+            raise
+        except SystemExit as exit_:
+            print(f"error: code of yours exits: {in_a_line(exit_)}", file=sys.stderr)
+            return 2
         except Interrupted as interrupted:
             print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)
             return 128 + interrupted.signal

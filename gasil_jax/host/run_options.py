@@ -399,9 +399,7 @@ def _trace(env: Any, config: Config) -> None:
         state = training.init(env, config, jax.random.key(0))
         return training.iterate(env, config, state)
 
-    try:
+    package = pathlib.Path(training.__file__).parent
+    what = f"agent {config.agent!r} can't be traced"
+    with command_line.input_checked(), own_code.refused(what, package):
         jax.eval_shape(begin)
-    except Exception as error:
-        package = pathlib.Path(training.__file__).parent
-        why = own_code.in_a_line(error, package)
-        raise InputError(f"agent {config.agent!r} can't be traced: {why}") from None

@@ -11,6 +11,7 @@ import numpy as np
 from gasil_jax import npz
 
 _MINARI = "minari:"
+_NAMES = ("observation", "action")
 
 
 def load(source: str) -> tuple[np.ndarray, np.ndarray]:
@@ -50,66 +51,52 @@ def _version(source: str) -> Any:
 def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
     """Load an expert; `version` makes the cache read a changed file again."""
     if source.startswith(_MINARI):
-        observation, action = _load_minari(source.removeprefix(_MINARI))
+        name = source.removeprefix(_MINARI)
+        _require_minari(name)
+        form = "a local data set with arrays as observations and actions"
+        read = lambda: _read_minari(name)
     else:
-        observation, action = _load_file(pathlib.Path(source))
-    observation = np.asarray(observation, np.float32)
-    action = np.asarray(action, np.float32)
-    if observation.ndim != 2 or action.ndim != 2 or len(observation) != len(action):
-        raise ValueError(
-            f"expert {source!r} has observations {observation.shape} and actions "
-            f"{action.shape}: they must be (steps, obs) and (steps, action)"
+        form = "an .npz file with arrays 'observation' and 'action'"
+        read = lambda: npz.read(pathlib.Path(source), lambda name: name in _NAMES)
+    # What is wrong in a data set decides the type of the error.
+    try:
+        arrays = read()
+        observation, action = (
+            npz.numbers(arrays, x, (None, None)).astype(np.float32) for x in _NAMES
         )
-    if not (
-        len(action) and np.isfinite(observation).all() and np.isfinite(action).all()
-    ):
-        raise ValueError(
-            f"expert {source!r} is empty or has numbers that aren't finite"
-        )
+        if len(observation) != len(action):
+            raise ValueError(f"{len(observation)} observations, {len(action)} actions")
+    except Exception as error:
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise ValueError(f"expert is {source!r}: it must be {form} ({why})") from None
     for array in (observation, action):
         array.setflags(write=False)
     return observation, action
 
 
-def _load_file(path: pathlib.Path) -> tuple[np.ndarray, np.ndarray]:
-    try:
-        arrays = npz.read(path)
-        if missing := [x for x in ("observation", "action") if x not in arrays]:
-            raise ValueError(f"{missing[0]} is missing")
-    except ValueError as error:
-        raise ValueError(
-            f"expert is {str(path)!r}: it must be an .npz file with arrays "
-            f"'observation' and 'action' ({error})"
-        ) from None
-    return arrays["observation"], arrays["action"]
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).partition("\n")[0] or type(error).__name__
-
-
-def _load_minari(name: str) -> tuple[np.ndarray, np.ndarray]:
+def _require_minari(name: str) -> None:
+    """Raise `ValueError` unless Minari and what it needs for data sets is installed."""
     try:
         importlib.import_module("h5py")  # Minari needs it to read a data set.
-        import minari
+        importlib.import_module("minari")
     except ImportError:
         raise ValueError(
             f"expert is 'minari:{name}': it needs the package minari "
             '(pip install "gasil_jax[minari]")'
         ) from None
-    try:
-        episodes = list(minari.load_dataset(name).iterate_episodes())
-        # An episode has one observation more than actions.
-        return (
-            np.concatenate([e.observations[: len(e.actions)] for e in episodes]),
-            np.concatenate([e.actions for e in episodes]),
-        )
-    # Observations that are dicts or tuples raise a TypeError.
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(
-            f"expert is 'minari:{name}': it must be a local data set with arrays as "
-            f"observations and actions ({_first_line(error)})"
-        ) from None
+
+
+def _read_minari(name: str) -> dict[str, np.ndarray]:
+    import minari
+
+    episodes = list(minari.load_dataset(name).iterate_episodes())
+    # An episode has one observation more than actions.
+    observations = [e.observations[: len(e.actions)] for e in episodes]
+    arrays = (
+        np.concatenate(observations),
+        np.concatenate([e.actions for e in episodes]),
+    )
+    return dict(zip(_NAMES, arrays))
 
 
 def check(source: str | None, observation_size: int, action_size: int) -> None:

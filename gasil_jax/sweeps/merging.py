@@ -111,8 +111,8 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
       out: folder of the tables, created if it is missing.
 
     Raises:
-      InputError: if a shard is missing, unfinished or of another sweep, or if `out`
-        holds other files.
+      InputError: if a shard is missing, unfinished, damaged or of another sweep, or if
+        `out` holds other files. Nothing has been written then.
     """
     every = _read_all(folders)
     description = every[0].description
@@ -128,9 +128,10 @@ def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
         raise InputError(
             f"not finished: shards {', '.join(unfinished)}; continue them with --resume"
         )
+    results = tables.read(points, seeds, parts)
     run_folder.create(out)
     with run_folder.lock(out):
         _refuse_used(out, every[0])
         own = {"shard": None, "resume": False, "out": str(out)}
         run_folder.write_description(out, {**description, **own})
-        return tables.write(out, points, seeds, parts)
+        return tables.write(out, results)

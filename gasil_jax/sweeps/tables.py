@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.statistics import importance
 from gasil_jax.host import metrics_files, output_file
@@ -21,10 +22,11 @@ from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
 
 
 @dataclasses.dataclass(frozen=True)
-class _Results:
+class Results:
     """The results of all points and seeds of a sweep.
 
     Attributes:
+      parts: the parts of the sweep that they were read from.
       points: the points.
       seeds: absolute seed numbers.
       curves: every metric and score by its name in curves.npz, (points, seeds,
@@ -34,6 +36,7 @@ class _Results:
       diverged: whether an update was undone, bool (points, seeds).
     """
 
+    parts: Sequence[TrainedPrograms]
     points: Sequence[Point]
     seeds: Sequence[int]
     curves: dict[str, Any]
@@ -56,10 +59,19 @@ class _Results:
         return np.flatnonzero(np.isfinite(self.mean)).tolist()
 
 
-def _results(
+def read(
     points: Sequence[Point], seeds: Sequence[int], parts: Sequence[TrainedPrograms]
-) -> _Results:
-    """Return the results that the tables of a sweep's parts hold."""
+) -> Results:
+    """Return the results that the tables of a sweep's parts hold.
+
+    Args:
+      points: all points of the sweep.
+      seeds: absolute seed numbers.
+      parts: the finished parts, which together hold every point with every seed.
+
+    Raises:
+      InputError: if a table is damaged, or if one has other columns than the others.
+    """
     members: dict[Member, dict[str, np.ndarray]] = {}
     evaluations: dict[Member, dict[str, np.ndarray]] = {}
     for part in parts:
@@ -80,15 +92,10 @@ def _results(
             [[last((i, seed)) for seed in seeds] for i in range(len(points))]
         )
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
-    return _Results(points, seeds, curves, finals, diverged)
+    return Results(parts, points, seeds, curves, finals, diverged)
 
 
-def write(
-    folder: pathlib.Path,
-    points: Sequence[Point],
-    seeds: Sequence[int],
-    parts: Sequence[TrainedPrograms],
-) -> dict[str, Any]:
+def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     """Write results.csv, curves.npz, summary.json and the plots; return the summary.
 
     hyperparameters.png is written only if a hyperparameter varies among the points that
@@ -96,28 +103,25 @@ def write(
 
     Args:
       folder: folder to write to.
-      points: all points of the sweep.
-      seeds: absolute seed numbers.
-      parts: the finished parts, which together hold every point with every seed.
+      results: the results, from `read`.
     """
-    results = _results(points, seeds, parts)
     _write_results(folder / "results.csv", results)
     with output_file.atomic(folder / "curves.npz") as partial:
         np.savez_compressed(partial, **results.curves)
-    varied = _varied(parts, results.names, results.ended)
-    trainings = [training for part in parts for training in part.trainings()]
+    varied = _varied(results.parts, results.names, results.ended)
+    trainings = [training for part in results.parts for training in part.trainings()]
     summary = _summary(results, varied, trainings)
     metrics_files.write_json(folder / "summary.json", summary)
     with output_file.atomic(folder / "sweep.png") as partial:
         final, best = results.finals["final_return"], summary["best_by_mean"]
-        plotting.final_returns(partial, _labels(points), final, best)
+        plotting.final_returns(partial, _labels(results.points), final, best)
     if varied:
         with output_file.atomic(folder / "hyperparameters.png") as partial:
             _draw_hyperparameters(partial, results, varied, summary)
     return summary
 
 
-def _write_results(path: pathlib.Path, results: _Results) -> None:
+def _write_results(path: pathlib.Path, results: Results) -> None:
     """Write results.csv, a row for each point and seed.
 
     A cell is empty where a point does not change the sweep's value, or where a final
@@ -137,7 +141,7 @@ def _write_results(path: pathlib.Path, results: _Results) -> None:
 
 
 def _summary(
-    results: _Results,
+    results: Results,
     varied: Mapping[str, Sequence[Any]],
     trainings: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
@@ -178,7 +182,7 @@ def _summary(
 
 def _draw_hyperparameters(
     path: pathlib.Path,
-    results: _Results,
+    results: Results,
     varied: Mapping[str, Sequence[Any]],
     summary: Mapping[str, Any],
 ) -> None:
@@ -239,7 +243,18 @@ def _curves(
     seeds: Sequence[int],
     members: Mapping[Member, Mapping[str, np.ndarray]],
 ) -> dict[str, Any]:
-    """Return every metric, (points, seeds, iterations); NaN after a member's last."""
+    """Return every metric, (points, seeds, iterations); NaN after a member's last.
+
+    Raises:
+      InputError: if members have other metrics than the first one.
+    """
+    names = members[0, seeds[0]].keys()
+    for (point, seed), metrics in members.items():
+        if differing := ", ".join(sorted(names ^ metrics.keys())):
+            raise InputError(
+                f"point {point}, seed {seed} was trained with other metrics than point "
+                f"0, seed {seeds[0]}: {differing}"
+            )
     # Points may differ in batch_steps, and so in iterations.
     length = max(len(metrics["env_steps"]) for metrics in members.values())
     pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
@@ -250,7 +265,7 @@ def _curves(
                 for i in range(len(points))
             ]
         )
-        for name in members[0, seeds[0]]
+        for name in names
     }
 
 

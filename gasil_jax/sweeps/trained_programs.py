@@ -152,10 +152,13 @@ class TrainedPrograms:
         path, config = program.folder(self.folder) / name, program.config
         try:
             columns = metrics_files.read_metrics(
-                path, LABELS, len(program.members), required
+                path, (), len(program.members), (*LABELS, *required)
             )
         except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
+        labels = np.stack([columns.pop(label) for label in LABELS], axis=-1)
+        if (labels != np.array(program.members)[:, None]).any():
+            raise InputError(f"{path} is damaged: its rows are not in order")
         steps = columns["env_steps"][0]
         whole = steps[-1] == config.num_iterations * config.batch_steps
         if not whole or rows not in (None, len(steps)):

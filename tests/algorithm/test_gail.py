@@ -128,6 +128,28 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
         expert_module.load("minari:test/expert-v0")
 
 
+@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
+def test_a_data_set_that_minari_can_not_read_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    space = gymnasium.spaces.Box(-9.0, 9.0, (1,))
+    episode = EpisodeBuffer(
+        observations=np.zeros((2, 1), np.float32),
+        actions=np.zeros((1, 1), np.float32),
+        rewards=[0.0],
+        terminations=[False],
+        truncations=[True],
+    )
+    minari.create_dataset_from_buffers(
+        "test/expert-v0", [episode], observation_space=space, action_space=space
+    )
+    (described,) = tmp_path.rglob("metadata.json")
+    described.write_text(described.read_text().replace('"hdf5"', '"arrow"'))
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ValueError, match=r"'minari:test/expert-v0'.*pyarrow") as error:
+        expert_module.load("minari:test/expert-v0")
+    assert "\n" not in str(error.value)
+
+
 def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
     path = str(tmp_path / "expert.npz")
     for length in (4, 7):

@@ -95,10 +95,22 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
         ({"log_std": arrays["log_std"][:2]}, "log_std has the shape"),
         ({"final_return": np.array(["a", "b", "c"])}, "final_return holds no numbers"),
         ({"kernel_7": arrays["kernel_0"]}, "kernel_3 is missing"),
+        ({"kernel_1": arrays["kernel_1"][:, 1:]}, "kernel_1 has the shape"),
+        ({"kernel_2": arrays["kernel_2"][..., :1]}, "kernel_2 has the shape"),
+        ({"bias_0": arrays["bias_0"][:, :, None]}, "bias_0 has the shape"),
+        ({"scale": arrays["scale"][:, :3]}, "scale has the shape"),
+        ({"low": arrays["low"][:1]}, "low has the shape"),
+        ({"kernel_0": arrays["kernel_0"] * np.nan}, "kernel_0 has numbers that are"),
+        (
+            {"mean": arrays["mean"].astype(float) + 1e300},
+            "mean has numbers that aren't finite",
+        ),
     ):
         np.savez(tmp_path / "policy.npz", **{**arrays, **changes})
         with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
             gasil_jax.load_policy(tmp_path)
+    np.savez(tmp_path / "policy.npz", **arrays, notes=np.array([{}]))
+    gasil_jax.load_policy(tmp_path)
 
 
 def test_an_observation_of_another_size_is_refused(saved):
@@ -120,7 +132,7 @@ def test_a_batch_of_states_is_no_policy(trained_point_mass):
 
 def test_only_the_zoos_policies_have_a_description(tmp_path):
     with pytest.raises(ValueError, match="must be zoo:NAME, with NAME one of ant"):
-        numpy_policy.about(str(tmp_path))
+        numpy_policy.about(tmp_path)
 
 
 def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_path):

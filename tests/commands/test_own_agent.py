@@ -12,6 +12,8 @@ from gasil_jax import evaluate, merge, render, run, sweep
 from gasil_jax.config import Hyperparameters, validate
 
 MODULE = '''
+import sys
+
 import jax.numpy as jnp
 
 import gasil_jax
@@ -63,6 +65,22 @@ def grows(state, context, key):
     return {"count": jnp.zeros(3)}, context.rollout.reward, {}
 
 
+def exits(state, context, key):
+    sys.exit()
+
+
+def interrupts(state, context, key):
+    raise KeyboardInterrupt
+
+
+def refuses(config, observation_size, action_size):
+    sys.exit(7)
+
+
+def is_wrong(config, observation_size, action_size):
+    return config.alhpa
+
+
 def shrinks(state, context, key):
     return {"count": state["count"].sum()}, context.rollout.reward, {}
 
@@ -83,6 +101,10 @@ GROWS = OWN._replace(init=start, update_and_reward=grows)
 SHRINKS = OWN._replace(
     init=lambda *_: {"count": jnp.zeros(3)}, update_and_reward=shrinks
 )
+EXITS = OWN._replace(update_and_reward=exits)
+INTERRUPTS = OWN._replace(update_and_reward=interrupts)
+REFUSES = OWN._replace(check=refuses)
+IS_WRONG = OWN._replace(check=is_wrong)
 TURNS = OWN._replace(
     init=lambda *_: {"count": jnp.int32(0)},
     update_and_reward=lambda state, context, key: (
@@ -184,6 +206,10 @@ def test_every_command_takes_it(tmp_path, capsys):
         ("my_agents:TURNS", r"state\['count'\] is float32\[\]: .* int32\[\], as"),
         ("my_agents:FORGETS", r"update_policy of .* returned actor_critic.* missing:"),
         ("my_agents:SILENT", "update_policy .* returns metrics None: .* be a dict"),
+        ("my_agents:EXITS", r"EXITS' can't be traced: SystemExit \(.*my_agents"),
+        ("my_agents:INTERRUPTS", r"be traced: KeyboardInterrupt \(.*my_agents"),
+        ("my_agents:REFUSES", "check of agent .* fails: SystemExit: 7"),
+        ("my_agents:IS_WRONG", "check of agent .* fails: AttributeError: .*alhpa"),
         ("leaves:OWN", "'leaves:OWN' can't be imported: SystemExit: 3"),
         ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
     ],

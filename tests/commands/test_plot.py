@@ -4,6 +4,7 @@ import csv
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from small_training import FLAGS
 
 from gasil_jax import plot, run
@@ -71,3 +72,16 @@ def test_runs_are_drawn(tmp_path, capsys):
         assert plot.main(arguments) == 2
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
+
+
+def test_a_label_with_an_underscore_is_in_the_legends():
+    finals = np.arange(3.0)
+    curves = [
+        plot.Curves("hopper", label, np.arange(4.0), np.ones((3, 4)), finals, None)
+        for label in ("_first", "second")
+    ]
+    panels = Figure().subplots(1, 3)
+    plot._draw_row(panels, curves)
+    for panel in (panels[0], panels[2]):
+        texts = [text.get_text() for text in panel.get_legend().get_texts()]
+        assert [text.strip() for text in texts] == ["_first", "second"]

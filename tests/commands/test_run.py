@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import io
 import itertools
 import json
 import math
@@ -16,8 +17,8 @@ import pytest
 from small_training import FLAGS
 
 import gasil_jax
-from gasil_envs import locomotion
-from gasil_jax.host import run_options
+from gasil_envs import locomotion, own_code
+from gasil_jax.host import command_line, run_options
 from gasil_jax.run import main
 from gasil_jax.sweeps import assembly
 
@@ -239,6 +240,36 @@ sys.exit(command_line.reports_errors(lambda: print(100_000 * "line\\n"))())
         process.stdout.close()
         assert process.stderr.read() == ""
     assert process.returncode == 128 + signal.SIGPIPE
+
+
+def test_a_name_that_the_terminal_can_not_show_is_no_error(monkeypatch):
+    terminal = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr(sys, "stdout", terminal)
+    assert command_line.reports_errors(lambda: print("in r\u00e9sum\u00e9") or 0)() == 0
+    terminal.flush()
+    assert terminal.buffer.getvalue() == b"in r\\xe9sum\\xe9\n"
+
+
+def test_a_line_break_in_a_name_keeps_the_error_in_a_line(capsys):
+    assert main(["--env", "hopper", "--out", "/proc/no\nrun"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert r"/proc/no\nrun" in line
+
+
+def test_code_that_exits_later_does_not_decide_the_status(capsys):
+    status = command_line.reports_errors(lambda: sys.exit())()
+    assert status == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: code of yours exits: SystemExit (")
+
+
+def test_ctrl_c_passes_through_what_checks_the_users_code():
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt), own_code.refused("never said"):
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def test_a_run_in_which_no_episode_can_end_is_told(capsys):

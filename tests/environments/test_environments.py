@@ -284,6 +284,20 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
             "def Env():\n    raise OSError('no licence')",
             "built: OSError: no licence .*2",
         ),
+        ("def Env():\n    import sys\n    sys.exit()", r"built: SystemExit \(.*line 3"),
+        ("raise KeyboardInterrupt", r"imported: KeyboardInterrupt \(.*line 1"),
+        (
+            _OWN.replace("return State", "raise SystemExit(4); State"),
+            r"can't be traced: SystemExit: 4 \(.*line 7",
+        ),
+        (
+            _OWN.replace("reward = action[0]", "exit(5)"),
+            r"can't be traced: SystemExit: 5 \(.*line 10",
+        ),
+        (
+            _OWN + "    @property\n    def observation_size(self):\n        exit()",
+            r"can't be built: SystemExit: None \(.*line 14",
+        ),
         ("class Env:\n    reset = step = 1", "it has no observation_size"),
         (
             _OWN.replace("2, 1, ", "2.5, 1, "),
@@ -333,6 +347,15 @@ def test_a_fault_of_the_users_environment_is_one_line(
     with pytest.raises(ValueError, match=message) as refused:
         gasil_envs.make(f"{name}:Env")
     assert "\n" not in str(refused.value)
+
+
+def test_a_warning_of_mujoco_writes_no_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    env = gasil_envs.make("hopper", physics="mujoco").unwrapped
+    data = mujoco.MjData(env.model)
+    data.qvel[:] = np.nan
+    mujoco.mj_step(env.model, data)
+    assert data.warning.number.any() and list(tmp_path.iterdir()) == []
 
 
 def test_the_euler_integrator_is_mujocos():

@@ -5,6 +5,7 @@ import multiprocessing
 import gymnasium
 import jax
 import jax.numpy as jnp
+import minari
 import numpy as np
 import pytest
 from brax.envs import Env, State
@@ -180,6 +181,40 @@ def test_a_forked_process_is_refused(make):
         assert ours.poll(60)
         assert 'vector_kwargs={"context": "spawn"}' in ours.recv()
     child.join(60)
+
+
+def test_forked_processes_of_gymnasium_are_refused_in_the_parent():
+    forked = {"context": "fork"}
+    with pytest.raises(RuntimeError, match=r'kwargs=\{"context": "spawn"\}'):
+        gymnasium.make_vec(
+            "gasil_envs/point_mass",
+            num_envs=2,
+            vectorization_mode="async",
+            vector_kwargs=forked,
+        )
+
+
+@SINGLE_AND_BATCH
+def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
+    env = make()
+    _, first = env.reset(seed=0)
+    *_, then = env.step(env.action_space.sample())
+    describe = lambda info: {key: (type(x), np.shape(x)) for key, x in info.items()}
+    assert describe(first) == describe(then)
+    assert not np.any(first["true_reward"])
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
+def test_minari_collects_episodes_with_their_infos(tmp_path, monkeypatch):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    env = gymnasium.make("gasil_envs/point_mass", reward_delay=5)
+    collector = minari.DataCollector(env, record_infos=True)
+    collector.reset(seed=0)
+    for _ in range(50):
+        collector.step(env.action_space.sample())
+    data = collector.create_dataset("test/point-v0")
+    (episode,) = data.iterate_episodes()
+    assert episode.infos["true_reward"].shape == (51,)
 
 
 @SINGLE_AND_BATCH

@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import io
+import itertools
 import json
 import math
 import pickle
@@ -20,7 +21,7 @@ from hypothesis import strategies as st
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import evaluate, merge, run, sweep
+from gasil_jax import evaluate, evaluation, merge, npz, run, sweep
 from gasil_jax.config import validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
@@ -50,6 +51,7 @@ OPTIONS = [
     "evaluate_every",
     "evaluate_episodes",
 ]
+SMALL = gasil_jax.Config(num_envs=4, batch_steps=64, minibatch_size=16)
 NEVER_VALID = st.one_of(
     st.sampled_from(["-1", "-0.5", "nan", "inf", "-inf", "", "true", "1e999", "0x10"]),
     st.text(
@@ -156,6 +158,8 @@ def schedules_at_fault():
 
 WRONG = [
     *[("gamma", x) for x in (None, [1], True, np.True_, 1j, math.nan, 2**2000, {})],
+    *[("learning_rate", x) for x in (1e-60, 1e-40, -1e300, 10**400, np.zeros((2, 2)))],
+    ("num_envs", np.zeros((2, 2))),
     *[("agent", x) for x in (3, None, [], "")],
     *[("hidden_sizes", x) for x in (3, (2**62,), [3], ("a",), (None,), (True,))],
     *[
@@ -176,6 +180,47 @@ def test_a_value_of_any_type_is_refused_by_name(name, value):
     with pytest.raises(ValueError, match=name) as refusal:
         validate(gasil_jax.Config().replace(**{name: value}))
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_a_whole_number_beyond_all_floats_is_refused(name, capsys):
+    for sign in ("", "-"):
+        value = f"--{name.replace('_', '-')}={sign}{400 * '9'}"
+        arguments = ["--env", "point_mass", value, "--out", "/proc/no/run"]
+        assert run.main(arguments) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert name in line.replace("-", "_")
+
+
+@pytest.mark.parametrize(
+    "value",
+    [10**400, -(10**400), 0, None, "3", True],
+    ids=lambda value: str(value)[:4],
+)
+def test_a_count_that_is_none_is_refused_by_name(value):
+    env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
+    for name, call in (
+        ("reward_delay", lambda: gasil_jax.preset("hopper", "ppo", reward_delay=value)),
+        ("evaluate_every", lambda: gasil_jax.fit(env, SMALL, evaluate_every=value)),
+        (
+            "num_episodes",
+            lambda: evaluation.run_episodes(
+                env, None, key, num_episodes=value, num_steps=1
+            ),
+        ),
+        (
+            "key",
+            lambda: evaluation.run_episodes(
+                env, None, value, num_episodes=1, num_steps=1
+            ),
+        ),
+        ("path", lambda: gasil_jax.load_policy(value)),
+    ):
+        is_default = name == "evaluate_every" and value is None
+        is_path = name == "path" and isinstance(value, str)
+        if not is_default and not is_path:
+            with pytest.raises(ValueError, match=f"^{name} is "):
+                call()
 
 
 @pytest.mark.parametrize(
@@ -303,6 +348,21 @@ WHOLE = saved(
         WHOLE[:300] + b"xxxx" + WHOLE[304:],
         saved(np.save, np.zeros(3)),
         saved(np.savez, observation=np.zeros((3, 2))),
+        *[
+            saved(np.savez, observation=np.zeros((3, 2)), action=action)
+            for action in (
+                np.zeros((3, 1), complex),
+                np.full((3, 1), b"1"),
+                np.full((3, 1), "1"),
+                np.zeros((3, 1), "datetime64[s]"),
+                np.zeros((3, 1), bool),
+                np.full((3, 1), 1e300),
+                np.full((3, 1), np.nan),
+                np.zeros(3),
+                np.zeros((3, 0)),
+                np.zeros((2, 1)),
+            )
+        ],
         b"",
         b"PK\x03\x04 not a zip",
         b"\x80\x04N.",
@@ -315,6 +375,30 @@ def test_a_foreign_demonstration_file_is_refused(content, tmp_path):
     with pytest.raises(ValueError, match=r"must be an \.npz file") as refusal:
         expert.load(str(path))
     assert "\n" not in str(refusal.value)
+
+
+def test_a_file_with_an_altered_byte_is_read_or_refused(tmp_path):
+    path = tmp_path / "expert.npz"
+    arrays = {name: np.ones((2, 1)) for name in ("observation", "action")}
+    whole, refused = saved(np.savez, **arrays), 0
+    for position, value in itertools.product(range(len(whole)), (1, 64, 255)):
+        altered = bytearray(whole)
+        altered[position] ^= value
+        path.write_bytes(altered)
+        try:
+            npz.read(path)
+        except ValueError as error:
+            refused += 1
+            assert "\n" not in str(error)
+    assert refused > 100
+
+
+def test_an_array_that_nobody_needs_may_be_of_any_kind(tmp_path):
+    path = tmp_path / "expert.npz"
+    arrays = {name: np.ones((2, 1)) for name in ("observation", "action")}
+    np.savez(path, **arrays, notes=np.array([{}]))
+    observation, _ = expert.load(str(path))
+    np.testing.assert_array_equal(observation, arrays["observation"])
 
 
 def test_a_demonstration_file_is_never_unpickled(tmp_path):

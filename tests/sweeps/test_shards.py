@@ -120,7 +120,8 @@ TABLES = ("results.csv", "curves.npz", "sweep.png", "hyperparameters.png")
 def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
     """Five shards of twelve members divide points and programs."""
     trained, points = train(tmp_path / "whole")
-    expected = tables.write(tmp_path / "whole", points, range(3), [trained])
+    results = tables.read(points, range(3), [trained])
+    expected = tables.write(tmp_path / "whole", results)
     assert expected["points"][1]["mean"] is None  # never ended
     assert [point["diverged_seeds"] for point in expected["points"]] == [0, 0, 1, 0]
     assert expected["env_steps_per_second"] == pytest.approx(600)
@@ -209,6 +210,48 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     assert merge.main([str(out)]) == 0
     train(out, "1/2")
     assert "shards of 2 and of 3" in refused(out)
+
+
+def swapped(rows):
+    """Exchange the rows of two seeds."""
+    return [rows[0], rows[2], rows[1], *rows[3:]]
+
+
+def renamed(rows):
+    """Change the seed of a row."""
+    point, _, rest = rows[1].split(",", 2)
+    return [rows[0], f"{point},7,{rest}", *rows[2:]]
+
+
+def unlabelled(rows):
+    return [rows[0].replace("seed", "sead"), *rows[1:]]
+
+
+def longer(rows):
+    return [f"{rows[0]},mine", *(f"{row},1" for row in rows[1:])]
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        (swapped, "metrics.csv is damaged: its rows are not in order"),
+        (renamed, "metrics.csv is damaged: its rows are not in order"),
+        (unlabelled, "metrics.csv is damaged: it has no column seed"),
+        (longer, "was trained with other metrics than point 0, seed 0: mine"),
+    ],
+)
+def test_tables_of_other_members_or_metrics_are_not_merged(
+    change, why, tmp_path, capsys
+):
+    train(tmp_path / "parts", "1/2")
+    trained, _ = train(tmp_path / "parts", "2/2")
+    path = trained.programs[0].folder(trained.folder) / "metrics.csv"
+    path.write_text("\n".join([*change(path.read_text().splitlines()), ""]))
+    out = tmp_path / "out"
+    assert merge.main([str(tmp_path / "parts"), "--out", str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ") and line.endswith(why)
+    assert not out.exists()
 
 
 def test_tables_are_written_anew_when_all_shards_have_gone_on(tmp_path, capsys):

@@ -105,7 +105,7 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
         drawn.append((path, *arguments))
 
     monkeypatch.setattr(plotting, "marginals", marginals)
-    summary = tables.write(tmp_path, points, [5], [trained])
+    summary = tables.write(tmp_path, tables.read(points, [5], [trained]))
     assert summary["best_by_mean"] == 1
     # A point that does not name a value has the sweep's own.
     ((_, values, returns, importance),) = drawn
