@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import pathlib
+import re
 import uuid
 from collections.abc import Iterator, Sequence
 
@@ -80,6 +81,19 @@ def make_parent(path: pathlib.Path) -> None:
 def _partial(path: pathlib.Path) -> pathlib.Path:
     # A process number is not unique: processes on several hosts may share the folder.
     return path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
+
+
+def is_temporary(path: pathlib.Path) -> bool:
+    """Return whether it is a temporary file of `atomic`, by its name."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name) is not None
+
+
+def delete_temporary(path: pathlib.Path) -> None:
+    """Delete the temporary files of killed processes; none may write the file now."""
+    for other in path.parent.glob(f".{path.stem}.*{path.suffix}"):
+        if is_temporary(other):
+            with contextlib.suppress(OSError):
+                other.unlink()
 
 
 @contextlib.contextmanager
