@@ -264,6 +264,9 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
+        # A folder's name need not be text that the terminal can show.
+        if isinstance(sys.stdout, io.TextIOWrapper):
+            sys.stdout.reconfigure(errors="backslashreplace")
         try:
             return main(*args, **kwargs)
         except BrokenPipeError:
