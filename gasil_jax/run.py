@@ -61,7 +61,11 @@ def train(
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
-        return _write_results(options, env, folder, *finished[0])
+        members, outcome = finished[0]
+        summary = _write_results(options, env, folder, members, outcome)
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
+    return summary
 
 
 def _write_results(

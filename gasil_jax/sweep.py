@@ -89,6 +89,9 @@ def train(
         write()
 
     def on_finished(job: assembly.Job, members: Members, outcome: Outcome) -> None:
+        if outcome.unsaved is not None:
+            # Its policies are nowhere else, so it is not finished.
+            raise outcome.unsaved
         trained_programs.write_training(
             folder,
             job.program,

@@ -1,15 +1,15 @@
-"""Save and load training states with Orbax.
+"""Save and load training states.
 
 `save` and `restore` handle a single state. `write`, `latest`, `best` and `prune` manage
 a folder of checkpoints. Each checkpoint is a folder named by its iteration:
 
-    00000490/state/          the state, written by Orbax
-    00000490/manifest.json   SHA-256 of each of its files, and a record
+    00000490/state/arrays.npz   the state's arrays, by their path in the state
+    00000490/manifest.json      SHA-256 of each of its files, and a record
 
-A checkpoint is written to 00000490.partial, which is renamed once it is complete and
-flushed to the disk, so that killing the process never damages a checkpoint. The hashes
-reveal later damage. A damaged checkpoint is renamed to 00000490.damaged when training
-continues from an older one.
+A checkpoint is written to 00000490.partial, which is renamed once it has been read
+again and flushed to the disk, so that killing the process never damages a checkpoint.
+The hashes reveal later damage. A damaged checkpoint is renamed to 00000490.damaged when
+training continues from an older one.
 """
 
 import contextlib
@@ -19,18 +19,18 @@ import math
 import os
 import pathlib
 import shutil
+import zipfile
 from collections.abc import Mapping
 from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
-from gasil_jax.host import json_reader
+from gasil_jax.host import json_reader, output_file
 
-_STATE, _MANIFEST, _PARTIAL = "state", "manifest.json", ".partial"
-_DAMAGED = ".damaged"
+_STATE, _ARRAYS, _MANIFEST = "state", "arrays.npz", "manifest.json"
+_PARTIAL, _DAMAGED = ".partial", ".damaged"
 #: Errors of reading a damaged checkpoint. Other errors, such as those of a network file
 #: system, do not mean that it is damaged.
 _DAMAGE_ERRORS = (FileNotFoundError, NotADirectoryError, IsADirectoryError, ValueError)
@@ -50,10 +50,38 @@ def _as_arrays(state: Any) -> dict[str, Any]:
 
 
 def save(folder: pathlib.Path, state: Any) -> None:
-    """Write `state`, a pytree of arrays, to `folder`, which must not exist."""
-    arrays = jax.tree.map(np.asarray, _as_arrays(state))
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(folder.absolute(), arrays)
+    """Write `state`, a pytree of arrays, to a new folder, and read it again.
+
+    Raises:
+      OSError: if it can't be written, or if other numbers are read than were written.
+    """
+    folder.mkdir()
+    path = folder / _ARRAYS
+    arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
+    with path.open("wb") as file:
+        np.savez(file, **arrays)
+    # One array after the other, so that memory holds no second state.
+    with np.load(path) as file:
+        for name, array in arrays.items():
+            if not np.array_equal(_bytes(file[name]), _bytes(array)):
+                raise OSError(f"{name or 'its array'} is not what was written")
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    # Not-a-numbers are equal, and so are types that NumPy does not know.
+    return array.ravel().view(np.uint8)
+
+
+def _read_arrays(folder: pathlib.Path) -> dict[str, Any]:
+    """Return the arrays in a folder that `save` wrote, by their path in the state."""
+    if (folder / _ARRAYS).exists():
+        with np.load(folder / _ARRAYS) as file:
+            return dict(file)
+    # Older versions wrote states with Orbax.
+    import orbax.checkpoint
+
+    with orbax.checkpoint.StandardCheckpointer() as checkpointer:
+        return checkpointer.restore(folder.absolute())
 
 
 def restore(folder: pathlib.Path, like: Any) -> Any:
@@ -69,10 +97,13 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     Raises:
       ValueError: if the saved state has another structure, shape or dtype.
     """
-    with ocp.StandardCheckpointer() as checkpointer:
-        arrays = checkpointer.restore(folder.absolute())
     expected = jax.eval_shape(_as_arrays, like)
-    # Orbax may silently restore only a part of a tree that does not match.
+    arrays = _read_arrays(folder)
+    for name in set(arrays) & set(expected):
+        array, dtype = arrays[name], expected[name].dtype
+        # NumPy's files keep the size alone of a type such as bfloat16.
+        if array.dtype == f"V{dtype.itemsize}" and dtype.kind == "V":
+            arrays[name] = array.view(dtype)
     shape = lambda tree: {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
     if shape(arrays) != shape(expected):
         names = set(arrays) ^ set(expected) or {
@@ -81,12 +112,19 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
         raise ValueError(f"{folder} holds another state: {min(names)} differs")
     leaves, structure = jax.tree_util.tree_flatten_with_path(like)
     values = [
-        jax.random.wrap_key_data(arrays[jax.tree_util.keystr(path)])
+        jax.random.wrap_key_data(arrays[jax.tree_util.keystr(path)], impl=_key_impl(x))
         if _is_key(x)
         else np.asarray(arrays[jax.tree_util.keystr(path)])
         for path, x in leaves
     ]
     return jax.tree.unflatten(structure, values)
+
+
+def _key_impl(key: Any) -> Any:
+    """Return the implementation of random keys, which may be `ShapeDtypeStruct`."""
+    found = []
+    jax.eval_shape(lambda x: found.append(jax.random.key_impl(x)), key)
+    return found[0]
 
 
 class Checkpoint(NamedTuple):
@@ -107,7 +145,7 @@ class Checkpoint(NamedTuple):
         return restore(self.folder / _STATE, like)
 
 
-class WriteError(OSError):
+class WriteError(output_file.WriteError):
     """A checkpoint could not be written; older ones are unharmed."""
 
 
@@ -123,7 +161,8 @@ def write(
       record: facts that can be read without the state; written as JSON.
 
     Raises:
-      WriteError: if the disk is full or the folder can't be written.
+      WriteError: if it can't be written, for example because the disk is full, or if
+        it can't be read after it was written.
     """
     folder = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
@@ -143,11 +182,23 @@ def write(
         shutil.rmtree(folder, ignore_errors=True)  # A damaged checkpoint.
         partial.rename(folder)
         _flush(root)
-    # Orbax raises errors of several types if the disk is full.
-    except Exception as error:
+    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
         shutil.rmtree(partial, ignore_errors=True)
-        reason = str(error).splitlines()[0][:300] if str(error) else repr(error)
-        raise WriteError(f"{root} can't be written: {reason}") from error
+        raise WriteError(output_file.unwritten(root, error)) from error
+
+
+def check_writable(root: pathlib.Path) -> None:
+    """Write a tiny checkpoint below the folder `root`, and delete it.
+
+    Raises:
+      WriteError: if it can't be written and read.
+    """
+    # `delete_partial` deletes it if the process is killed.
+    tiny = root / f"check{_PARTIAL}"
+    try:
+        write(tiny, 0, {"x": np.zeros(1, np.float32)}, {})
+    finally:
+        shutil.rmtree(tiny, ignore_errors=True)
 
 
 def _hashes(folder: pathlib.Path) -> dict[str, str]:
@@ -165,7 +216,7 @@ def _flush(path: pathlib.Path) -> None:
     """Make the operating system write a file or a folder's entries to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
-        os.fsync(descriptor)
+        output_file.flush(descriptor)
     finally:
         os.close(descriptor)
 

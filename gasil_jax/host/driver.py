@@ -80,6 +80,8 @@ class Outcome:
       train_seconds: time that this process spent on training, without evaluations.
       evaluation_seconds: time that this process spent on evaluations, including
         compilation; None without evaluations.
+      unsaved: why the last checkpoint could not be written, to raise once the results
+        are written; None if it was.
     """
 
     states: Any
@@ -87,6 +89,7 @@ class Outcome:
     compile_seconds: float
     train_seconds: float
     evaluation_seconds: float | None
+    unsaved: checkpoint.WriteError | None
 
 
 @dataclasses.dataclass
@@ -334,7 +337,8 @@ def drive(
       Interrupted: if a signal was received; a checkpoint was written first.
       InputError: if the checkpoint has another state or no size of a table, if a table
         is damaged, or if the folder holds results but no undamaged checkpoint.
-      OSError: if the folder can't be written, or if the disk is full.
+      OSError: if the folder can't be written, or if the disk is full. If only the last
+        checkpoint can't, the outcome has the error.
     """
     root = folder / "checkpoints"
     names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
@@ -350,6 +354,7 @@ def drive(
         )
     on_restored()
     checkpoints = PeriodicCheckpoints(members, root, schedule)
+    checkpoints.check()
     first = training.done
     steps_of = lambda done: steps_before + members.env_steps(done)
 
@@ -379,11 +384,15 @@ def drive(
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
     train_seconds = time.monotonic() - started
-    _save(checkpoints, training, tables, progress)
+    unsaved = None
+    try:
+        _save(checkpoints, training, tables, progress)
+    except checkpoint.WriteError as error:
+        unsaved = error
     with progress.aside("closing the trackers"):
         tables.close()
     if interruption.signal is not None and training.left and not stopped:
-        raise Interrupted(interruption.signal)
+        raise unsaved or Interrupted(interruption.signal)
     evaluation = tables.evaluation
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
@@ -392,4 +401,5 @@ def drive(
         compile_seconds=compile_seconds,
         train_seconds=train_seconds - (evaluation_seconds or 0.0),
         evaluation_seconds=evaluation_seconds,
+        unsaved=unsaved,
     )

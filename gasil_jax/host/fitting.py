@@ -88,7 +88,8 @@ def fit(
     Raises:
       Interrupted: if a folder is given and SIGINT or SIGTERM was received; a checkpoint
         was written first.
-      OSError: if the folder can't be written.
+      OSError: if the folder can't be written. If that is seen only after training,
+        policy.npz is written nevertheless where it can be.
       ValueError: if a value is not allowed, or if the folder holds other files.
     """
     checks.check_environment(env)
@@ -141,6 +142,8 @@ def fit(
             policy_file.save(
                 path / "policy.npz", outcome.states, env, members.seeds, final
             )
+        if outcome.unsaved is not None:
+            raise outcome.unsaved
         return FitResult(
             outcome.states,
             metrics,

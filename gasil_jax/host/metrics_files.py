@@ -105,7 +105,7 @@ class MetricsWriter:
     ):
         self._first = tuple(columns)
         self._columns: tuple[str, ...] | None = None
-        self._labels = labels
+        self._labels, self._path = labels, path
         if size is None:
             self._file = path.open("x", newline="")
         else:
@@ -118,7 +118,17 @@ class MetricsWriter:
         self._writer = csv.writer(self._file)
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
-        """Write arrays (members, iterations), one for each metric."""
+        """Write arrays (members, iterations), one for each metric.
+
+        Raises:
+          output_file.WriteError: if they can't be written, or if the file is not at its
+            path any more.
+        """
+        self._check_in_place()
+        with output_file.errors_named(self._path):
+            self._write(metrics)
+
+    def _write(self, metrics: Mapping[str, np.ndarray]) -> None:
         if self._columns is None:
             others = tuple(sorted(set(metrics) - set(self._first)))
             self._columns = (*self._labels, *self._first, *others)
@@ -136,10 +146,28 @@ class MetricsWriter:
         self._file.flush()
 
     def size(self) -> int:
-        """Write everything to the disk and return the size of the file in bytes."""
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        return os.fstat(self._file.fileno()).st_size
+        """Write everything to the disk and return the size of the file in bytes.
+
+        Raises:
+          output_file.WriteError: as `write` does.
+        """
+        self._check_in_place()
+        with output_file.errors_named(self._path):
+            self._file.flush()
+            output_file.flush(self._file.fileno())
+            return os.fstat(self._file.fileno()).st_size
+
+    def _check_in_place(self) -> None:
+        """Raise `WriteError` if the file at the path is not the one that was opened."""
+        try:
+            there = self._path.stat()
+            in_place = os.path.samestat(there, os.fstat(self._file.fileno()))
+        except (FileNotFoundError, NotADirectoryError):
+            in_place = False
+        if not in_place:
+            raise output_file.WriteError(
+                f"{self._path} was deleted or replaced during training"
+            )
 
     def close(self) -> None:
         """Close the file."""

@@ -1,11 +1,21 @@
 """Check the paths of output files, and write files atomically."""
 
 import contextlib
+import errno
+import os
 import pathlib
+import re
 import uuid
 from collections.abc import Iterator, Sequence
 
 from gasil_jax.errors import InputError
+
+#: Errors of calls that a file system does not have, such as those for locks.
+MISSING_CALL = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+
+
+class WriteError(OSError):
+    """A file or folder could not be written; the message is one line with its path."""
 
 
 def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
@@ -13,9 +23,36 @@ def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
     return f"{option} is {path}, which can't be written: {_reason(error)}"
 
 
-def _reason(error: OSError) -> str:
-    # A library's error may have no `strerror`, and a message of several lines.
-    return error.strerror or str(error).partition("\n")[0]
+def unwritten(path: pathlib.Path, error: Exception) -> str:
+    """Return the error message for a file or folder that could not be written."""
+    return f"{path} can't be written: {_reason(error)}"
+
+
+def _reason(error: Exception) -> str:
+    # A library's error may have no `strerror`, and a message of several lines or none.
+    strerror = getattr(error, "strerror", None)
+    return strerror or str(error).partition("\n")[0] or type(error).__name__
+
+
+@contextlib.contextmanager
+def errors_named(path: pathlib.Path) -> Iterator[None]:
+    """Turn an `OSError` raised inside the `with` block into a `WriteError`."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(unwritten(path, error)) from error
+
+
+def flush(descriptor: int) -> None:
+    """Make the operating system write an open file or folder to the disk.
+
+    Some file systems can't be told to: they write when they choose.
+    """
+    try:
+        os.fsync(descriptor)
+    except OSError as error:
+        if error.errno not in MISSING_CALL:
+            raise
 
 
 def check(path: pathlib.Path, endings: Sequence[str]) -> None:
@@ -46,6 +83,19 @@ def _partial(path: pathlib.Path) -> pathlib.Path:
     return path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
 
 
+def is_temporary(path: pathlib.Path) -> bool:
+    """Return whether it is a temporary file of `atomic`, by its name."""
+    return re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name) is not None
+
+
+def delete_temporary(path: pathlib.Path) -> None:
+    """Delete the temporary files of killed processes; none may write the file now."""
+    for other in path.parent.glob(f".{path.stem}.*{path.suffix}"):
+        if is_temporary(other):
+            with contextlib.suppress(OSError):
+                other.unlink()
+
+
 @contextlib.contextmanager
 def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary path beside the file, which is renamed to it at the end.
@@ -54,14 +104,13 @@ def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
     file. If the block raises an error, the temporary file is deleted.
 
     Raises:
-      OSError: if it can't be written; the message is one line with the path.
+      WriteError: if it can't be written.
     """
     partial = _partial(path)
     try:
-        yield partial
-        partial.rename(path)
-    except OSError as error:
-        raise OSError(f"{path} can't be written: {_reason(error)}") from error
+        with errors_named(path):
+            yield partial
+            partial.rename(path)
     finally:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)

@@ -48,6 +48,11 @@ class PeriodicCheckpoints:
         self._saved_at = time.monotonic()
         self._best_score = checkpoint.best_score(root)
 
+    def check(self) -> None:
+        """Raise `checkpoint.WriteError` if no checkpoint can be written."""
+        if self._keep:
+            checkpoint.check_writable(self._root)
+
     def iterations_left(self, done: int) -> float:
         """Return the iterations to the next checkpoint; infinity if time decides."""
         if self._interval is None:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Required, TypedDict
 
 from gasil_jax.config import Config, validate
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, json_reader, metrics_files
+from gasil_jax.host import command_line, json_reader, metrics_files, output_file
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
 from gasil_jax.imitation import expert
@@ -24,8 +24,13 @@ from gasil_jax.imitation import expert
 _LOCK = ".lock"
 _PROBE = ".writable-"
 _CONFIG = "config.json"
+#: Files that only the process that has locked the folder writes.
+_LOCKED = (
+    *(_CONFIG, "fit.json", "summary.json", "policy.npz", "learning_curve.png"),
+    *("results.csv", "curves.npz", "sweep.png", "hyperparameters.png"),
+)
 #: Errors of locking on a file system without locks.
-_NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP)
+_NO_LOCKS = (*output_file.MISSING_CALL, errno.ENOLCK)
 
 
 def check(out: pathlib.Path, resume: bool) -> None:
@@ -121,6 +126,8 @@ def _note_missing_locks(folder: pathlib.Path, why: str) -> None:
 def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
     """Lock the folder against other processes inside the `with` block.
 
+    What a killed process had half written is deleted.
+
     The operating system frees the lock when the process ends, however it ends. Where
     the file system has no locks, a note says so, and nothing is locked.
 
@@ -140,9 +147,13 @@ def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
             if error.errno not in _NO_LOCKS:
                 raise
             _note_missing_locks(folder, str(error.strerror))
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}")
-        file.flush()
+        else:
+            for name in _LOCKED:
+                output_file.delete_temporary(folder / name)
+        with output_file.errors_named(folder / _LOCK):
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {socket.gethostname()}")
+            file.flush()
         yield
 
 
@@ -166,14 +177,24 @@ def wait_for_lock(folder: pathlib.Path, seconds: float = 60.0) -> Iterator[None]
         yield
 
 
-def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
-    """Raise `InputError` unless the folder is empty.
+def content(folder: pathlib.Path) -> set[str]:
+    """Return the names in a folder, but for those that may be left by killed processes.
 
-    The lock file is ignored, and so is the folder that `create` makes for a moment to
-    test whether it can write.
+    These are the lock file, half written files, and the folder that `create` makes for
+    a moment to test whether it can write.
     """
-    names = (path.name for path in folder.iterdir())
-    if any(name != _LOCK and not name.startswith(_PROBE) for name in names):
+    return {
+        path.name
+        for path in folder.iterdir()
+        if path.name != _LOCK
+        and not path.name.startswith(_PROBE)
+        and not output_file.is_temporary(path)
+    }
+
+
+def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
+    """Raise `InputError` unless the folder is empty, as `content` sees it."""
+    if content(folder):
         message = (
             f"{option} is {folder}, which is not empty: name a new or an empty folder"
         )

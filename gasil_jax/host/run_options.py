@@ -17,7 +17,13 @@ from gasil_jax import checks, presets
 from gasil_jax import train as training
 from gasil_jax.config import Config, own_names, validate
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, environments, run_folder, trackers
+from gasil_jax.host import (
+    command_line,
+    environments,
+    output_file,
+    run_folder,
+    trackers,
+)
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
@@ -335,11 +341,13 @@ def check_out(options: Options) -> None:
 def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     """Create the run's folder if it is missing, and lock it inside the `with` block.
 
-    An `Interrupted` raised inside gets a note with the command that continues the run.
+    A `WriteError` or `Interrupted` that is raised inside tells the command that
+    continues the run.
 
     Raises:
       InputError: if another run is in the folder or uses it now, if the run to be
         continued has other settings, or if the folder can't be written.
+      output_file.WriteError: if the folder can no longer be written.
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
@@ -352,14 +360,18 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
             _refuse_changes(options, _stored_options(type(options), run), run)
         else:
             run_folder.refuse_used(folder)
+        quoted = shlex.quote(str(folder))
+        how = f"continue with: python -m {program} --resume --out {quoted}"
         try:
             yield folder
         except Interrupted as interrupted:
-            quoted = shlex.quote(str(folder))
-            interrupted.add_note(
-                f"continue with: python -m {program} --resume --out {quoted}"
-            )
+            interrupted.add_note(how)
             raise
+        except output_file.WriteError as error:
+            # A run that has results may be without checkpoints.
+            if not run_folder.has_run(folder) or run_folder.has_results(folder):
+                raise
+            raise output_file.WriteError(f"{error}; {how}") from error
 
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:

@@ -141,7 +141,8 @@ def train(
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      OSError: if a folder can no longer be written.
+      OSError: if a folder can no longer be written. If only a job's last checkpoint
+        can't, its outcome has the error.
       ValueError: if a job to continue does not fit the options.
     """
     schedule = CheckpointSchedule(options.checkpoint_every, options.keep_checkpoints)

@@ -98,7 +98,7 @@ def _refuse_used(out: pathlib.Path, shard: StoredRun) -> None:
         # A single run has no points, and a sweep that was not merged has programs.
         used = "points" not in earlier or (out / "programs").is_dir()
     else:
-        used = any(path.name not in ("shards", ".lock") for path in out.iterdir())
+        used = bool(run_folder.content(out) - {"shards"})
     if used:
         raise InputError(f"out is {out}, which holds other files: name another folder")
 
