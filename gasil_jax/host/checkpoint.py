@@ -1,10 +1,10 @@
-"""Save and load training states.
+"""Save and load training states with Orbax.
 
 `save` and `restore` handle a single state. `write`, `latest`, `best` and `prune` manage
 a folder of checkpoints. Each checkpoint is a folder named by its iteration:
 
-    00000490/state/arrays.npz   the state's arrays, by their path in the state
-    00000490/manifest.json      SHA-256 of each of its files, and a record
+    00000490/state/          the state, written by Orbax
+    00000490/manifest.json   SHA-256 of each of its files, and a record
 
 A checkpoint is written to 00000490.partial, which is renamed once it has been read
 again and flushed to the disk, so that killing the process never damages a checkpoint.
@@ -15,21 +15,25 @@ training continues from an older one.
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import pathlib
 import shutil
-import zipfile
-from collections.abc import Mapping
+import tempfile
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import orbax.checkpoint as ocp
 
 from gasil_jax.host import json_reader, output_file
 
-_STATE, _ARRAYS, _MANIFEST = "state", "arrays.npz", "manifest.json"
+_STATE, _MANIFEST = "state", "manifest.json"
+#: The name of the only array of a state that has none.
+_NOTHING = "nothing"
 _PARTIAL, _DAMAGED = ".partial", ".damaged"
 #: Errors of reading a damaged checkpoint. Other errors, such as those of a network file
 #: system, do not mean that it is damaged.
@@ -49,39 +53,54 @@ def _as_arrays(state: Any) -> dict[str, Any]:
     }
 
 
+@contextlib.contextmanager
+def _plainly_named(folder: pathlib.Path) -> Iterator[pathlib.Path]:
+    """Yield another path to a folder, in which no character means anything.
+
+    Orbax takes a path with brackets or stars for a pattern.
+    """
+    with tempfile.TemporaryDirectory() as directory:
+        link = pathlib.Path(directory, "checkpoints")
+        link.symlink_to(folder.absolute().parent, target_is_directory=True)
+        yield link / folder.name
+
+
 def save(folder: pathlib.Path, state: Any) -> None:
     """Write `state`, a pytree of arrays, to a new folder, and read it again.
+
+    Arrays of no size, which Orbax refuses, are left out; `restore` makes them anew.
 
     Raises:
       OSError: if it can't be written, or if other numbers are read than were written.
     """
-    folder.mkdir()
-    path = folder / _ARRAYS
     arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
-    with path.open("wb") as file:
-        np.savez(file, **arrays)
-    # One array after the other, so that memory holds no second state.
-    with np.load(path) as file:
-        for name, array in arrays.items():
-            if not np.array_equal(_bytes(file[name]), _bytes(array)):
-                raise OSError(f"{name or 'its array'} is not what was written")
+    arrays = {name: x for name, x in arrays.items() if x.size}
+    # Orbax logs the traceback of each of its threads, besides what it raises.
+    logger = logging.getLogger("absl")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    try:
+        with _plainly_named(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+            checkpointer.save(path, arrays or {_NOTHING: np.zeros(1, bool)})
+    finally:
+        logger.setLevel(level)
+    again = _read_arrays(folder)
+    for name, array in arrays.items():
+        if not np.array_equal(_bytes(again[name]), _bytes(array)):
+            raise OSError(f"{name or 'its array'} is not what was written")
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
     # Not-a-numbers are equal, and so are types that NumPy does not know.
-    return array.ravel().view(np.uint8)
+    return np.ascontiguousarray(array).ravel().view(np.uint8)
 
 
 def _read_arrays(folder: pathlib.Path) -> dict[str, Any]:
     """Return the arrays in a folder that `save` wrote, by their path in the state."""
-    if (folder / _ARRAYS).exists():
-        with np.load(folder / _ARRAYS) as file:
-            return dict(file)
-    # Older versions wrote states with Orbax.
-    import orbax.checkpoint
-
-    with orbax.checkpoint.StandardCheckpointer() as checkpointer:
-        return checkpointer.restore(folder.absolute())
+    with _plainly_named(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+        arrays = checkpointer.restore(path)
+    arrays.pop(_NOTHING, None)
+    return arrays
 
 
 def restore(folder: pathlib.Path, like: Any) -> Any:
@@ -99,11 +118,9 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     """
     expected = jax.eval_shape(_as_arrays, like)
     arrays = _read_arrays(folder)
-    for name in set(arrays) & set(expected):
-        array, dtype = arrays[name], expected[name].dtype
-        # NumPy's files keep the size alone of a type such as bfloat16.
-        if array.dtype == f"V{dtype.itemsize}" and dtype.kind == "V":
-            arrays[name] = array.view(dtype)
+    missing = {x: y for x, y in expected.items() if x not in arrays and not y.size}
+    arrays |= {name: np.zeros(x.shape, x.dtype) for name, x in missing.items()}
+    # Orbax may silently restore only a part of a tree that does not match.
     shape = lambda tree: {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
     if shape(arrays) != shape(expected):
         names = set(arrays) ^ set(expected) or {
@@ -182,7 +199,7 @@ def write(
         shutil.rmtree(folder, ignore_errors=True)  # A damaged checkpoint.
         partial.rename(folder)
         _flush(root)
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, EOFError, ValueError) as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise WriteError(output_file.unwritten(root, error)) from error
 

@@ -122,6 +122,10 @@ class Members:
         """The sharding of all arrays: each device has its share of the members."""
         return NamedSharding(Mesh(np.array(self.devices), ("members",)), P("members"))
 
+    def _sharding_of(self, leaf: Any) -> NamedSharding:
+        # JAX gives all devices an array of no size.
+        return self.sharding if leaf.size else NamedSharding(self.sharding.mesh, P())
+
     def _shard(self, function: Callable[..., Any], in_specs: Any) -> Callable[..., Any]:
         # Members do not communicate, so there is no replication to check.
         return jax.shard_map(
@@ -161,7 +165,7 @@ class Members:
           states: states to continue from, (members, ...); default the first states.
         """
         shapes = jax.tree.map(
-            lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=self.sharding),
+            lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
         with futures.ThreadPoolExecutor(1) as pool:
@@ -216,7 +220,10 @@ class Members:
         index = np.minimum(padded, self.num_members - 1)
         # Not on one device first, whose memory may hold only its share.
         padded_rows = lambda x: x[index] if self._padding else x
-        return jax.device_put(jax.tree.map(padded_rows, states), self.sharding)
+        padded_states = jax.tree.map(padded_rows, states)
+        return jax.device_put(
+            padded_states, jax.tree.map(self._sharding_of, padded_states)
+        )
 
     def trim(self, states: Any) -> Any:
         """Return the members' arrays without the padding, (members, ...).

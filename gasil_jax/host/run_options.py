@@ -58,9 +58,9 @@ class Options:
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
-        rule of PPO for all locomotion tasks; or paper, the paper's own protocol with one
-        environment per seed. Options override them. The
-        defaults that this help shows are those without a preset.
+        rule of PPO for all locomotion tasks; or paper, the paper's own protocol, with
+        one environment per seed. Options override them. The defaults that this help
+        shows are those without a preset.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       settings: settings of the environment.
