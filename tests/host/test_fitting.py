@@ -22,6 +22,7 @@ ITERATIONS, CHUNK = 100, 2
 CONFIG = small_training.CONFIG.replace(agent="ppo", total_steps=ITERATIONS * 128)
 FLAGS = (
     *(*small_training.FLAGS, "--agent", "ppo", "--preset", "paper"),
+    "--no-normalize-rewards",
     *("--total-steps", str(ITERATIONS * 128), "--stagger-episodes"),
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
