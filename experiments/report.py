@@ -261,8 +261,18 @@ class Page:
         """Return on how many panels the favourite is better than each other curve.
 
         Args:
-          *panels: the panels; default all.
+          *panels: the panels; or "delayed" or "dense", and "raw" for rewards that are
+            not normalized; default all.
         """
+        if panels and panels[0] in ("delayed", "dense"):
+            family = (panels[0] == "delayed", panels[1:] == ("raw",))
+            panels = tuple(
+                panel
+                for panel, curves in self.figure.panels.items()
+                if next(iter(curves.values())).family[:2] == family
+            )
+            if not panels:
+                return ""
         if not set(panels) <= set(self.figure.panels):
             raise self._no_slot("tally", *panels)
         return self._tally(self.scores, self.comparisons, panels)
