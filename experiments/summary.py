@@ -275,14 +275,12 @@ class Summary:
 
     def _lead(self, name: str, ours: str, other: str) -> str:
         """Return on how many delayed tasks an agent is better than another one."""
-        panels = [name_of(env, DELAY) for env in TASKS]
+        keys = [(name_of(env, DELAY), ours, other) for env in TASKS]
         compared = self.pages[name].comparisons
-        found = [
-            compared[p, ours, other] for p in panels if (p, ours, other) in compared
-        ]
-        better = sum(x.verdict == "better" for x in found)
-        lacking = "" if len(found) == len(panels) else " measured"
-        return f"{other.upper()} on {better} of {len(found)}{lacking} tasks"
+        verdicts = [compared[key].verdict for key in keys if key in compared]
+        measured = "" if len(verdicts) == len(keys) else " measured"
+        better = verdicts.count("better")
+        return f"{other.upper()} on {better} of {len(verdicts)}{measured} tasks"
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""
