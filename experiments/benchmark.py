@@ -212,16 +212,21 @@ def physics_table(env_name: str, options: Options) -> Iterator[list[Row]]:
 
 
 def training_row(
-    env_name: str, variant: str, options: Options, devices: int, seeds: int
+    env_name: str, variant: str, options: Options, *, devices: int, seeds: int
 ) -> Row:
     """PPO+GASIL with the paper's preset."""
     env = gasil_envs.make(env_name, **VARIANTS[variant])
-    config = presets.preset(env_name, "ppo+gasil", "paper")
-    config = config.replace(num_envs=options.training_envs or config.num_envs)
+    algorithm = presets.preset(env_name, "ppo+gasil", "paper")
+    num_envs = options.training_envs or algorithm.config.num_envs
+    batch_steps = algorithm.config.batch_steps
     # As many iterations in a call as the command line does at most.
-    config = config.replace(total_steps=50 * options.iterations * config.batch_steps)
+    algorithm = algorithm.replace(
+        num_envs=num_envs, total_steps=50 * options.iterations * batch_steps
+    )
     with command_line.input_checked():
-        batch = make_members(env, config, range(seeds), devices=jax.devices()[:devices])
+        batch = make_members(
+            env, algorithm, range(seeds), devices=jax.devices()[:devices]
+        )
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began
@@ -231,15 +236,15 @@ def training_row(
     def run() -> float:
         began = time.perf_counter()
         newest.append(jax.block_until_ready(advance(newest.pop(), count))[0])
-        steps = options.iterations * config.batch_steps * seeds
+        steps = options.iterations * batch_steps * seeds
         return steps / (time.perf_counter() - began)
 
-    name, num_envs = f"ppo+gasil, {variant}", seeds * config.num_envs
-    return Row(env_name, name, num_envs, run, compile_seconds)
+    name = f"ppo+gasil, {variant}"
+    return Row(env_name, name, seeds * num_envs, run, compile_seconds)
 
 
 def _train_baseline(
-    task: str, num_envs: int, spread: bool, threads: int, pipe: Any
+    task: str, num_envs: int, spread: bool, *, threads: int, pipe: Any
 ) -> None:
     """Train Stable-Baselines3's PPO in a separate process, when the pipe says "go"."""
     import torch
@@ -308,7 +313,7 @@ def baseline_row(
 
 def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """Training beside physics alone and Stable-Baselines3."""
-    config = presets.preset(env_name, "ppo+gasil", "paper")
+    config = presets.preset(env_name, "ppo+gasil", "paper").config
     num_envs = options.seeds * (options.training_envs or config.num_envs)
     rows, devices = [], len(jax.devices())
     if importlib.util.find_spec("stable_baselines3"):
@@ -318,7 +323,11 @@ def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     for variant in options.variants or ("ours", "mujoco"):
         row = physics_row(env_name, variant, num_envs)
         rows.append(dataclasses.replace(row, name=f"physics alone, {variant}"))
-        rows.append(training_row(env_name, variant, options, devices, options.seeds))
+        rows.append(
+            training_row(
+                env_name, variant, options, devices=devices, seeds=options.seeds
+            )
+        )
     yield rows
 
 
@@ -326,7 +335,9 @@ def scaling_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """Training on 1, 2, 4 ... devices, and finally on all of them."""
     most, rows = len(jax.devices()), []
     for n in (*(2**i for i in range(most) if 2**i < most), most):
-        row = training_row(env_name, "ours", options, n, n * options.seeds)
+        row = training_row(
+            env_name, "ours", options, devices=n, seeds=n * options.seeds
+        )
         name = f"{row.name}, {n} device{'s' * (n > 1)}"
         rows.append(dataclasses.replace(row, name=name))
     yield rows

@@ -131,7 +131,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
     return {key: corrected[key] for key in raw}
 
 
-def improvement(scores: Scores, panels: Sequence[str], ours: str, other: str) -> str:
+def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:
     """Return the probability of improvement over the panels, as text.
 
     It is the probability that a random seed of `ours` has a higher score than a random

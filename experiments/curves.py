@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from experiments.search import DELAY, PAPERS, Point, Search
 from experiments.store import Run, Store
 from gasil_jax import presets
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.imitation import AGENTS
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.
 Terms = tuple[tuple[float, str, str], ...]
@@ -25,12 +26,12 @@ class Curve:
     Attributes:
       env: name of the task.
       agent: name of the agent.
-      changes: hyperparameters and other fields of `Config` to change.
+      changes: settings of the algorithm to change, by name.
       reward_delay: the task's reward delay, in steps.
       obs_noise: standard deviation of the task's observation noise.
       terminal_limits: whether the task's step limit terminates an episode.
-      base: the settings before the changes: a preset's, by its name; the defaults of
-        `Config`, by None; or what a search chose, by a function of task, agent and
+      base: the settings before the changes: a preset's, by its name; the defaults, by
+        None; or what a search chose, by a function of task, agent and
         delay that returns the search.
       seeds: number of seeds, from seed 0 on.
       total_steps: environment steps per seed.
@@ -76,18 +77,18 @@ class Curve:
         """Return the curve's runs, or none if its search is not complete."""
         if (point := self.point(searched)) is None:
             return ()
-        config = Config(agent=self.agent)
+        algorithm = Algorithm(AGENTS[self.agent]())
         if self.search:
-            config = self.search.config({})
+            algorithm = self.search.algorithm({})
         elif isinstance(self.base, str):
-            config = presets.preset(
+            algorithm = presets.preset(
                 self.env, self.agent, self.base, reward_delay=self.reward_delay
             )
-        config = config.replace(**{"total_steps": self.total_steps, **point})
+        algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
         return tuple(
             Run(
                 self.env,
-                config,
+                algorithm,
                 seed,
                 self.reward_delay,
                 self.obs_noise,
@@ -112,8 +113,8 @@ class Figure:
         None compares each pair of curves.
       comparisons: comparisons to make instead of those with the favourite.
       searches: searches that are trained before the curves, by their names.
-      over: a field of `Curve` or `Config` that is the x-axis of final returns, and the
-        axis' label; None for learning curves. Curves whose names differ only in the
+      over: a field of `Curve`, or a setting, that is the x-axis of final returns, and
+        the axis' label; None for learning curves. Curves whose names differ only in the
         field's value are points of one line.
       early: number of first environment steps whose mean return is compared too, as the
         curve "NAME early".

@@ -26,7 +26,7 @@ import numpy as np
 
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Run, Store, run_of
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.environments import Settings
@@ -63,8 +63,6 @@ class Setup:
         own on one core. Where each run has few environments this is the fastest way.
         With 1 the program's runs are sharded over `devices`.
       members: largest number of runs in a program; default no limit.
-      share_counts: train runs that differ in buffer_steps or discriminator_updates in
-        one program: it compiles once, and each run costs what the largest does.
       commit: commit of the code, to be recorded if there is no repository.
     """
 
@@ -75,7 +73,6 @@ class Setup:
     evaluate_episodes: int = 10
     processes: int = 1
     members: int | None = None
-    share_counts: bool = False
     commit: str | None = None
 
 
@@ -116,13 +113,6 @@ class Program:
     setup: Setup
 
     @property
-    def config(self) -> Config:
-        """The members' config, with the largest of their counts."""
-        members = [run.config.hyperparameters for run in self.runs]
-        counts = {x: max(getattr(of, x) for of in members) for x in shards.COUNTS}
-        return self.runs[0].config.replace(**counts)
-
-    @property
     def evaluate_episodes(self) -> int:
         """The number of episodes of each evaluation."""
         return 0 if _is_of_search(self.runs[0]) else self.setup.evaluate_episodes
@@ -138,9 +128,11 @@ class Program:
 
     def __str__(self) -> str:
         run, count = self.runs[0], len(self.runs)
-        words = [f"{run.env} {run.config.agent}", f"{run.config.num_envs} environments"]
+        config = run.algorithm.config
+        words = [f"{run.env} {run.algorithm.agent.name}"]
+        words += [f"{config.num_envs} environments"]
         words += [f"delayed {run.reward_delay}"] if run.reward_delay > 1 else []
-        words += [] if run.config.stagger_episodes else ["in step"]
+        words += [] if config.stagger_episodes else ["in step"]
         words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
         return ", ".join(words)
 
@@ -153,12 +145,13 @@ def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
     """Group runs into as few programs as possible, of at most `setup.members`."""
     groups: dict[tuple[Run, bool], list[Run]] = {}
     for run in runs:
-        # Only counts decide shapes, so only they may need separate programs.
-        counts = {x: getattr(run.config.hyperparameters, x) for x in shards.COUNTS}
-        kind = type(run.config.hyperparameters)
-        own = kind() if setup.share_counts else kind(**counts)
-        config = run.config.replace(hyperparameters=own)
-        shared = dataclasses.replace(run, config=config, seed=0)
+        # Numbers that are traced may differ within a program.
+        agent = type(run.algorithm.agent)
+        models = tuple(type(model)() for model in run.algorithm.rewards)
+        numbers = Algorithm(agent(), models).hyperparameters
+        shared = dataclasses.replace(
+            run, algorithm=run.algorithm.replace(**numbers), seed=0
+        )
         groups.setdefault((shared, _is_of_search(run)), []).append(run)
     parts = []
     for group in groups.values():
@@ -187,6 +180,7 @@ def train(program: Program) -> dict[Run, Record]:
     """
     run, setup, folder = program.runs[0], program.setup, program.folder
     episodes = program.evaluate_episodes or None
+    algorithm, total_steps = run.algorithm, run.algorithm.config.total_steps
     settings = Settings(
         reward_delay=run.reward_delay,
         obs_noise=run.obs_noise,
@@ -198,15 +192,15 @@ def train(program: Program) -> dict[Run, Record]:
         env=run.env,
         out=folder,
         keep_checkpoints=1,
-        evaluate_every=episodes and math.ceil(run.config.total_steps / EVALUATIONS),
+        evaluate_every=episodes and math.ceil(total_steps / EVALUATIONS),
         evaluate_episodes=episodes,
         devices=setup.devices,
         settings=settings,
-        config=program.config,
+        **run_options.algorithm_options(algorithm),
     )
     seeds = tuple(run.seed for run in program.runs)
-    points = tuple(run.config.hyperparameters for run in program.runs)
-    members = shards.Program(0, program.config, tuple(enumerate(seeds)), points)
+    numbers = tuple(run.algorithm.hyperparameters for run in program.runs)
+    members = shards.Program(0, algorithm, tuple(enumerate(seeds)), numbers)
     labels = dict(zip(_LABELS, (range(len(seeds)), seeds), strict=True))
     env = assembly.prepare(options, [members], [members])
     read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))

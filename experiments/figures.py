@@ -234,7 +234,7 @@ def _equal_comparisons() -> Comparisons:
 
 
 def _paper_panel(
-    env: str, delay: int, normalize: bool, agents: Sequence[str]
+    env: str, delay: int, normalize: bool, *, agents: Sequence[str]
 ) -> Panels:
     """Return agents on a task under the paper's protocol, each with its search there.
 
@@ -257,7 +257,7 @@ def _paper_panel(
 
 #: The panels under the paper's protocol, those first that decide most.
 _PROTOCOL = joined(
-    _paper_panel(env, delay, normalize, agents)
+    _paper_panel(env, delay, normalize, agents=agents)
     for tasks, delay, normalize, agents in (
         (TASKS[:4], DELAY, True, PAPERS),
         (TASKS[:4], DELAY, False, PAIR),

@@ -46,9 +46,9 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         axes.set_visible(False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         if figure.over:
-            _draw_over(figure, panel, scores, axes)
+            _draw_over(figure, panel, scores, axes=axes)
         else:
-            _draw_curves(figure, panel, records, axes)
+            _draw_curves(figure, panel, records, axes=axes)
         axes.set_title(panel)
     shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
     handle_of = {
@@ -93,7 +93,7 @@ def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
     return {name: color_of.get(name) or next(free) for name in names}
 
 
-def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> None:
+def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
     """Draw learning curves: interquartile mean and 95% interval over seeds."""
     color_of = _colors(figure)
     for label in figure.panels[panel]:
@@ -115,7 +115,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, axes: Any) -> Non
     axes.set_xlabel("million steps")
 
 
-def _draw_over(figure: Figure, panel: str, scores: Scores, axes: Any) -> None:
+def _draw_over(figure: Figure, panel: str, scores: Scores, *, axes: Any) -> None:
     """Draw final returns over a setting; a line joins curves that differ only in it."""
     curves = figure.panels[panel]
     color_of = _with_free_colors(dict.fromkeys(x.agent for *_, x in figure.curves()))

@@ -24,7 +24,7 @@ from experiments.store import RESULTS, ResultsFolder
 from gasil_envs import pictures
 from gasil_jax import normalization, policy
 from gasil_jax.host import command_line, output_file
-from gasil_jax.imitation import adversarial
+from gasil_jax.imitation import PPOGASIL, adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
@@ -32,7 +32,7 @@ _EPISODES = 20
 SHARES = (0.0, 0.1, 0.25, 0.5, 1.0)
 #: The columns of each agent; PPO has no discriminator.
 _COLUMNS = {
-    "ppo": ("policy", "good trajectories"),
+    "ppo": ("policy",),
     "ppo+gasil": ("policy", "good trajectories", "discriminator's reward"),
 }
 
@@ -50,7 +50,9 @@ class Options:
     out: ResultsFolder = RESULTS
 
 
-def states_at(env: Any, config: gasil_jax.Config, shares: Sequence[float]) -> list[Any]:
+def states_at(
+    env: Any, algorithm: gasil_jax.Algorithm, shares: Sequence[float]
+) -> list[Any]:
     """Return the training states of seed 0 at increasing shares of training.
 
     The first share may be 0, which is after one iteration.
@@ -58,11 +60,11 @@ def states_at(env: Any, config: gasil_jax.Config, shares: Sequence[float]) -> li
 
     @functools.partial(jax.jit, donate_argnums=0)
     def advance(state: Any, count: jax.Array) -> Any:
-        step = lambda _, state: gasil_jax.iterate(env, config, state)[0]
+        step = lambda _, state: gasil_jax.iterate(env, algorithm, state)[0]
         return jax.lax.fori_loop(0, count, step, state)
 
-    state, states = gasil_jax.init(env, config, jax.random.key(0)), []
-    ends = [max(1, round(share * config.num_iterations)) for share in shares]
+    state, states = gasil_jax.init(env, algorithm, jax.random.key(0)), []
+    ends = [max(1, round(share * algorithm.config.num_iterations)) for share in shares]
     for first, end in itertools.pairwise([0, *ends]):
         state = advance(state, end - first)
         states.append(jax.device_get(state))
@@ -90,7 +92,7 @@ def policy_paths(env: Any, state: Any, key: jax.Array) -> np.ndarray:
 
 def buffer_paths(state: Any) -> list[np.ndarray]:
     """Return positions (steps, 2) of each episode in the buffer, the best first."""
-    buffer = state.good_trajectories
+    buffer = state.agent.buffer
     size = int(buffer.size)
     starts = np.flatnonzero(np.asarray(buffer.time[:size]) == 0)
     positions = np.asarray(buffer.observation[:size, :2])
@@ -98,7 +100,7 @@ def buffer_paths(state: Any) -> list[np.ndarray]:
 
 
 def reward_field(
-    env: Any, config: gasil_jax.Config, state: Any
+    env: Any, agent: PPOGASIL, state: Any
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions (n, 2), the best direction (n, 2), and its -log D (n,)."""
     line = np.linspace(-0.95, 0.95, 17, dtype=np.float32)
@@ -109,10 +111,10 @@ def reward_field(
     observation = normalization.normalize(
         state.normalizer, jnp.asarray(np.concatenate([positions, objects], axis=1))
     )
-    network = Discriminator(config.discriminator_hidden_sizes)
+    network = Discriminator(agent.discriminator_hidden_sizes)
     logits: Any = jax.vmap(
         lambda action: network.apply(
-            state.imitation.params,
+            state.agent.discriminator.params,
             observation,
             jnp.broadcast_to(action, (len(positions), 2)),
         )
@@ -121,7 +123,7 @@ def reward_field(
     return positions, actions[reward.argmax(axis=0)], reward.max(axis=0)
 
 
-def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> None:
+def draw_moment(panels: Any, env: Any, agent: gasil_jax.Agent, *, state: Any) -> None:
     """Draw an agent's policy, its buffer and, if it has one, its discriminator."""
     for panel in panels:
         none = np.zeros(len(env.unwrapped.objects), bool)
@@ -129,10 +131,10 @@ def draw_moment(panels: Any, env: Any, config: gasil_jax.Config, state: Any) -> 
         panel.set(xticks=[], yticks=[])
     for path in policy_paths(env, state, jax.random.key(1)):
         panels[0].plot(*path.T, color="0.2", linewidth=0.7, alpha=0.6)
-    for path in buffer_paths(state):
-        panels[1].plot(*path.T, color="#0072B2", linewidth=0.7, alpha=0.6)
-    if len(panels) > 2:
-        positions, direction, reward = reward_field(env, config, state)
+    if isinstance(agent, PPOGASIL):
+        for path in buffer_paths(state):
+            panels[1].plot(*path.T, color="#0072B2", linewidth=0.7, alpha=0.6)
+        positions, direction, reward = reward_field(env, agent, state)
         strength = (reward - reward.min()) / max(np.ptp(reward), 1e-6)
         panels[2].quiver(
             *positions.T, *direction.T, alpha=strength, scale=28, width=0.006
@@ -159,12 +161,12 @@ def run(options: Options) -> None:
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(len(SHARES), len(titles), squeeze=False)
     for agent in _COLUMNS:
-        config = gasil_jax.preset("point_mass", agent, "tuned")
-        config = config.replace(total_steps=options.total_steps)
+        algorithm = gasil_jax.preset("point_mass", agent, "tuned")
+        algorithm = algorithm.replace(total_steps=options.total_steps)
         columns = [i for i, (of, _) in enumerate(titles) if of == agent]
-        for row, state in zip(grid, states_at(env, config, SHARES), strict=True):
-            draw_moment(row[columns], env, config, state)
-            steps = int(state.iteration) * config.batch_steps
+        for row, state in zip(grid, states_at(env, algorithm, SHARES), strict=True):
+            draw_moment(row[columns], env, algorithm.agent, state=state)
+            steps = int(state.iteration) * algorithm.config.batch_steps
             row[0].set_ylabel(f"{steps:,} steps")
     for panel, (agent, title) in zip(grid[0], titles, strict=True):
         panel.set_title(f"{agent}: {title}", fontsize=9)

@@ -147,12 +147,12 @@ def run(options: Options) -> None:
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
     with command_line.input_checked():
         delay = options.settings.reward_delay
-        config = presets.preset(
+        algorithm = presets.preset(
             options.env, options.agent, options.preset, reward_delay=delay
         )
         env = gasil_envs.make(options.env, **dataclasses.asdict(options.settings))
         members = make_members(
-            env, config, range(options.seeds), devices=jax.devices()[:1]
+            env, algorithm, range(options.seeds), devices=jax.devices()[:1]
         )
     states, compiled = members.compile()
     advance: Any = compiled  # Its declared type lacks `as_text`.
@@ -178,7 +178,7 @@ def run(options: Options) -> None:
         writer.write({name: np.asarray(x)[:, :1] for name, x in metrics.items()})
         totals["host: metrics.csv"] = time.perf_counter() - began
         writer.close()
-    steps, total = options.seeds * config.batch_steps, sum(totals.values())
+    steps, total = options.seeds * algorithm.config.batch_steps, sum(totals.values())
     rows = {**totals, "sum": total, "an iteration without trace": np.median(seconds)}
     print(f"{options.env}, {options.agent}, {options.seeds} seeds: us/env step  share")
     for part, of_part in rows.items():

@@ -42,7 +42,7 @@ from experiments.search import (
     mean_ranks,
 )
 from experiments.store import Record, Run, Store
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.figures.statistics import interquartile_mean
 from gasil_jax.host import output_file
@@ -89,13 +89,17 @@ def point_in_words(point: Mapping[str, Any]) -> str:
     return ", ".join(f"{name} {words(value)}" for name, value in point.items())
 
 
-def changed(config: Config) -> dict[str, Any]:
-    """Return the settings of a config that differ from the defaults."""
-    default = Config(agent=config.agent)
-    values = lambda config: {**vars(config), **vars(config.hyperparameters)}
-    mine, defaults = values(config), values(default)
-    names = [name for name in mine if name not in ("hyperparameters", "total_steps")]
-    return {name: mine[name] for name in names if mine[name] != defaults[name]}
+def changed(algorithm: Algorithm) -> dict[str, Any]:
+    """Return the settings of an algorithm that differ from the defaults."""
+    models = tuple(type(model)() for model in algorithm.rewards)
+    defaults = Algorithm(type(algorithm.agent)(), models).settings
+    # Without models of rewards, which are no default.
+    defaults |= {model.switch: False for model in models}
+    return {
+        name: value
+        for name, value in algorithm.settings.items()
+        if name != "total_steps" and value != defaults[name]
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -296,6 +300,7 @@ class Page:
         scores: Scores,
         comparisons: Mapping[tuple[str, ...], Comparison],
         panels: Sequence[str] = (),
+        *,
         lacking: str = "not measured yet",
     ) -> str:
         lines, panels = [], panels or tuple(self.figure.panels)
@@ -305,7 +310,7 @@ class Page:
             complete = [p for p in with_other if (p, ours, other) in comparisons]
             if complete:
                 verdicts = [comparisons[p, ours, other].verdict for p in complete]
-                probability = improvement(scores, complete, ours, other)
+                probability = improvement(scores, complete, ours, other=other)
                 others = len(with_other) - len(complete)
                 more = f", {others} {lacking}" if others else ""
                 lines.append(
@@ -399,7 +404,8 @@ class Page:
           name: the hyperparameter.
         """
         tasks = {
-            name_of(*task): mean_ranks(name, *task, self.searched) for task in CELLS
+            name_of(*task): mean_ranks(name, *task, store=self.searched)
+            for task in CELLS
         }
         values = sorted({value for of_task in tasks.values() for value in of_task})
         rows = [
@@ -455,12 +461,13 @@ class Page:
         """Return a table of each curve's settings that are not the defaults."""
         rows = []
         for names, results in self.results.items():
-            config = next(iter(results.records)).config
+            algorithm = next(iter(results.records)).algorithm
             if isinstance(results.curve.base, str):
-                words = point_in_words(changed(config))
+                words = point_in_words(changed(algorithm))
             else:
                 words = point_in_words(results.point)
-                words += ", rewards normalized" if config.normalize_rewards else ""
+                is_normalized = algorithm.settings["normalize_rewards"]
+                words += ", rewards normalized" if is_normalized else ""
             rows.append([*names, words, results.provenance()])
         head = ["task", "agent", "hyperparameters", "trained with"]
         return markdown_table(head, rows)

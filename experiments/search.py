@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.store import Run, Store
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm, algorithm
 from gasil_jax.figures import statistics
 
 Point = Mapping[str, Any]
@@ -144,20 +144,20 @@ class Search:
     reward_delay: int = 1
     decompose_rewards: bool = False
 
-    def config(self, point: Point) -> Config:
-        """Return a point's config."""
-        return self._config(tuple(point.items()))
+    def algorithm(self, point: Point) -> Algorithm:
+        """Return a point's algorithm."""
+        return self._algorithm(tuple(point.items()))
 
-    # A page asks for each config many times, and to make one takes 0.1 ms.
+    # A page asks for each algorithm many times, and to make one takes 0.1 ms.
     @functools.cache  # noqa: B019
-    def _config(self, point: tuple[tuple[str, Any], ...]) -> Config:
+    def _algorithm(self, point: tuple[tuple[str, Any], ...]) -> Algorithm:
         return self._base().replace(**dict(point))
 
-    def _base(self) -> Config:
+    def _base(self) -> Algorithm:
         """Return the settings that all points share."""
         decompose = self.decompose_rewards or self.agent == ADAPTIVE
-        return Config(
-            agent=self.agent,
+        return algorithm(
+            self.agent,
             total_steps=_STEPS_OF.get(self.env, STEPS),
             num_envs=32,
             normalize_rewards=True,
@@ -170,7 +170,10 @@ class Search:
         """Return the runs of points, a list for each."""
         seeds = tuple(seeds)
         return [
-            [Run(self.env, self.config(x), seed, self.reward_delay) for seed in seeds]
+            [
+                Run(self.env, self.algorithm(x), seed, self.reward_delay)
+                for seed in seeds
+            ]
             for x in points
         ]
 
@@ -295,15 +298,15 @@ class PaperSearch(Search):
 
     normalize_rewards: bool = True
 
-    def _base(self) -> Config:
-        config = Config(
-            agent=self.agent,
+    def _base(self) -> Algorithm:
+        base = algorithm(
+            self.agent,
             total_steps=PAPER_STEPS_OF.get(self.env, STEPS),
             num_envs=1,
             stagger_episodes=False,
             normalize_rewards=self.normalize_rewards,
         )
-        return config.replace(**_HUMANOID) if self._has_schedule else config
+        return base.replace(**_HUMANOID) if self._has_schedule else base
 
     @property
     def _has_schedule(self) -> bool:
@@ -408,7 +411,7 @@ def importance(agent: str, store: Store) -> dict[str, float]:
 
 
 def mean_ranks(
-    name: str, env: str, reward_delay: int, store: Store
+    name: str, env: str, reward_delay: int, *, store: Store
 ) -> dict[Any, float]:
     """Return the mean rank, by value of a hyperparameter, of points on a task.
 

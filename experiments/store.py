@@ -17,9 +17,10 @@ import numpy as np
 import tyro
 
 from gasil_jax import npz
-from gasil_jax.config import Config, hyperparameters_of
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import ranges
 from gasil_jax.errors import InputError
-from gasil_jax.host import output_file, run_folder
+from gasil_jax.host import descriptions, output_file, run_folder
 
 #: Raise this by hand when a change makes the same settings give different numbers, by
 #: more than rounding. All earlier runs then count as missing. Runs of version 1 had
@@ -44,7 +45,7 @@ class Run:
     """
 
     env: str
-    config: Config
+    algorithm: Algorithm
     seed: int
     reward_delay: int = 1
     obs_noise: float = 0.0
@@ -55,19 +56,19 @@ class Run:
     @functools.cached_property
     def experiment(self) -> str:
         """All settings but the seed as JSON, which the runs of a curve share."""
-        values = dict(vars(self.config))
+        values = descriptions.describe(self.algorithm)
         for name, value in values.items():
             if callable(value):
                 raise InputError(f"{name} is a function: a stored run needs points")
             if name.endswith("_schedule"):
                 values[name] = [[float(x) for x in point] for point in value]
-        defaults = type(self.config.hyperparameters)()
-        values["hyperparameters"] = {
-            name: type(getattr(defaults, name))(value)
-            for name, value in vars(self.config.hyperparameters).items()
-        }
+        # 1 and 1.0 are the same number, and so the same run.
+        for part in self.algorithm.parts:
+            for name, allowed in ranges(part).items():
+                if values[name] is not None:
+                    values[name] = (int if allowed.whole else float)(values[name])
         fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        fields |= {"config": values, "obs_noise": float(self.obs_noise)}
+        fields |= {"algorithm": values, "obs_noise": float(self.obs_noise)}
         del fields["seed"]
         return json.dumps(fields, sort_keys=True)
 
@@ -78,20 +79,12 @@ class Run:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def _tuples(value: Any) -> Any:
-    # JSON has no tuples, but a config must be hashable.
-    return tuple(map(_tuples, value)) if isinstance(value, list) else value
-
-
 def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
     """Return a `Run`'s fields without its seed.
 
-    Fields of `Config` that are newer than the stored run have their defaults.
+    Settings that are newer than the stored run have their defaults.
     """
-    values = {name: _tuples(value) for name, value in fields["config"].items()}
-    kind = hyperparameters_of(values["agent"])
-    values["hyperparameters"] = kind(**values["hyperparameters"])
-    return {**fields, "config": Config(**values)}
+    return {**fields, "algorithm": descriptions.read(fields["algorithm"])}
 
 
 def run_of(experiment: str, seed: int) -> Run:

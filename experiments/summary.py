@@ -322,12 +322,12 @@ class Summary:
                 raw = not getattr(search, "normalize_rewards", True)
                 if point is None or search.agent == ADAPTIVE or raw:
                     continue
-                config = report.changed(search.config(point))
+                settings = report.changed(search.algorithm(point))
                 kind = "delayed" if search.reward_delay > 1 else "dense"
                 kind = "decomposed" if search.decompose_rewards else kind
                 kind = f"paper {kind}" if isinstance(search, PaperSearch) else kind
                 of_task = rows.setdefault(kind, {}).setdefault(search.env, {})
-                of_task[search.agent] = dict(sorted(config.items()))
+                of_task[search.agent] = dict(sorted(settings.items()))
         return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
     def write(self) -> None:

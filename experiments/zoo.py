@@ -52,7 +52,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         none of its seeds has a return.
     """
     description = run_folder.read(folder)
-    delay = description["settings"].reward_delay
+    algorithm, delay = description["algorithm"], description["settings"].reward_delay
     with command_line.input_checked():
         env = environments.make_env(description["env"])
         saved = npz.read(folder / "policy.npz")
@@ -72,10 +72,10 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
     about = {
         "env": description["env"],
         "reward_delay": delay,
-        "agent": description["config"].agent,
-        "decompose_rewards": description["config"].decompose_rewards,
+        "agent": algorithm.agent.name,
+        "decompose_rewards": algorithm.settings["decompose_rewards"],
         "seed": seed,
-        "env_steps": description["config"].total_steps,
+        "env_steps": algorithm.config.total_steps,
         "mean": round(float(returns.mean()), 1),
         "deviation": round(float(returns.std()), 1),
         "episodes": episodes,

@@ -1,6 +1,5 @@
-"""Refuse what training can't start from, each in one line and before it compiles."""
+"""Check the environment, the algorithm and the key before anything compiles."""
 
-import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -8,11 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from gasil_envs import own_code, own_environment
-from gasil_jax.config import Config, validate
-from gasil_jax.errors import unknown
-from gasil_jax.imitation import find_agent
-from gasil_jax.imitation.adaptive import RULES
-from gasil_jax.imitation.adversarial import BONUSES
+from gasil_jax import algorithms
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.context import Sizes
 
 
 def check_environment(env: Any) -> None:
@@ -28,27 +25,16 @@ def check_environment(env: Any) -> None:
         own_environment.check(type(innermost).__name__, env, env)
 
 
-def check(env: Any, config: Config) -> None:
-    """Raise `ValueError` if the config can't train in the environment.
+def check(env: Any, algorithm: Algorithm) -> None:
+    """Raise `ValueError` if the algorithm can't train in the environment.
 
     Nothing is traced or compiled.
     """
     _check_interface(env)
-    if not isinstance(config, Config):
-        raise ValueError(f"config is {config!r}: it must be a gasil_jax.Config")
-    validate(config)
-    for name, allowed in (("bonus", BONUSES), ("imitation_rule", RULES)):
-        if (value := getattr(config, name)) not in allowed:
-            raise ValueError(unknown(name, value, tuple(allowed)))
-    limit = getattr(env, "episode_length", math.inf)
-    if (config.max_episode_steps or 0) > limit:
-        raise ValueError(
-            f"max_episode_steps is {config.max_episode_steps}: the environment's own "
-            f"limit is {limit}"
-        )
-    agent = find_agent(config.agent)
-    with own_code.refused(f"check of agent {config.agent!r} fails", passing=ValueError):
-        agent.check(config, env.observation_size, env.action_size)
+    algorithms.check(algorithm)
+    agent, num_envs = algorithm.agent, algorithm.config.num_envs
+    with own_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
+        agent.check(Sizes(num_envs, env.observation_size, env.action_size))
 
 
 def _check_interface(env: Any) -> None:

@@ -24,7 +24,7 @@ def nearest(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def unknown(
-    kind: str, name: str, allowed: Sequence[str], forms: Sequence[str] = ()
+    kind: str, name: str, allowed: Sequence[str], *, forms: Sequence[str] = ()
 ) -> str:
     """Return the error message for a name that is not among the allowed ones.
 

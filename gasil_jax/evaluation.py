@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import checks, policy, train
-from gasil_jax.config import Config, Range
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Range
 
 _EPISODES = Range(1, 2**31 - 1, whole=True)
 
@@ -17,7 +18,7 @@ _EPISODES = Range(1, 2**31 - 1, whole=True)
 @full_precision
 def evaluate(
     env: Any,
-    config: Config,
+    algorithm: Algorithm,
     state: train.TrainState,
     key: jax.Array,
     *,
@@ -31,7 +32,7 @@ def evaluate(
 
     Args:
       env: one environment.
-      config: the config of the run.
+      algorithm: the algorithm of the run.
       state: the training state of one run, not of a batch.
       key: random key; consumed.
       num_episodes: number of episodes, which run in parallel.
@@ -49,7 +50,7 @@ def evaluate(
         policy.from_state(state, env),
         key,
         num_episodes=num_episodes,
-        num_steps=train.max_episode_steps(env, config),
+        num_steps=train.max_episode_steps(env),
         deterministic=deterministic,
     )
 
@@ -84,11 +85,11 @@ def run_episodes(
 
     def step(carry: Any, key: jax.Array) -> Any:
         states, running, return_, length = carry
-        action = act(states.obs, None if deterministic else key)
-        sound = wrappers.is_sound(states.obs).all(axis=-1)
+        observation = states.obs
+        action = act(observation, None if deterministic else key)
         states = jax.vmap(env.step)(states, action)
         reward = states.info.get("true_reward", states.reward)
-        sound &= wrappers.is_sound(states.obs).all(axis=-1) & wrappers.is_sound(reward)
+        sound = wrappers.step_is_sound(observation, states)
         # As in training, a step of failed physics ends the episode with reward 0.
         return_ = return_ + jnp.where(running & sound, reward, 0.0)
         length = length + running

@@ -77,15 +77,12 @@ class Episode(NamedTuple):
     return_: float
 
 
-def episodes(
-    buffer: GoodTrajectories, max_episode_steps: int, max_steps: float
-) -> list[Episode]:
+def episodes(buffer: GoodTrajectories, max_episode_steps: int) -> list[Episode]:
     """Return the buffer's complete episodes, best first.
 
     Args:
       buffer: the buffer of one run.
       max_episode_steps: length of a full episode, which is complete in any case.
-      max_steps: the `max_steps` of `good_trajectories.insert`.
     """
     size = int(buffer.size)
     bounds = [*np.flatnonzero(np.asarray(buffer.time[:size]) == 0), size]
@@ -94,8 +91,7 @@ def episodes(
         Episode(observation[start:end], action[start:end], float(buffer.return_[start]))
         for start, end in itertools.pairwise(bounds)
     ]
-    most = min(buffer.capacity, int(max_steps))
-    if size >= most and len(complete[-1].action) < max_episode_steps:
+    if size >= buffer.capacity and len(complete[-1].action) < max_episode_steps:
         complete.pop()
     return complete
 
@@ -177,33 +173,39 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
     check_name(options.name)
-    env, config, seeds, states = saved_states.load(
+    env, algorithm, seeds, states = saved_states.load(
         options.run, options.checkpoint, options.point, options.seed
     )
-    limit = train.max_episode_steps(env, config)
-    most = states.hyperparameters.buffer_steps
-    buffers = jax.device_get((states.good_trajectories, most))
-    members = [member(buffers, index) for index in range(len(seeds))]
+    agent = algorithm.agent
+    buffers = jax.device_get(agent.good_trajectories(states.agent))
+    if buffers is None:
+        raise InputError(
+            f"run is {options.run}, of agent {agent.name!r}: it has no buffer of good "
+            "trajectories"
+        )
+    limit = train.max_episode_steps(env)
     complete = [
         episode
-        for buffer, max_steps in members
-        for episode in episodes(buffer, limit, max_steps)
+        for index in range(len(seeds))
+        for episode in episodes(member(buffers, index), limit)
     ]
     if not complete:
         raise InputError(f"run is {options.run}: no whole episode is in its buffer")
     described = run_folder.read(options.run)
     settings = dataclasses.asdict(described["settings"])
     discounted = "not discounted"
-    if config.buffer_discounts:
+    if getattr(agent, "buffer_discounts", True):
         # The points of a sweep may have different gammas.
-        discounted = f"discounted by {float(states.hyperparameters.gamma[0]):g} a step"
+        discounted = (
+            f"discounted by {float(states.hyperparameters['gamma'][0]):g} a step"
+        )
     description = _DESCRIPTION.format(
         run=options.run.resolve().name,
-        agent=config.agent,
+        agent=agent.name,
         env=f"{described['env']} {settings}",
         discounted=discounted,
     )
-    write(options.name, complete, algorithm_name=config.agent, description=description)
+    write(options.name, complete, algorithm_name=agent.name, description=description)
     steps = sum(len(episode.action) for episode in complete)
     print(f"{len(complete)} episodes, {steps} steps in {options.name}")
     return 0

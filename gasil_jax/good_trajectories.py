@@ -2,7 +2,7 @@
 
 Paper, section 4.1. An episode is offered to the buffer as a whole once it has ended. It
 is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, or the
-undiscounted sum if `Config.buffer_discounts` is false. The capacity is in steps: all
+undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
 steps that were ever offered are ordered by (return descending, episode, time), and the
 first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
 a tie the older episode stays. All functions are pure and work under jit, vmap and
@@ -14,9 +14,6 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-#: Names of the settings that all agents with this buffer use.
-FIELDS = ("buffer_steps", "buffer_episodes", "buffer_discounts", "sample_by_return")
-
 # Shape letters: C capacity in steps, E offered episodes, H steps of history per
 # environment, N environments.
 
@@ -27,7 +24,7 @@ class GoodTrajectories(struct.PyTreeNode):
     Attributes:
       observation: float32 (C, obs), not normalized.
       action: float32 (C, action).
-      return_: float32 (C,), the return of the step's episode; -inf where empty.
+      return_: float32 (C,), the return of the step's episode; 0 where empty.
       time: int32 (C,), the step's index in its episode.
       size: int32 (), number of filled steps; they are the first ones.
     """
@@ -55,9 +52,9 @@ class History(struct.PyTreeNode):
     Attributes:
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
-      reward: float32 (N, H), the reward, never normalized; in an agent's context it is
-        decomposed if the config says so. NaN in faulty steps, and in the last step of
-        an episode that was cut short.
+      reward: float32 (N, H), the reward, never normalized; in an agent's context it may
+        be decomposed. NaN in faulty steps, and in the last step of an episode that was
+        cut short.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
       next_observation: float32 (N, H, obs), after the action; None if it is not kept.
@@ -98,7 +95,7 @@ def init(capacity: int, observation_size: int, action_size: int) -> GoodTrajecto
     return GoodTrajectories(
         observation=jnp.zeros((capacity, observation_size), jnp.float32),
         action=jnp.zeros((capacity, action_size), jnp.float32),
-        return_=jnp.full(capacity, -jnp.inf, jnp.float32),
+        return_=jnp.zeros(capacity, jnp.float32),
         time=jnp.zeros(capacity, jnp.int32),
         size=jnp.int32(0),
     )
@@ -108,9 +105,9 @@ def init_history(
     num_envs: int,
     num_steps: int,
     max_episode_steps: int,
+    *,
     observation_size: int,
     action_size: int,
-    *,
     keep_next: bool = False,
     num_episodes: int = 1,
 ) -> History:
@@ -139,6 +136,7 @@ def record(
     history: History,
     observation: jax.Array,
     action: jax.Array,
+    *,
     reward: jax.Array,
     ended: jax.Array,
     next_observation: jax.Array | None = None,
@@ -177,7 +175,7 @@ def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
 
 
 def ended_episodes(
-    history: History, ended: jax.Array, return_: jax.Array, length: jax.Array
+    history: History, ended: jax.Array, return_: jax.Array, *, length: jax.Array
 ) -> Episodes:
     """Return the episodes that ended in the last recorded batch, oldest first.
 
@@ -207,7 +205,6 @@ def insert(
     history: History,
     episodes: Episodes,
     *,
-    max_steps: jax.Array | float,
     max_episodes: int | None = None,
 ) -> GoodTrajectories:
     """Return the buffer with the best of its own and the offered episodes.
@@ -215,10 +212,8 @@ def insert(
     Args:
       good_trajectories: the buffer before the insertion.
       history: the history that holds the steps of the offered episodes.
-      episodes: the offered episodes. Those whose return is not finite are rejected. The
-        return of an episode with a number that is not finite must not be finite either.
-      max_steps: number of steps to keep at most, (), which may be traced; the buffer's
-        capacity if that is lower. It must be the same in all insertions into a buffer.
+      episodes: the offered episodes. Those whose return is not finite are rejected, so
+        an episode in which any number is not finite must have such a return.
       max_episodes: number of episodes to keep at most; None for any number.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
@@ -245,7 +240,6 @@ def insert(
         length = length.at[order[max_episodes:]].set(0)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
-    size = jnp.minimum(size, jnp.asarray(max_steps, jnp.int32))
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]
@@ -266,7 +260,7 @@ def insert(
     return GoodTrajectories(
         observation=gather(good_trajectories.observation, history.observation),
         action=gather(good_trajectories.action, history.action),
-        return_=jnp.where(filled, return_[source], -jnp.inf),
+        return_=jnp.where(filled, return_[source], 0.0),
         time=jnp.where(filled, time, 0),
         size=size,
     )

@@ -32,6 +32,7 @@ def descend(
     learner: Learner,
     gradient: Any,
     transform: optax.GradientTransformation,
+    *,
     step_size: jax.Array | float,
 ) -> Learner:
     """Take one gradient step.

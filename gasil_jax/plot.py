@@ -80,7 +80,7 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
-    default = f"{description['env']}, {description['config'].agent}"
+    default = f"{description['env']}, {description['algorithm'].agent.name}"
     return Curves(
         env=description["env"],
         label=label or default,
@@ -130,7 +130,7 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
             curves,
             run.env_steps,
             run.returns,
-            run.evaluations,
+            evaluations=run.evaluations,
             color=color,
             label=labels[number],
             evaluated=f"{labels[number]}, evaluations",

@@ -10,7 +10,7 @@ import optax
 from flax import struct
 
 from gasil_jax import learner
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import Config
 from gasil_jax.learner import Learner
 from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
 from gasil_jax.permutation import permutation
@@ -58,9 +58,9 @@ def generalized_advantage_estimation(
     reward: jax.Array,
     value: jax.Array,
     next_value: jax.Array,
+    *,
     terminated: jax.Array,
     ended: jax.Array,
-    *,
     gamma: jax.Array | float,
     gae_lambda: jax.Array | float,
 ) -> jax.Array:
@@ -109,12 +109,12 @@ def evaluate_streams(
     actor_critic: ActorCritic,
     rewards: jax.Array,
     observation: jax.Array,
+    *,
     next_observation: jax.Array,
     terminated: jax.Array,
     ended: jax.Array,
-    *,
     value: Callable[[Any, jax.Array], jax.Array],
-    hyperparameters: Hyperparameters,
+    config: Config,
 ) -> tuple[jax.Array, jax.Array]:
     """Return values and advantages of every reward stream, (time, env, stream) each.
 
@@ -126,7 +126,7 @@ def evaluate_streams(
       terminated: bool (time, env).
       ended: bool (time, env).
       value: (params, observation) -> value.
-      hyperparameters: discount and lambda.
+      config: discount and lambda.
     """
     chex.assert_equal(rewards.shape, (*terminated.shape, len(actor_critic.values)))
     evaluate = lambda observation: jnp.stack(
@@ -137,10 +137,10 @@ def evaluate_streams(
         rewards,
         values,
         evaluate(next_observation),
-        terminated[..., None],
-        ended[..., None],
-        gamma=hyperparameters.gamma,
-        gae_lambda=hyperparameters.gae_lambda,
+        terminated=terminated[..., None],
+        ended=ended[..., None],
+        gamma=config.gamma,
+        gae_lambda=config.gae_lambda,
     )
     return values, advantage
 
@@ -151,7 +151,7 @@ def loss(
     *,
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     value: Callable[[Any, jax.Array], jax.Array],
-    hyperparameters: Hyperparameters,
+    config: Config,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Return PPO's loss: clipped surrogate, value error and entropy.
 
@@ -162,7 +162,7 @@ def loss(
       batch: a minibatch.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
-      hyperparameters: clip range and weights.
+      config: clip range and weights.
 
     Returns:
       The loss, (), and its parts as metrics.
@@ -175,7 +175,7 @@ def loss(
     log_prob = gaussian_log_prob(mean, log_std, batch.action)
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
-    epsilon = hyperparameters.clip_epsilon
+    epsilon = config.clip_epsilon
     clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -jnp.mean(surrogate)
@@ -187,8 +187,8 @@ def loss(
     entropy = gaussian_entropy(log_std)
     total = (
         policy_loss
-        + hyperparameters.value_coefficient * value_loss
-        - hyperparameters.entropy_coefficient * entropy
+        + config.value_coefficient * value_loss
+        - config.entropy_coefficient * entropy
     )
     metrics = {
         "policy_loss": policy_loss,
@@ -201,7 +201,7 @@ def loss(
     return total, metrics
 
 
-def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
+def optimizer(config: Config) -> optax.GradientTransformation:
     """Return one network's optimizer: a clip of the gradient's norm, then Adam.
 
     The caller applies the step size. All parameters are treated as one vector, because
@@ -209,26 +209,24 @@ def optimizer(hyperparameters: Hyperparameters) -> optax.GradientTransformation:
     for each layer took a tenth of the training time on a CPU.
     """
     transform = optax.chain(
-        optax.clip_by_global_norm(hyperparameters.max_grad_norm),
+        optax.clip_by_global_norm(config.max_grad_norm),
         optax.scale_by_adam(eps=1e-5),
     )
     return optax.flatten(transform)
 
 
-def descend(
-    actor_critic: ActorCritic, gradient: Any, hyperparameters: Hyperparameters
-) -> ActorCritic:
+def descend(actor_critic: ActorCritic, gradient: Any, config: Config) -> ActorCritic:
     """Take one gradient step of every network; each gradient's norm is clipped alone.
 
     Args:
       actor_critic: the networks before the step.
       gradient: {"policy": ..., "values": (stream)}.
-      hyperparameters: the step size and the largest norm of a gradient.
+      config: the step size and the largest norm of a gradient.
     """
     return ActorCritic(
-        policy=descend_one(actor_critic.policy, gradient["policy"], hyperparameters),
+        policy=descend_one(actor_critic.policy, gradient["policy"], config),
         values=tuple(
-            descend_one(value, value_gradient, hyperparameters)
+            descend_one(value, value_gradient, config)
             for value, value_gradient in zip(
                 actor_critic.values, gradient["values"], strict=True
             )
@@ -236,12 +234,10 @@ def descend(
     )
 
 
-def descend_one(
-    network: Learner, gradient: Any, hyperparameters: Hyperparameters
-) -> Learner:
+def descend_one(network: Learner, gradient: Any, config: Config) -> Learner:
     """Take one gradient step of one network."""
-    transform = optimizer(hyperparameters)
-    return learner.descend(network, gradient, transform, hyperparameters.learning_rate)
+    transform = optimizer(config)
+    return learner.descend(network, gradient, transform, step_size=config.learning_rate)
 
 
 @jax.named_scope("ppo")
@@ -253,7 +249,6 @@ def update(
     policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
     value: Callable[[Any, jax.Array], jax.Array],
     config: Config,
-    hyperparameters: Hyperparameters,
 ) -> tuple[ActorCritic, dict[str, jax.Array]]:
     """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
@@ -263,8 +258,8 @@ def update(
       key: random key; consumed.
       policy: (params, observation) -> mean, log standard deviation.
       value: (params, observation) -> value.
-      config: number of epochs, and number and size of minibatches.
-      hyperparameters: their values in this iteration.
+      config: number of epochs, number and size of minibatches, and this iteration's
+        numbers.
 
     Returns:
       The networks after the update, and the mean of each metric over all minibatches.
@@ -276,9 +271,9 @@ def update(
             jax.tree.map(lambda x: x[rows], batch),
             policy=policy,
             value=value,
-            hyperparameters=hyperparameters,
+            config=config,
         )
-        return descend(actor_critic, gradient, hyperparameters), metrics
+        return descend(actor_critic, gradient, config), metrics
 
     def epoch(actor_critic: ActorCritic, key: jax.Array) -> Any:
         order = permutation(key, config.batch_steps)

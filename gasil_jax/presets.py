@@ -1,7 +1,7 @@
 """Presets: settings that runs start from, by environment, agent and reward delay.
 
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
-`Config` and `Hyperparameters`; a flag overrides a row.
+the settings; a flag overrides a row.
 
 "tuned" has the settings that a search chose for an agent on a task, with the number of
 environments and the normalization of rewards that it ran with. Alpha suits only that
@@ -13,9 +13,8 @@ without a row for a task starts from the defaults.
 "decomposed" has the settings that a search chose on each task for PPO on decomposed
 rewards, where rewards are delayed.
 
-"scaled" has one rule for PPO on all locomotion tasks: learning rate, exploration and
-lambda depend on the dimension of an action. Delayed rewards are
-decomposed.
+"scaled" has one rule for PPO on all tasks: learning rate, exploration and lambda depend
+on the dimension of an action. Delayed rewards are decomposed.
 
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
@@ -29,9 +28,10 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
-from gasil_jax.config import Config, Range
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Range
 from gasil_jax.errors import unknown
-from gasil_jax.imitation import find_agent
+from gasil_jax.imitation import AGENTS, Agent
 
 #: The preset that runs start from if none is named.
 DEFAULT = "tuned"
@@ -87,8 +87,8 @@ def _tuned(rewards: str, adaptive: Overrides) -> Rows:
     return {**_searched(rewards), **rows}
 
 
-def _scaled(decompose_rewards: bool) -> Rows:
-    """Return rows for PPO whose settings depend on the dimension of an action.
+def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
+    """Return settings of PPO that depend on the dimension of an action.
 
     The searches suggest that the learning rate and the exploration must be smaller for
     actions with more dimensions (experiments/results/matrix.md). Noise in more
@@ -96,21 +96,22 @@ def _scaled(decompose_rewards: bool) -> Rows:
     All three fall linearly from two dimensions to eight; more dimensions have the
     values of eight (experiments/results/action_dimension.md).
     """
-
-    def between(size: int, two: float, eight: float) -> float:
-        share = min((size - 2) / 6, 1.0)
-        return two * (1 - share) + eight * share
-
+    share = min(max((action_size - 2) / 6, 0.0), 1.0)
+    between = lambda two, eight: two * (1 - share) + eight * share
     return {
-        (env, "ppo"): {
-            "normalize_rewards": True,
-            "decompose_rewards": decompose_rewards,
-            "num_envs": 32,
-            "gamma": 0.995,
-            "learning_rate": between(size, 7.5e-4, 1e-4),
-            "initial_deviation": between(size, 0.7, 0.25),
-            "gae_lambda": between(size, 0.975, 0.9),
-        }
+        "normalize_rewards": True,
+        "decompose_rewards": decompose_rewards,
+        "num_envs": 32,
+        "gamma": 0.995,
+        "learning_rate": between(7.5e-4, 1e-4),
+        "initial_deviation": between(0.7, 0.25),
+        "gae_lambda": between(0.975, 0.9),
+    }
+
+
+def _scaled(decompose_rewards: bool) -> Rows:
+    return {
+        (env, "ppo"): scaled(size, decompose_rewards)
         for env, size in ACTION_SIZES.items()
     }
 
@@ -162,15 +163,22 @@ def check(name: str) -> None:
 
 
 def preset(
-    env: str, agent: str, name: str = DEFAULT, *, reward_delay: int = 1
-) -> Config:
-    """Return the config that runs of `agent` in `env` start from.
+    env: str,
+    agent: str | type[Agent] = "ppo+gasil",
+    name: str = DEFAULT,
+    *,
+    reward_delay: int = 1,
+    action_size: int | None = None,
+) -> Algorithm:
+    """Return the algorithm that runs of `agent` in `env` start from.
 
     Args:
       env: name of the environment.
-      agent: name of the agent, or MODULE:NAME of your own agent.
+      agent: name of the agent, or its class.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
+      action_size: dimension of an action, which "scaled" needs for an environment that
+        is no locomotion task of ours.
 
     Returns:
       The defaults, overridden by what the preset has for all tasks and by its row. For
@@ -182,19 +190,24 @@ def preset(
         the agent on the task.
     """
     check(name)
-    find_agent(agent)
+    kind = AGENTS.get(agent, agent) if isinstance(agent, str) else agent
+    if not (isinstance(kind, type) and issubclass(kind, Agent)):
+        raise ValueError(unknown("agent", str(agent), tuple(AGENTS)))
     if reward_delay not in _DELAYS:
         raise ValueError(f"reward_delay is {reward_delay!r}: it must be {_DELAYS}")
     ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
-        raise ValueError(unknown("env", str(env), ours, others))
-    lacking = describe_lack(env, agent, name, reward_delay)
+        raise ValueError(unknown("env", str(env), ours, forms=others))
+    if name == "scaled" and kind.name == "ppo" and action_size is not None:
+        row = scaled(action_size, decompose_rewards=reward_delay > 1)
+        return Algorithm(kind()).replace(**row)
+    lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and name != DEFAULT:
         other = "dense" if reward_delay > 1 else "delayed"
         listed = _listed(_rows(name, reward_delay)) or f"rows for {other} ones"
         raise ValueError(f"{lacking}: it has {listed}")
-    row = _rows(name, reward_delay).get((env, agent), {})
-    return Config(agent=agent).replace(**{**PRESETS[name].every, **row})
+    row = _rows(name, reward_delay).get((env, kind.name), {})
+    return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
 def _listed(rows: Rows) -> str:
@@ -206,7 +219,7 @@ def _listed(rows: Rows) -> str:
     return "; ".join(words)
 
 
-def describe_lack(env: str, agent: str, name: str, reward_delay: int) -> str | None:
+def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str | None:
     """Return in words that a preset changes no default for an agent on a task.
 
     The result is None if the preset changes any.

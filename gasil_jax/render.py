@@ -90,9 +90,9 @@ def episode(
     step = jax.jit(lambda state, key: env.step(state, act(state.obs, key)))
     states, total = [jax.device_get(state.pipeline_state)], 0.0
     for step_key in jax.random.split(key, num_steps):
-        state = step(state, step_key)
+        observation, state = state.obs, step(state, step_key)
         reward = state.info.get("true_reward", state.reward)
-        if not (wrappers.is_sound(state.obs).all() and wrappers.is_sound(reward)):
+        if not wrappers.step_is_sound(observation, state):
             break
         states.append(jax.device_get(state.pipeline_state))
         total += float(reward)
@@ -168,7 +168,7 @@ def save(
         path.write_text(locomotion_page(env, states))
         return len(states)
     if path.suffix == ".png":
-        return write_strip(env, states, size, path)
+        return write_strip(env, states, size, path=path)
     frames, fps = frames_of(env, states, size)
     write_film(frames, fps, path)
     return len(frames)
@@ -206,7 +206,7 @@ def write_film(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> 
 
 
 def write_strip(
-    env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
+    env: Any, states: Sequence[Any], size: tuple[int, int], *, path: pathlib.Path
 ) -> int:
     """Write up to eight pictures of an episode in two rows, each above its time.
 

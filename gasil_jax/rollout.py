@@ -21,16 +21,16 @@ class Rollout(struct.PyTreeNode):
       action: float32 (time, env, action), as drawn from the policy, not clipped.
       log_prob: float32 (time, env), log density of the action when it was drawn.
       reward: float32 (time, env), the reward that the environment gives, which may be
-        delayed; in an agent's `Context`, decomposed and normalized if the config says
-        so.
+        delayed; in an agent's `Context`, what the reward models make of it.
       terminated: bool (time, env), whether the episode ended and has no future value.
       truncated: bool (time, env), whether the episode was cut off; its value is then
         bootstrapped.
       episode_return: float32 (time, env), the episode's sum of undelayed rewards up to
         this step.
       discounted_return: float32 (time, env), the episode's sum of gamma^t reward up to
-        this step, with gamma 1 if `Config.buffer_discounts` is false; NaN from the
-        first faulty step on, and where the episode was cut short.
+        this step, of the environment's own rewards; NaN from the first faulty step on,
+        and where the episode was cut short.
+      undiscounted_return: float32 (time, env), the same with gamma 1.
       episode_length: int32 (time, env), number of steps up to this one.
       faulty: bool (time, env), whether the physics failed in this step.
       cut_short: bool (time, env), whether the episode was truncated before it reached
@@ -46,6 +46,7 @@ class Rollout(struct.PyTreeNode):
     truncated: jax.Array
     episode_return: jax.Array
     discounted_return: jax.Array
+    undiscounted_return: jax.Array
     episode_length: jax.Array
     faulty: jax.Array
     cut_short: jax.Array
@@ -70,8 +71,8 @@ class EnvironmentStates(struct.PyTreeNode):
     Attributes:
       state: the environments' states, a Brax ``State``.
       episode_return: float32 (env,), sum of undelayed rewards so far.
-      discounted_return: float32 (env,), sum of gamma^t reward so far, with the same
-        gamma.
+      discounted_return: float32 (env,), sum of gamma^t reward so far.
+      undiscounted_return: float32 (env,), sum of rewards so far.
       discount: float32 (env,), gamma^t.
       episode_length: int32 (env,), number of steps so far.
       starting_age: int32 (env,), the age in steps at which the running episode began.
@@ -82,6 +83,7 @@ class EnvironmentStates(struct.PyTreeNode):
     state: Any
     episode_return: jax.Array
     discounted_return: jax.Array
+    undiscounted_return: jax.Array
     discount: jax.Array
     episode_length: jax.Array
     starting_age: jax.Array
@@ -124,6 +126,7 @@ def init(
         state=_strip_weak_types(state),
         episode_return=jnp.zeros(num_envs, jnp.float32),
         discounted_return=jnp.zeros(num_envs, jnp.float32),
+        undiscounted_return=jnp.zeros(num_envs, jnp.float32),
         discount=jnp.ones(num_envs, jnp.float32),
         episode_length=jnp.zeros(num_envs, jnp.int32),
         starting_age=starting_age,
@@ -151,11 +154,10 @@ def collect(
       max_episode_steps: length at which an episode is truncated.
       gamma: discount of the episodes' return.
 
-    If the physics diverges, the episode terminates with reward 0 and the step is marked
-    in ``faulty``. It has diverged if `wrappers.is_sound` is false for a number in the
-    observation before or after the step, or for a reward, given or held back. If an
-    episode is truncated here, its last step also gets the reward that the environment
-    still holds back, ``info["held_reward"]``.
+    If the physics fails (`wrappers.step_is_sound`), the episode terminates with reward
+    0 and the step is marked in ``faulty``. If an episode is truncated here, its last
+    step also gets the reward that the environment still holds back,
+    ``info["held_reward"]``.
 
     An episode that began at an age above 0 is truncated when its age reaches the limit,
     and marked in ``cut_short``. PPO learns from its steps, but its return is not
@@ -172,9 +174,9 @@ def collect(
 
     def step(carry: EnvironmentStates, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
-        # The observation may be that of a reset, whose physics may have diverged too.
-        sound = wrappers.is_sound(carry.state.obs).all(axis=-1)
-        observation = jnp.where(sound[:, None], carry.state.obs, 0.0)
+        # The observation may be that of a reset, whose physics may have failed too.
+        visible = wrappers.is_sound(carry.state.obs).all(axis=-1)
+        observation = jnp.where(visible[:, None], carry.state.obs, 0.0)
         with jax.named_scope("policy"):
             mean, log_std = policy(observation)
         noise = jax.random.normal(action_key, mean.shape, mean.dtype)
@@ -184,9 +186,7 @@ def collect(
 
         true_reward = stepped.info.get("true_reward", stepped.reward)
         held = stepped.info.get("held_reward", jnp.zeros_like(stepped.reward))
-        sound &= wrappers.is_sound(stepped.obs).all(axis=-1)
-        for number in (stepped.reward, true_reward, held):
-            sound &= wrappers.is_sound(number)
+        sound = wrappers.step_is_sound(carry.state.obs, stepped)
         length = carry.episode_length + 1
         true_reward = jnp.where(sound, true_reward, 0.0)
         cut_off = wrappers.truncated(stepped)
@@ -201,9 +201,9 @@ def collect(
 
         next_observation = jnp.where(sound[:, None], stepped.obs, 0.0)
         episode_return = carry.episode_return + true_reward
-        discounted_return = carry.discounted_return + carry.discount * jnp.where(
-            sound, reward, jnp.nan
-        )
+        own_reward = jnp.where(sound, reward, jnp.nan)
+        discounted_return = carry.discounted_return + carry.discount * own_reward
+        undiscounted_return = carry.undiscounted_return + own_reward
         transition = Rollout(
             observation=observation,
             next_observation=next_observation,
@@ -214,6 +214,7 @@ def collect(
             truncated=truncated,
             episode_return=episode_return,
             discounted_return=jnp.where(cut_short, jnp.nan, discounted_return),
+            undiscounted_return=jnp.where(cut_short, jnp.nan, undiscounted_return),
             episode_length=length,
             faulty=~sound,
             cut_short=cut_short,
@@ -227,6 +228,7 @@ def collect(
             ),
             episode_return=jnp.where(ended, 0.0, episode_return),
             discounted_return=jnp.where(ended, 0.0, discounted_return),
+            undiscounted_return=jnp.where(ended, 0.0, undiscounted_return),
             discount=jnp.where(ended, 1.0, carry.discount * gamma),
             episode_length=jnp.where(ended, 0, length),
             starting_age=jnp.where(ended, 0, carry.starting_age),

@@ -47,7 +47,7 @@ def train(
     # A run that is continued keeps its config.json until its checkpoint is restored.
     if not run_folder.has_run(folder):
         write()
-    title = f"{options.env} {options.config.agent}"
+    title = f"{options.env} {options.agent}"
     labels = {"seed": seeds_of(options)}
     job = assembly.Job(program, folder, labels, folder.absolute().name)
     finished: list[tuple[Members, driver.Outcome]] = []
@@ -62,7 +62,7 @@ def train(
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
         members, outcome = finished[0]
-        summary = _write_results(options, env, folder, members, outcome)
+        summary = _write_results(options, env, folder, members=members, outcome=outcome)
     if outcome.unsaved is not None:
         raise outcome.unsaved
     return summary
@@ -72,11 +72,11 @@ def _write_results(
     options: Options,
     env: Any,
     folder: pathlib.Path,
+    *,
     members: Members,
     outcome: driver.Outcome,
 ) -> dict[str, Any]:
     """Write the learning curve, the policies and the summary; return the summary."""
-    config = options.config
     seeds = seeds_of(options)
     read = lambda name, required: metrics_files.read_metrics(
         folder / name, ("seed",), options.seeds, required
@@ -86,9 +86,11 @@ def _write_results(
     evaluations = None
     if options.evaluate_every is not None:
         evaluations = read("evaluations.csv", ("mean",))
-    title = f"{options.env}, {config.agent}"
+    title = f"{options.env}, {options.agent}"
     with output_file.atomic(folder / "learning_curve.png") as partial:
-        plotting.learning_curve(partial, steps, returns, title, evaluations=evaluations)
+        plotting.learning_curve(
+            partial, steps, returns, title=title, evaluations=evaluations
+        )
     final = metrics_files.final_returns(returns)
     policy_file.save(folder / "policy.npz", outcome.states, env, seeds, final)
     faulty = np.nansum(metrics["faulty_steps"], axis=1)
@@ -115,7 +117,7 @@ def _write_results(
         trained = _recorded(folder / "summary.json", trained)
     summary = {
         "env": options.env,
-        "agent": config.agent,
+        "agent": options.agent,
         "env_steps_per_seed": int(steps[-1]),
         **_by_seed_and_mean(seeds, finals),
         "faulty_steps": by_seed(faulty, int),
@@ -173,7 +175,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check(options)
     check_out(options)
     # A run is a sweep of one point, in one program.
-    programs = shards.programs(options.config, [{}], seeds_of(options))
+    programs = shards.programs(options.algorithm, [{}], seeds_of(options))
     env = assembly.prepare(options, programs, programs)
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, programs[0], folder)

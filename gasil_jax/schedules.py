@@ -1,9 +1,12 @@
-"""Schedules: hyperparameters that change over the environment steps of training."""
+"""Schedules: numbers that change over the environment steps of training."""
+
+from collections.abc import Mapping
 
 import jax
 import jax.numpy as jnp
 
-from gasil_jax.config import Config, Hyperparameters, Schedule
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import SCHEDULE_SUFFIX, Schedule
 
 
 def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
@@ -23,21 +26,24 @@ def factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
 
 
 def at(
-    config: Config, hyperparameters: Hyperparameters, iteration: jax.Array
-) -> Hyperparameters:
-    """Return the hyperparameters of an iteration, with all schedules applied."""
+    algorithm: Algorithm, hyperparameters: Mapping[str, jax.Array], iteration: jax.Array
+) -> Algorithm:
+    """Return an algorithm with its numbers in an iteration, all schedules applied.
+
+    Args:
+      algorithm: the algorithm.
+      hyperparameters: the run's own numbers by name, () each, before schedules.
+      iteration: int32 (), number of iterations before this one.
+    """
+    config, numbers = algorithm.config, dict(hyperparameters)
     # In float32, because int32 would overflow at 2^31 steps.
     env_steps = iteration.astype(jnp.float32) * config.batch_steps
     # A user's own loop may run for more iterations than the config has.
-    remaining_share = jnp.maximum(
-        1.0 - hyperparameters.learning_rate_decay * (iteration / config.num_iterations),
-        0.0,
-    )
-    return hyperparameters.replace(
-        learning_rate=hyperparameters.learning_rate
-        * remaining_share
-        * factor(config.learning_rate_schedule, env_steps),
-        clip_epsilon=hyperparameters.clip_epsilon
-        * factor(config.clip_epsilon_schedule, env_steps),
-        alpha=hyperparameters.alpha * factor(config.alpha_schedule, env_steps),
-    )
+    decay = numbers["learning_rate_decay"]
+    remaining_share = jnp.maximum(1.0 - decay * (iteration / config.num_iterations), 0)
+    numbers["learning_rate"] = numbers["learning_rate"] * remaining_share
+    for name, value in algorithm.settings.items():
+        if name.endswith(SCHEDULE_SUFFIX):
+            number = name.removesuffix(SCHEDULE_SUFFIX)
+            numbers[number] = numbers[number] * factor(value, env_steps)
+    return algorithm.replace(**numbers)

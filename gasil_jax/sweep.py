@@ -1,9 +1,8 @@
 """Train a sweep: ``python -m gasil_jax.sweep --env hopper --grid alpha=0.02,0.1``.
 
-Points that differ only in `Hyperparameters` run in one compiled program, with seeds x
+Points that differ only in traced numbers run in one compiled program, with seeds x
 points vmapped and sharded. Points that differ in a count (such as buffer size or
-discriminator updates) are grouped, and each group compiles once. With --share-counts
-points with different buffer sizes or discriminator updates share a program.
+discriminator updates) are grouped, and each group compiles once.
 
 The sweep's folder holds config.json, results.csv (a row for each point and seed),
 curves.npz (every metric, (points, seeds, iterations)), summary.json, sweep.png (the
@@ -24,6 +23,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+from gasil_jax import algorithms
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.driver import Outcome
@@ -31,7 +31,7 @@ from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.sweeps import assembly, launch, merging, shards, tables, trained_programs
-from gasil_jax.sweeps.points import Point, check_saved, kinds, make_points
+from gasil_jax.sweeps.points import Point, check_saved, make_points
 from gasil_jax.sweeps.shards import Program
 
 _PROGRAM = "gasil_jax.sweep"
@@ -49,9 +49,6 @@ class Options(run_options.Options):
         ranges of the paper's appendix. The draw's seed is first_seed.
       points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
         instead of grid and random.
-      share_counts: let points that differ in buffer_steps or discriminator_updates
-        share a program. It compiles once, but every point costs as much as the
-        largest; best on a GPU.
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
         from 1 on, in a folder below `out`. With --resume it continues. See
         gasil_jax.merge.
@@ -63,7 +60,6 @@ class Options(run_options.Options):
     grid: tuple[str, ...] = ()
     random: int | None = None
     points_file: str | None = None
-    share_counts: bool = False
     shard: str | None = None
     launcher: str | None = None
     shards: int | None = None
@@ -115,7 +111,7 @@ def train(
         )
         for program in programs
     ]
-    title = f"{options.env} {options.config.agent} sweep"
+    title = f"{options.env} {options.agent} sweep"
     assembly.train(
         options, env, jobs, title=title, on_finished=on_finished, on_restored=write
     )
@@ -135,11 +131,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         resumed = None
         if given.resume and run_folder.has_run(folder):
             resumed = StoredRun(folder, run_folder.read(folder))
-        _train_shard(arguments, shard, folder, resumed)
+        _train_shard(arguments, shard, folder, resumed=resumed)
         return 0
     resumed = run_options.resumed_run(arguments)
     if resumed is not None and (text := resumed.description.get("shard")):
-        _train_shard(arguments, shards.parse(text), resumed.folder, resumed)
+        _train_shard(arguments, shards.parse(text), resumed.folder, resumed=resumed)
     else:
         options = run_options.parse(Options, arguments, _PROGRAM, resumed)
         _train_whole(options, resumed)
@@ -174,10 +170,14 @@ def _points(options: Options, stored: Sequence[StoredRun]) -> list[dict[str, Any
         for folder, description in stored:
             if description.get("points_file") == file:
                 points = list(description["points"])
-                check_saved(points, description["config"], folder / "config.json")
+                check_saved(points, description["algorithm"], folder / "config.json")
                 return points
     return make_points(
-        options.grid, options.random, file, options.first_seed, options.config.agent
+        options.grid,
+        options.random,
+        file,
+        seed=options.first_seed,
+        algorithm=options.algorithm,
     )
 
 
@@ -195,18 +195,14 @@ def plan(
     """
     run_options.check(options)
     points = _points(options, stored)
-    unused = run_options.unused_fields(options.config)
-    for point in points:
-        if name := next((name for name in point if name in unused), None):
-            others = [x for x in kinds(options.config.agent) if x not in unused]
-            raise InputError(
-                f"{name} can't vary: {unused[name]}. Allowed are {', '.join(others)}"
-            )
-        config = options.config.replace(**point)
-        run_options.check(dataclasses.replace(options, config=config))
-    programs = shards.programs(
-        options.config, points, run_options.seeds_of(options), options.share_counts
-    )
+    algorithm = options.algorithm
+    without_effect = run_options.without_effect(algorithm)
+    with command_line.input_checked():
+        for point in points:
+            for name in without_effect.keys() & point.keys():
+                raise InputError(f"{name} can't vary: {without_effect[name]}")
+            algorithms.check(algorithm.replace(**point))
+    programs = shards.programs(algorithm, points, run_options.seeds_of(options))
     return points, programs
 
 
@@ -290,14 +286,13 @@ def _refuse_other_sweep(
     """
     if not others:
         return
-    now = {**vars(options), "points": tuple(points)}
-    with command_line.input_checked():
-        now |= run_folder.expert_hash(options.config)
+    now = {**run_options.description(options), "points": tuple(points)}
     for folder, description in others:
         # Shards are continued to more total_steps one after another.
-        config = description["config"].replace(total_steps=options.config.total_steps)
+        steps = options.config.total_steps
+        algorithm = description["algorithm"].replace(total_steps=steps)
         merging.refuse_different(
-            StoredRun(folder, {**description, "config": config}),
+            StoredRun(folder, {**description, "algorithm": algorithm}),
             StoredRun(shard_folder, now),
         )
 
@@ -306,6 +301,7 @@ def _train_shard(
     arguments: Sequence[str] | None,
     shard: shards.Shard,
     shard_folder: pathlib.Path,
+    *,
     resumed: StoredRun | None,
 ) -> None:
     """Train a shard in its own folder, or continue it if it is stored there."""

@@ -1,16 +1,17 @@
 """Algorithm 1 of the paper: `init`, `iterate`, and `make_train`, their composition.
 
 Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or over
-any leaf of `Hyperparameters`, shard it over devices, call it from other JAX code.
+any hyperparameter, shard it over devices, call it from other JAX code.
 """
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs import wrappers
+from gasil_envs import own_code, wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     checks,
@@ -18,19 +19,16 @@ from gasil_jax import (
     learner,
     normalization,
     ppo,
-    reward_decomposition,
-    reward_normalization,
     rollout,
     schedules,
 )
-from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
-from gasil_jax.imitation import find_agent
-from gasil_jax.imitation.interface import Context, Imitation, checked
+from gasil_jax.algorithms import Algorithm, check_numbers
+from gasil_jax.config import Config
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.imitation.interface import Checked
 from gasil_jax.networks import Policy, Value
 from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
-
-Metrics = dict[str, jax.Array]
 
 
 class TrainState(struct.PyTreeNode):
@@ -39,119 +37,132 @@ class TrainState(struct.PyTreeNode):
     Attributes:
       actor_critic: the policy and value networks, with their optimizers' states.
       normalizer: running mean and variance of observations.
-      reward_decomposition: the network that decomposes rewards, and its state; None if
-        rewards are not decomposed.
-      reward_normalizer: running scale of rewards; None if they are not normalized.
       environments: the running episodes, (env, ...).
-      history: the last steps of each environment, (env, steps, ...).
-      good_trajectories: the good-trajectory buffer, B in the paper.
-      imitation: the state of the agent's `Imitation`, such as its discriminator.
-      hyperparameters: the run's hyperparameters, float32 () each, before schedules.
+      history: the last steps of each environment, (env, steps, ...); None if neither
+        the agent nor a model of rewards needs them.
+      rewards: the state of each model of rewards.
+      agent: the state of the agent, such as its discriminator and its good-trajectory
+        buffer.
+      hyperparameters: the run's own numbers by name, float32 () each, before schedules.
       key: random key of the next iteration.
       iteration: int32 (), number of iterations done.
     """
 
     actor_critic: ActorCritic
     normalizer: normalization.Normalizer
-    reward_decomposition: reward_decomposition.Decomposition | None
-    reward_normalizer: reward_normalization.RewardNormalizer | None
     environments: rollout.EnvironmentStates
-    history: good_trajectories.History
-    good_trajectories: good_trajectories.GoodTrajectories
-    imitation: Any
-    hyperparameters: Hyperparameters
+    history: good_trajectories.History | None
+    rewards: tuple[Any, ...]
+    agent: Any
+    hyperparameters: dict[str, jax.Array]
     key: jax.Array
     iteration: jax.Array
 
 
-def max_episode_steps(env: Any, config: Config) -> int:
-    """Return the number of steps after which an episode is truncated."""
-    return config.max_episode_steps or int(getattr(env, "episode_length", 1000))
+def max_episode_steps(env: Any) -> int:
+    """Return the environment's limit, after which an episode is truncated, or 1000."""
+    return int(getattr(env, "episode_length", 1000))
 
 
 @full_precision
 def init(
     env: Any,
-    config: Config,
+    algorithm: Algorithm,
     key: jax.Array,
-    hyperparameters: Hyperparameters | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
 ) -> TrainState:
     """Return the training state before the first iteration.
 
     Args:
       env: one environment with Brax's interface, not wrapped to reset itself.
-      config: the agent and all sizes.
+      algorithm: how to learn.
       key: random key; consumed.
-      hyperparameters: scalars, which may be traced; default the config's.
+      hyperparameters: numbers by name, which may be traced; the algorithm has the
+        others.
 
     Raises:
-      ValueError: if the config can't train in the environment, if the key is no single
-        random key, or if a hyperparameter is out of its range and not traced.
+      ValueError: if the algorithm can't train in the environment, if the key is no
+        single random key, or if a number is out of its range and not traced.
     """
-    checks.check(env, config)
+    checks.check(env, algorithm)
     checks.check_key(key)
-    if hyperparameters is None:
-        hyperparameters = config.hyperparameters
-    validate_hyperparameters(config, hyperparameters)
-    # `Config` converts them to the class that the agent declares.
-    hyperparameters = config.replace(hyperparameters=hyperparameters).hyperparameters
-    hyperparameters = jax.tree.map(
-        lambda x: jnp.asarray(x, jnp.float32), hyperparameters
+    own = {} if hyperparameters is None else hyperparameters
+    check_numbers(algorithm, own)
+    numbers = {
+        name: jnp.asarray(value, jnp.float32)
+        for name, value in {**algorithm.hyperparameters, **own}.items()
+    }
+    key, policy_key, value_key, env_key, agent_key, rewards_key = jax.random.split(
+        key, 6
     )
-    key, policy_key, value_key, env_key, imitation_key, decomposition_key = (
-        jax.random.split(key, 6)
-    )
-    sizes = (env.observation_size, env.action_size)
-    history = _init_history(env, config)
+    config = algorithm.config
     return TrainState(
         actor_critic=_init_actor_critic(
-            env, config, hyperparameters, policy_key, value_key
+            env,
+            algorithm,
+            numbers["initial_deviation"],
+            policy_key=policy_key,
+            value_key=value_key,
         ),
         normalizer=normalization.init(env.observation_size),
-        reward_decomposition=(
-            reward_decomposition.init(
-                decomposition_key, config, history, env.action_size
-            )
-            if config.decompose_rewards
-            else None
-        ),
-        reward_normalizer=(
-            reward_normalization.init(config.num_envs)
-            if config.normalize_rewards
-            else None
-        ),
         environments=rollout.init(
             env,
             env_key,
             config.num_envs,
-            age_limit=(
-                max_episode_steps(env, config) if config.stagger_episodes else None
-            ),
+            age_limit=max_episode_steps(env) if config.stagger_episodes else None,
         ),
-        history=history,
-        # The config's buffer_steps is the size of the arrays. That of this run, which
-        # may be traced, limits how many steps are filled.
-        good_trajectories=good_trajectories.init(
-            int(config.hyperparameters.buffer_steps), *sizes
-        ),
-        imitation=find_agent(config.agent).init(imitation_key, config, *sizes),
-        hyperparameters=hyperparameters,
+        **_init_memory(env, algorithm, agent_key, rewards_key=rewards_key),
+        hyperparameters=numbers,
         key=key,
         iteration=jnp.int32(0),
     )
 
 
-def _init_history(env: Any, config: Config) -> good_trajectories.History:
+def _init_memory(
+    env: Any, algorithm: Algorithm, agent_key: jax.Array, *, rewards_key: jax.Array
+) -> dict[str, Any]:
+    """Return the history and the states of the agent and of the models of rewards."""
+    history = _init_history(env, algorithm)
+    sizes = Sizes(
+        algorithm.config.num_envs,
+        env.observation_size,
+        env.action_size,
+        history_steps=0 if history is None else history.reward.shape[1],
+    )
+    models = algorithm.rewards
+    keys = _keys(rewards_key, len(models))
+    return {
+        "history": history,
+        "rewards": tuple(
+            model.init(key, sizes) for model, key in zip(models, keys, strict=True)
+        ),
+        "agent": algorithm.agent.init(agent_key, sizes),
+    }
+
+
+def _keys(key: jax.Array, count: int) -> list[jax.Array]:
+    """Return a key for each of several parts; the first one is the key itself.
+
+    So what the first part draws does not depend on how many there are. `clone` allows
+    this second use where JAX checks that keys are not reused.
+    """
+    return [key, *jax.random.split(jax.random.clone(key), max(count, 1))[1:]][:count]
+
+
+def _init_history(env: Any, algorithm: Algorithm) -> good_trajectories.History | None:
+    """Return an empty history, as long as the longest that a part asks for."""
+    agent, models, config = algorithm.agent, algorithm.rewards, algorithm.config
+    episodes = [agent.history_episodes, *(model.history_episodes for model in models)]
+    if max(episodes) == 0:
+        return None
     return good_trajectories.init_history(
         config.num_envs,
         config.num_steps,
-        max_episode_steps(env, config),
-        env.observation_size,
-        env.action_size,
-        keep_next=config.decompose_rewards,
-        num_episodes=(
-            config.decomposition_history_episodes if config.decompose_rewards else 1
-        ),
+        max_episode_steps(env),
+        observation_size=env.observation_size,
+        action_size=env.action_size,
+        keep_next=any(model.keeps_next_observation for model in models),
+        num_episodes=max(episodes),
     )
 
 
@@ -162,63 +173,61 @@ def _networks(env: Any, config: Config) -> tuple[Any, Any]:
 
 def _init_actor_critic(
     env: Any,
-    config: Config,
-    hyperparameters: Hyperparameters,
+    algorithm: Algorithm,
+    initial_deviation: jax.Array,
+    *,
     policy_key: jax.Array,
     value_key: jax.Array,
 ) -> ActorCritic:
-    policy, value = _networks(env, config)
+    policy, value = _networks(env, algorithm.config)
     observation = jnp.zeros(env.observation_size)
-    transform = ppo.optimizer(hyperparameters)
-    num_streams = find_agent(config.agent).num_streams
-    # The first value network uses the key itself, so that all agents initialize it
-    # alike. `clone` allows this second use where JAX checks that keys are not reused.
-    others = jax.random.split(jax.random.clone(value_key), num_streams)[1:]
-    value_keys = [value_key, *others]
+    transform = ppo.optimizer(algorithm.config)
     policy_params = policy.init(policy_key, observation)
-    policy_params["params"]["log_std"] += jnp.log(hyperparameters.initial_deviation)
+    policy_params["params"]["log_std"] += jnp.log(initial_deviation)
     return ActorCritic(
         policy=learner.init(policy_params, transform),
         values=tuple(
-            learner.init(value.init(key, observation), transform) for key in value_keys
+            learner.init(value.init(key, observation), transform)
+            for key in _keys(value_key, algorithm.agent.num_streams)
         ),
     )
 
 
-def _check_state(env: Any, config: Config, state: TrainState) -> None:
+def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
     """Raise `ValueError` where arrays would be broadcast, or steps lost, unnoticed."""
     if shape := jnp.shape(state.iteration):
         raise ValueError(
             f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
         )
-    validate_hyperparameters(config, state.hyperparameters)
-    given = state.history.reward.shape
-    needed = jax.eval_shape(lambda: _init_history(env, config)).reward.shape
-    if given != needed:
+    check_numbers(algorithm, state.hyperparameters)
+    key = jax.random.key(0)
+    needed = jax.eval_shape(lambda: _init_memory(env, algorithm, key, rewards_key=key))
+    needed["hyperparameters"] = dict.fromkeys(
+        algorithm.hyperparameters, state.iteration
+    )
+    needed["num_envs"] = jax.ShapeDtypeStruct((algorithm.config.num_envs,), jnp.int32)
+    given = {name: getattr(state, name) for name in ("history", "rewards", "agent")}
+    given["hyperparameters"] = dict.fromkeys(state.hyperparameters, state.iteration)
+    given["num_envs"] = state.environments.episode_length
+    if change := own_code.first_change(needed, given):
+        path, expected, actual = change
+        part, rest = path.removeprefix("['").split("']", 1)
         raise ValueError(
-            f"state has a history of {given[1]} steps of {given[0]} environments: this "
-            f"config needs {needed[1]} steps of {needed[0]}: make a new state with init"
+            f"state.{part}{rest} is {actual}: this algorithm needs {expected}: make a "
+            "new state with init"
         )
-    parts = {
-        "decompose_rewards": state.reward_decomposition,
-        "normalize_rewards": state.reward_normalizer,
-    }
-    for name, part in parts.items():
-        if getattr(config, name) != (part is not None):
-            raise ValueError(
-                f"{name} is {getattr(config, name)}, but the state was made with "
-                f"{part is not None}: make a new state with init"
-            )
 
 
 @full_precision
-def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Metrics]:
+def iterate(
+    env: Any, algorithm: Algorithm, state: TrainState
+) -> tuple[TrainState, Metrics]:
     """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
     Args:
       env: the environment that `init` was given.
-      config: the config that `init` was given. Of its `hyperparameters` only the counts
-        matter, as upper limits: the state has its own, which may be replaced.
+      algorithm: the algorithm that `init` was given. Its numbers do not matter: the
+        state has its own, which may be replaced.
       state: the state before the iteration.
 
     Returns:
@@ -227,64 +236,130 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
 
     Raises:
       ValueError: if the state is a batch of states, has a hyperparameter that is not
-        allowed, or is of a config with other sizes or rewards; if an agent's metric has
-        a name that another metric has; or if one of the agent's functions returns too
-        few or too many values, or a wrong shape or dtype.
+        allowed, or is of an algorithm with other sizes or rewards; if an agent's metric
+        has a name that another metric has; or if one of the agent's functions returns
+        too few or too many values, or a wrong shape or dtype.
     """
-    _check_state(env, config, state)
-    agent = checked(find_agent(config.agent), config.agent)
-    hyperparameters = schedules.at(config, state.hyperparameters, state.iteration)
-    key, act_key, imitate_key, ppo_key, policy_key, decompose_key = jax.random.split(
-        state.key, 6
-    )
-    # Sample policy trajectories.
-    environments, batch = sample_trajectories(
-        env, config, state, act_key, hyperparameters
-    )
-    # Update the good-trajectory buffer.
-    history, buffer = update_good_trajectories(config, state, batch, hyperparameters)
-    # The buffer ranks episodes by the environment's own rewards. PPO and the agent
-    # learn from rewards that may be decomposed and normalized.
-    rewards, reward_metrics = learner_rewards(
-        env,
-        config,
-        state,
-        batch=batch,
+    _check_state(env, algorithm, state)
+    algorithm = schedules.at(algorithm, state.hyperparameters, state.iteration)
+    keys = Keys(*jax.random.split(state.key, 6))
+    experience = collect(env, algorithm, state, keys)
+    return learn(algorithm, state, experience, keys)
+
+
+class Keys(NamedTuple):
+    """The random keys of an iteration; each is consumed once."""
+
+    state: jax.Array
+    act: jax.Array
+    agent: jax.Array
+    ppo: jax.Array
+    policy: jax.Array
+    rewards: jax.Array
+
+
+class Experience(NamedTuple):
+    """What is known of a batch before the agent and the policy learn from it.
+
+    Attributes:
+      batch: the batch, (time, env, ...), with the environment's own rewards.
+      context: the data that the agent gets.
+      environments: the running episodes after the batch.
+      history: the history after the batch, with the environment's own rewards.
+      rewards: the states of the models of rewards after the batch.
+      healthy: bool (), false if a model's update was not finite and was undone.
+      metrics: metrics of the models of rewards.
+    """
+
+    batch: Rollout
+    context: Context
+    environments: rollout.EnvironmentStates
+    history: good_trajectories.History | None
+    rewards: tuple[Any, ...]
+    healthy: jax.Array
+    metrics: Metrics
+
+
+def collect(
+    env: Any, algorithm: Algorithm, state: TrainState, keys: Keys
+) -> Experience:
+    """Sample policy trajectories, and make the rewards to learn from.
+
+    Args:
+      env: one environment.
+      algorithm: with its numbers in this iteration.
+      state: the state before the iteration.
+      keys: the iteration's keys, of which `act` and `rewards` are consumed.
+    """
+    config = algorithm.config
+    environments, batch = sample_trajectories(env, config, state, key=keys.act)
+    history = None if state.history is None else _record(state.history, batch)
+    policy, value = _networks(env, config)
+    context = Context(
+        rollout=batch,
         history=history,
-        key=decompose_key,
-        hyperparameters=hyperparameters,
+        normalizer=state.normalizer,
+        reward_scale=jnp.float32(1.0),
+        action_range=wrappers.action_range(env),
+        config=config,
+        policy=policy.apply,
+        value=value.apply,
     )
-    context = make_context(
-        env,
-        config,
-        state,
-        rewards=rewards,
-        buffer=buffer,
-        hyperparameters=hyperparameters,
+    metrics: Metrics = {}
+    states, healthy = [], jnp.bool_(True)
+    model_keys = _keys(keys.rewards, len(algorithm.rewards))
+    with jax.named_scope("rewards"):
+        for model, before, key in zip(algorithm.rewards, state.rewards, model_keys):
+            after, context, is_sound, own = model.update(before, context, key)
+            states.append(after)
+            healthy &= is_sound
+            metrics = merge_metrics(type(model).__name__, metrics, own)
+    return Experience(
+        batch, context, environments, history, tuple(states), healthy, metrics
     )
+
+
+def learn(
+    algorithm: Algorithm, state: TrainState, experience: Experience, keys: Keys
+) -> tuple[TrainState, Metrics]:
+    """Update the agent and the policy from a batch.
+
+    Args:
+      algorithm: with its numbers in this iteration.
+      state: the state before the iteration.
+      experience: the batch, from `collect`.
+      keys: the iteration's keys, of which those that `collect` leaves are consumed.
+
+    Returns:
+      The next state, and metrics.
+    """
+    agent, config = Checked(algorithm.agent), algorithm.config
+    batch, context = experience.batch, experience.context
+    # Update the good-trajectory buffer, which ranks episodes by the environment's own
+    # rewards.
+    remembered = agent.remember(state.agent, context)
     # Sample good trajectories, update the discriminator (equation 8) and shape the
     # reward with it (section 4.3); agents without a discriminator do other things here.
-    imitation, streams, imitation_metrics = agent.update_and_reward(
-        state.imitation, context, imitate_key
+    agent_state, streams, agent_metrics = agent.update_and_reward(
+        remembered, context, keys.agent
     )
     # Update the policy (equations 9 and 11).
-    actor_critic, imitation, policy_metrics = update_policy(
+    actor_critic, agent_state, policy_metrics = update_policy(
         agent,
         state.actor_critic,
-        imitation,
+        agent_state,
         rewards=streams,
         context=context,
-        keys=(ppo_key, policy_key),
+        keys=(keys.ppo, keys.policy),
     )
-    healthy, (actor_critic, imitation) = learner.keep_if_finite(
-        (actor_critic, imitation), (state.actor_critic, state.imitation)
+    healthy, (actor_critic, agent_state) = learner.keep_if_finite(
+        (actor_critic, agent_state), (state.actor_critic, remembered)
     )
     metrics: Metrics = {
         "env_steps": (state.iteration + 1).astype(jnp.float32) * config.batch_steps,
-        "learning_rate": jnp.asarray(hyperparameters.learning_rate),
-        "skipped_updates": ~(healthy & rewards.healthy),
-        **rollout_metrics(batch, buffer),
-        **reward_metrics,
+        "learning_rate": jnp.asarray(config.learning_rate),
+        "skipped_updates": ~(healthy & experience.healthy),
+        **rollout_metrics(batch),
     }
     state = state.replace(
         actor_critic=actor_critic,
@@ -295,36 +370,33 @@ def iterate(env: Any, config: Config, state: TrainState) -> tuple[TrainState, Me
             # Observations with a NaN are ignored.
             jnp.where(batch.faulty[..., None], jnp.nan, batch.observation),
         ),
-        reward_decomposition=rewards.decomposition,
-        reward_normalizer=rewards.normalizer,
-        environments=environments,
-        history=history,
-        good_trajectories=buffer,
-        imitation=imitation,
-        key=key,
+        environments=experience.environments,
+        history=experience.history,
+        rewards=experience.rewards,
+        agent=agent_state,
+        key=keys.state,
         iteration=state.iteration + 1,
     )
     return state, merge_metrics(
-        config.agent, metrics, imitation_metrics, policy_metrics
+        algorithm.agent.name,
+        metrics,
+        experience.metrics,
+        agent_metrics,
+        policy_metrics,
     )
 
 
 @jax.named_scope("rollout")
 def sample_trajectories(
-    env: Any,
-    config: Config,
-    state: TrainState,
-    key: jax.Array,
-    hyperparameters: Hyperparameters,
+    env: Any, config: Config, state: TrainState, *, key: jax.Array
 ) -> tuple[rollout.EnvironmentStates, Rollout]:
     """Collect one batch of experience with the current policy.
 
     Args:
       env: one environment.
-      config: sizes of the batch.
+      config: sizes of the batch, and the discount in this iteration.
       state: with the policy and the running episodes.
       key: random key; consumed.
-      hyperparameters: their values in this iteration.
 
     Returns:
       The running episodes after the batch, and the batch, (time, env, ...).
@@ -339,157 +411,25 @@ def sample_trajectories(
         state.environments,
         key,
         num_steps=config.num_steps,
-        max_episode_steps=max_episode_steps(env, config),
-        gamma=hyperparameters.gamma if config.buffer_discounts else 1.0,
+        max_episode_steps=max_episode_steps(env),
+        gamma=config.gamma,
     )
 
 
 @jax.named_scope("good_trajectories")
-def update_good_trajectories(
-    config: Config, state: TrainState, batch: Rollout, hyperparameters: Hyperparameters
-) -> tuple[good_trajectories.History, good_trajectories.GoodTrajectories]:
-    """Insert the whole episodes that ended in a batch into the buffer.
-
-    Args:
-      config: its `buffer_episodes` limits the buffer.
-      state: with the history and the buffer before the batch.
-      batch: the batch, with the environment's own rewards.
-      hyperparameters: its `buffer_steps` limits the buffer.
-
-    Returns:
-      The history with the batch recorded in it, and the buffer after the batch.
-    """
-    history = good_trajectories.record(
-        state.history,
+def _record(
+    history: good_trajectories.History, batch: Rollout
+) -> good_trajectories.History:
+    """Return the history with a batch recorded in it."""
+    return good_trajectories.record(
+        history,
         batch.observation,
         batch.action,
         # A NaN marks an episode without a valid return: one with a faulty step, or one
         # that was cut short.
-        jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
-        batch.ended,
-        batch.next_observation,
-    )
-    episodes = good_trajectories.ended_episodes(
-        history, batch.ended, batch.discounted_return, batch.episode_length
-    )
-    return history, good_trajectories.insert(
-        state.good_trajectories,
-        history,
-        episodes,
-        max_steps=hyperparameters.buffer_steps,
-        max_episodes=config.buffer_episodes,
-    )
-
-
-class Rewards(NamedTuple):
-    """The rewards that PPO and the agent learn from, and the state of their models.
-
-    Attributes:
-      batch: the batch with these rewards, (time, env, ...).
-      history: the history with these rewards, but not normalized.
-      scale: float32 (), the number that the batch's rewards were divided by.
-      decomposition: its state after the batch; None if rewards are not decomposed.
-      normalizer: its state after the batch; None if rewards are not normalized.
-      healthy: bool (), false if the update of the decomposition was not finite and was
-        undone.
-    """
-
-    batch: Rollout
-    history: good_trajectories.History
-    scale: jax.Array
-    decomposition: reward_decomposition.Decomposition | None
-    normalizer: reward_normalization.RewardNormalizer | None
-    healthy: jax.Array
-
-
-@jax.named_scope("rewards")
-def learner_rewards(
-    env: Any,
-    config: Config,
-    state: TrainState,
-    *,
-    batch: Rollout,
-    history: good_trajectories.History,
-    key: jax.Array,
-    hyperparameters: Hyperparameters,
-) -> tuple[Rewards, Metrics]:
-    """Decompose and normalize a batch's rewards, each if the config says so.
-
-    Args:
-      env: the environment, for its range of actions.
-      config: the config.
-      state: the state before the batch.
-      batch: the batch, with the environment's own rewards.
-      history: the history, with the batch recorded in it.
-      key: random key; consumed.
-      hyperparameters: their values in this iteration.
-
-    Returns:
-      The rewards, and metrics.
-    """
-    decomposition, healthy = None, jnp.bool_(True)
-    metrics: Metrics = {}
-    if state.reward_decomposition is not None:
-        decomposition, batch, healthy, metrics = reward_decomposition.decompose(
-            state.reward_decomposition,
-            batch,
-            history,
-            state.normalizer,
-            key,
-            config=config,
-            hyperparameters=hyperparameters,
-            action_range=wrappers.action_range(env),
-        )
-        # The NaNs that mark episodes without a valid return must stay.
-        no_return = jnp.isnan(history.reward)
-        history = history.replace(
-            reward=jnp.where(no_return, jnp.nan, decomposition.reward)
-        )
-    normalizer, scale = None, jnp.float32(1.0)
-    if state.reward_normalizer is not None:
-        normalizer = reward_normalization.update(
-            state.reward_normalizer, batch.reward, batch.ended, hyperparameters.gamma
-        )
-        clip = hyperparameters.reward_clip
-        scale = reward_normalization.scale(normalizer)
-        clipped = reward_normalization.clipped(normalizer, batch.reward, clip)
-        reward = reward_normalization.normalize(normalizer, batch.reward, clip)
-        batch = batch.replace(reward=reward)
-        metrics = {**metrics, "reward_scale": scale, "clipped_rewards": clipped}
-    rewards = Rewards(batch, history, scale, decomposition, normalizer, healthy)
-    return rewards, metrics
-
-
-def make_context(
-    env: Any,
-    config: Config,
-    state: TrainState,
-    *,
-    rewards: Rewards,
-    buffer: good_trajectories.GoodTrajectories,
-    hyperparameters: Hyperparameters,
-) -> Context:
-    """Return the data of an iteration that the agent's functions get.
-
-    Args:
-      env: the environment, for the sizes of the networks.
-      config: the config.
-      state: the state before the iteration.
-      rewards: the batch and the history with the rewards to learn from.
-      buffer: the buffer after the batch.
-      hyperparameters: their values in this iteration.
-    """
-    policy, value = _networks(env, config)
-    return Context(
-        rollout=rewards.batch,
-        history=rewards.history,
-        good_trajectories=buffer,
-        normalizer=state.normalizer,
-        reward_scale=rewards.scale,
-        hyperparameters=hyperparameters,
-        config=config,
-        policy=policy.apply,
-        value=value.apply,
+        reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
+        ended=batch.ended,
+        next_observation=batch.next_observation,
     )
 
 
@@ -499,8 +439,8 @@ def advantages(
     rewards: jax.Array,
     context: Context,
     *,
-    agent: Imitation,
-    imitation: Any,
+    agent: Checked,
+    agent_state: Any,
 ) -> tuple[ppo.Batch, Metrics]:
     """Return PPO's batch, with one advantage mixed from those of all reward streams.
 
@@ -509,7 +449,7 @@ def advantages(
       rewards: float32 (time, env) for one stream, or (time, env, stream).
       context: the iteration's data.
       agent: its `mix` combines the streams' standardized advantages.
-      imitation: the agent's state.
+      agent_state: the agent's state.
 
     Returns:
       The batch, (steps, ...), and metrics: those of `mix`, and "explained_variance",
@@ -523,14 +463,16 @@ def advantages(
         actor_critic,
         rewards,
         observation,
-        normalization.normalize(context.normalizer, batch.next_observation),
-        batch.terminated,
-        batch.ended,
+        next_observation=normalization.normalize(
+            context.normalizer, batch.next_observation
+        ),
+        terminated=batch.terminated,
+        ended=batch.ended,
         value=context.value,
-        hyperparameters=context.hyperparameters,
+        config=context.config,
     )
     returns = advantage + values
-    mixed, metrics = agent.mix(imitation, ppo.standardize(advantage), context)
+    mixed, metrics = agent.mix(agent_state, ppo.standardize(advantage), context)
     flat = lambda x: x.reshape(-1, *x.shape[2:])
     residual = jnp.var(returns - values, axis=(0, 1))
     explained = 1.0 - residual / (jnp.var(returns, axis=(0, 1)) + 1e-8)
@@ -540,16 +482,14 @@ def advantages(
         log_prob=flat(batch.log_prob),
         advantage=flat(mixed),
         returns=flat(returns),
-    ), merge_metrics(
-        context.config.agent, {"explained_variance": jnp.mean(explained)}, metrics
-    )
+    ), merge_metrics(agent.name, {"explained_variance": jnp.mean(explained)}, metrics)
 
 
 @jax.named_scope("update_policy")
 def update_policy(
-    agent: Imitation,
+    agent: Checked,
     actor_critic: ActorCritic,
-    imitation: Any,
+    agent_state: Any,
     *,
     rewards: jax.Array,
     context: Context,
@@ -560,7 +500,7 @@ def update_policy(
     Args:
       agent: the agent.
       actor_critic: the networks before the update.
-      imitation: the agent's state.
+      agent_state: the agent's state.
       rewards: float32 (time, env) for one stream, or (time, env, stream).
       context: the iteration's data.
       keys: random keys of PPO and of the agent's steps; both are consumed.
@@ -570,7 +510,7 @@ def update_policy(
     """
     ppo_key, own_key = keys
     batch, advantage_metrics = advantages(
-        actor_critic, rewards, context, agent=agent, imitation=imitation
+        actor_critic, rewards, context, agent=agent, agent_state=agent_state
     )
     actor_critic, ppo_metrics = ppo.update(
         actor_critic,
@@ -579,27 +519,18 @@ def update_policy(
         policy=context.policy,
         value=context.value,
         config=context.config,
-        hyperparameters=context.hyperparameters,
     )
-    imitation, actor_critic, own_metrics = agent.update_policy(
-        imitation, actor_critic, context, own_key
+    agent_state, actor_critic, own_metrics = agent.update_policy(
+        agent_state, actor_critic, context, own_key
     )
-    metrics = merge_metrics(
-        context.config.agent, ppo_metrics, advantage_metrics, own_metrics
-    )
-    return actor_critic, imitation, metrics
+    metrics = merge_metrics(agent.name, ppo_metrics, advantage_metrics, own_metrics)
+    return actor_critic, agent_state, metrics
 
 
-def rollout_metrics(
-    batch: Rollout, buffer: good_trajectories.GoodTrajectories
-) -> Metrics:
-    """Return the metrics of a batch and of the buffer after it.
+def rollout_metrics(batch: Rollout) -> Metrics:
+    """Return the metrics of a batch, (time, env, ...).
 
     Means over the whole episodes that ended in the batch are NaN if none did.
-
-    Args:
-      batch: the batch, (time, env, ...).
-      buffer: the buffer after the batch.
     """
     completed = batch.completed
     mean = lambda x: jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
@@ -608,8 +539,6 @@ def rollout_metrics(
         "episode_length": mean(batch.episode_length),
         "episodes": jnp.sum(completed),
         "faulty_steps": jnp.sum(batch.faulty),
-        "good_return": good_trajectories.mean_return(buffer),
-        "good_steps": buffer.size,
     }
 
 
@@ -639,37 +568,37 @@ class Train(Protocol):
     """The type of the function that `make_train` returns."""
 
     def __call__(
-        self, key: jax.Array, hyperparameters: Hyperparameters | None = None
+        self, key: jax.Array, hyperparameters: Mapping[str, Any] | None = None
     ) -> tuple[TrainState, Metrics]:
         """Return the last state, and metrics (iterations,); consumes the key."""
 
 
-def make_train(env: Any, config: Config) -> Train:
-    """Return a pure function that trains from scratch for `config.total_steps`.
+def make_train(env: Any, algorithm: Algorithm) -> Train:
+    """Return a pure function that trains from scratch for `total_steps`.
 
     Args:
       env: one environment with Brax's interface (`gasil_jax.make_env`, or any of
         ``brax.envs``), not wrapped to reset itself.
-      config: the agent and its settings.
+      algorithm: how to learn: an agent, models of rewards, and the config.
 
     Returns:
       ``train(key, hyperparameters=None) -> (TrainState, Metrics)``. The key is
-      consumed; the default hyperparameters are the config's; metrics are float32
-      (iterations,) each.
+      consumed; hyperparameters are numbers by name, such as ``{"alpha": 0.2}``, and the
+      algorithm has the others; metrics are float32 (iterations,) each.
 
     Raises:
-      ValueError: if the config can't train in the environment; nothing is compiled.
+      ValueError: if the algorithm can't train in the environment; nothing is compiled.
     """
     checks.check_environment(env)
-    checks.check(env, config)
+    checks.check(env, algorithm)
 
     def train(
-        key: jax.Array, hyperparameters: Hyperparameters | None = None
+        key: jax.Array, hyperparameters: Mapping[str, Any] | None = None
     ) -> tuple[TrainState, Metrics]:
         return jax.lax.scan(
-            lambda state, _: iterate(env, config, state),
-            init(env, config, key, hyperparameters),
-            length=config.num_iterations,
+            lambda state, _: iterate(env, algorithm, state),
+            init(env, algorithm, key, hyperparameters),
+            length=algorithm.config.num_iterations,
         )
 
     return train

@@ -140,15 +140,18 @@ def untrained_hopper(tmp_path_factory):
     from gasil_jax.host.environments import Settings
 
     out = tmp_path_factory.mktemp("hopper") / "run"
-    config = gasil_jax.Config(
+    algorithm = gasil_jax.algorithm(
         num_envs=1, batch_steps=64, hidden_sizes=(8,), discriminator_hidden_sizes=(8,)
     )
-    settings = Settings(physics="mujoco")
-    options = run_options.Options(env="hopper", settings=settings, config=config)
+    options = run_options.Options(
+        env="hopper",
+        settings=Settings(physics="mujoco"),
+        **run_options.algorithm_options(algorithm),
+    )
     out.mkdir()
     run_options.write_config(options, out)
     env = run_options.make_env(options)
-    init = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
     states = jax.jit(init)(np.arange(1, dtype=np.uint32))
     checkpoint.write(out / "checkpoints", 0, states, {"score": None})
     return out
@@ -156,21 +159,21 @@ def untrained_hopper(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def trained_point_mass():
-    """The environment, configuration and states (3,) after a little training."""
+    """The environment, algorithm and states (3,) after a little training."""
     import jax
     import numpy as np
 
     import gasil_jax
 
     env = gasil_jax.make_env("point_mass", reward_delay=7)
-    config = gasil_jax.Config(
-        agent="ppo+gasil",
+    algorithm = gasil_jax.algorithm(
+        "ppo+gasil",
         total_steps=1024,
         num_envs=4,
         batch_steps=512,
         hidden_sizes=(16, 8),
         num_epochs=1,
     )
-    train = gasil_jax.make_train(env, config)
+    train = gasil_jax.make_train(env, algorithm)
     keys = jax.vmap(jax.random.key)(np.arange(3))
-    return env, config, jax.jit(jax.vmap(train))(keys)[0]
+    return env, algorithm, jax.jit(jax.vmap(train))(keys)[0]

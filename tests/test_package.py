@@ -45,8 +45,8 @@ def test_the_commands_are_listed(capsys):
     assert "'foo' is unknown (without an argument" in capsys.readouterr().err
 
 
-def test_a_config_can_be_made_before_anything_else():
-    make = "import gasil_jax; gasil_jax.Config(agent='ppo+gasil').replace(num_envs=8)"
+def test_an_algorithm_can_be_made_before_anything_else():
+    make = "import gasil_jax; gasil_jax.algorithm('ppo+gasil').replace(num_envs=8)"
     subprocess.run([sys.executable, "-c", make], check=True)
 
 

@@ -30,7 +30,6 @@ PROGRAMS = {
 SMALL = (
     *("--total-steps", "256", "--batch-steps", "128", "--num-envs", "2"),
     *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
-    *("--discriminator-hidden-sizes", "8"),
 )
 #: What stands for an option's value when a command is run.
 TOY = {
@@ -150,7 +149,7 @@ def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
     started = calls_of(BASH[0], tmp_path)
     assert all(call[:2] == ["-m", "gasil_jax.run"] for call in started)
     agents = [
-        command_line.parse(run_options.Options, call[2:], "gasil_jax.run").config.agent
+        run_options.parse(run_options.Options, call[2:], "gasil_jax.run").agent
         for call in started
     ]
     assert sorted(agents) == ["ppo", "ppo+bc", "ppo+gasil", "ppo+sil"]
@@ -159,7 +158,7 @@ def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
 def shard_of(call):
     assert call[:2] == ["-m", "gasil_jax.sweep"]
     arguments = call[2:]
-    options = command_line.parse(sweep.Options, arguments, "gasil_jax.sweep")
+    options = run_options.parse(sweep.Options, arguments, "gasil_jax.sweep")
     shard = shards.parse(options.shard)
     return shard.number, shard.count, str(options.out), options.resume
 
@@ -250,10 +249,11 @@ def test_options_in_the_table_exist():
     rows = re.findall(r"^\| (`--.*?) \|", table, re.MULTILINE)
     fields = [field for row in rows for field in re.findall(r"--[a-z-]+", row)]
     assert len(fields) > 18
-    options = command_line.parse(run_options.Options, ["--env", "hopper"], "x")
-    config = options.config
-    parts = (options, options.settings, config, config.hyperparameters)
-    names = {name for part in parts for name in vars(part)}
+    options = run_options.parse(run_options.Options, ["--env", "hopper"], "x")
+    names = {*vars(options), *vars(options.settings)}
+    for agent in gasil_jax.agents():
+        models = {"decompose_rewards": True, "normalize_rewards": True}
+        names |= gasil_jax.algorithm(agent, **models).settings.keys()
     for field in fields:
         assert field[2:].replace("-", "_") in names, field
 
@@ -268,8 +268,8 @@ def test_the_agents_of_the_table_are_all_that_there_are():
 def saved_policies(tmp_path_factory):
     """A file of four policies."""
     env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config(agent="ppo", num_envs=1, batch_steps=64)
-    init = jax.vmap(lambda seed: gasil_jax.init(env, config, jax.random.key(seed)))
+    algorithm = gasil_jax.algorithm("ppo", num_envs=1, batch_steps=64)
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
     states = jax.jit(init)(np.arange(4, dtype=np.uint32))
     path = tmp_path_factory.mktemp("policies") / "policy.npz"
     policy_file.save(path, states, env, range(4), np.zeros(4))
@@ -357,7 +357,7 @@ def test_the_links_of_the_readme_lead_somewhere():
 def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     out, swept = tmp_path / "out", tmp_path / "swept"
     small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
-    both = ["--env", "my_tasks:Line", "--agent", "my_tasks:SCALED", *small.split()]
+    both = ["--env", "my_tasks:Line", "--agent", "my_tasks:Scaled", *small.split()]
     arguments = ["--reward-factor", "0.3", "--first-seed", "5", "--out", str(out)]
     assert run.main([*both, *arguments]) == 0
     metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
@@ -394,21 +394,20 @@ def rows_of(page, heading):
 @pytest.mark.parametrize("agent", gasil_jax.agents())
 def test_the_list_of_metrics_is_complete(agent, tmp_path):
     env = gasil_jax.make_env("point_mass", reward_delay=5)
-    config = gasil_jax.Config(
-        agent=agent,
+    algorithm = gasil_jax.algorithm(
+        agent,
         batch_steps=64,
         num_envs=4,
         normalize_rewards=True,
         decompose_rewards=True,
-        discriminator_gradient_penalty=1.0,
     )
     if agent == "gail":
         observation = np.zeros((9, env.observation_size), np.float32)
         action = np.zeros((9, env.action_size), np.float32)
         np.savez(tmp_path / "expert.npz", observation=observation, action=action)
-        config = config.replace(expert=str(tmp_path / "expert.npz"))
-    first = lambda: gasil_jax.init(env, config, jax.random.key(0))
-    step = lambda: gasil_jax.iterate(env, config, first())[1]
+        algorithm = algorithm.replace(expert=str(tmp_path / "expert.npz"))
+    first = lambda: gasil_jax.init(env, algorithm, jax.random.key(0))
+    step = lambda: gasil_jax.iterate(env, algorithm, first())[1]
     listed = [
         name.strip("`")
         for name, agents, *_ in rows_of("data.md", "Metrics")

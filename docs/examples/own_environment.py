@@ -59,8 +59,8 @@ def main() -> None:
     options = parser.parse_args()
 
     for agent in ("ppo", "ppo+gasil"):
-        config = gasil_jax.Config(agent=agent, total_steps=options.steps)
-        train = gasil_jax.make_train(Pendulum(), config)
+        algorithm = gasil_jax.algorithm(agent, total_steps=options.steps)
+        train = gasil_jax.make_train(Pendulum(), algorithm)
         _, metrics = jax.jit(train)(jax.random.key(0))
         returns = metrics["episode_return"]
         tenth = max(1, len(returns) // 10)

@@ -15,14 +15,13 @@ import numpy as np
 import gasil_jax
 
 
-def sweep(env, config, alphas, num_seeds):
+def sweep(env, algorithm, alphas, num_seeds):
     """Return the metrics, (alpha, seed, iteration) each."""
-    train = gasil_jax.make_train(env, config)
+    train = gasil_jax.make_train(env, algorithm)
     keys = jax.random.split(jax.random.key(0), num_seeds)
 
     def train_seeds(alpha):
-        hyperparameters = config.hyperparameters.replace(alpha=alpha)
-        return jax.vmap(lambda key: train(key, hyperparameters))(keys)
+        return jax.vmap(lambda key: train(key, {"alpha": alpha}))(keys)
 
     _, metrics = jax.jit(jax.vmap(train_seeds))(jnp.asarray(alphas))
     return metrics
@@ -40,12 +39,13 @@ def main() -> None:
 
     delay = options.reward_delay
     env = gasil_jax.make_env(options.env, reward_delay=delay)
-    config = gasil_jax.preset(options.env, "ppo+gasil", reward_delay=delay)
-    config = config.replace(total_steps=options.steps)
+    algorithm = gasil_jax.preset(options.env, "ppo+gasil", reward_delay=delay)
+    algorithm = algorithm.replace(total_steps=options.steps)
     alphas = (0.0, 0.1, 0.3, 1.0)
-    metrics = sweep(env, config, alphas, options.seeds)
+    metrics = sweep(env, algorithm, alphas, options.seeds)
 
     axes = plt.figure(layout="constrained").subplots()
+    config = algorithm.config
     steps = config.batch_steps * np.arange(1, config.num_iterations + 1)
     for alpha, returns in zip(alphas, np.asarray(metrics["episode_return"])):
         # Iterations in which no episode ended have no return.

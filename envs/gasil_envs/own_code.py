@@ -1,7 +1,6 @@
 """Import an object that a user names as MODULE:NAME; report errors in one line."""
 
 import contextlib
-import dis
 import importlib
 import pathlib
 import sysconfig
@@ -45,22 +44,11 @@ def refused(
         yield
     except passing:
         raise
+    except KeyboardInterrupt:
+        raise
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) and not _is_of_a_raise(error):
-            raise
         why = in_a_line(error, *packages)
         raise ValueError(f"{what}: {why}") from None
-
-
-def _is_of_a_raise(error: BaseException) -> bool:
-    """Return whether a `raise` in Python code raised an error, and not a signal."""
-    level = error.__traceback__
-    while level is not None and level.tb_next is not None:
-        level = level.tb_next
-    if level is None:
-        return False
-    code = level.tb_frame.f_code.co_code
-    return code[level.tb_lasti] == dis.opmap["RAISE_VARARGS"]
 
 
 def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:

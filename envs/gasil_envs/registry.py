@@ -36,6 +36,8 @@ class Settings:
       terminal_limits: whether an episode that reaches the step limit counts as
         terminated, without a future value, as in code of the paper's time. Otherwise it
         is truncated, and the value of its last observation is bootstrapped.
+      max_episode_steps: number of steps after which an episode is truncated; None takes
+        the environment's own limit, or 1000 if it has none.
     """
 
     reward_delay: int = 1
@@ -44,6 +46,7 @@ class Settings:
     solver: str = "small"
     integrator: str = "model"
     terminal_limits: bool = False
+    max_episode_steps: int | None = None
 
 
 #: Prefix of the names of environments in ``brax.envs``.
@@ -52,7 +55,7 @@ _EPISODE_LENGTH = 1000
 
 
 def _refuse_unknown(
-    kind: str, name: Any, allowed: Iterable[str], forms: Iterable[str] = ()
+    kind: str, name: Any, allowed: Iterable[str], *, forms: Iterable[str] = ()
 ) -> None:
     """Raise `ValueError` for a name that is not among the allowed ones.
 
@@ -96,7 +99,7 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     if isinstance(name, str) and ":" in name:
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
-    _refuse_unknown("env", name, names(), (f"{BRAX}NAME", "MODULE:NAME"))
+    _refuse_unknown("env", name, names(), forms=(f"{BRAX}NAME", "MODULE:NAME"))
     return lambda settings: _build_ours(name, settings)
 
 
@@ -205,22 +208,19 @@ def prepare(settings: Settings, num_devices: int) -> None:
         native.reserve_threads(num_devices)
 
 
-def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
+def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
       name: one of `names()`; "brax:" and a name in ``brax.envs``; or MODULE:NAME of
         your own class or function that builds an environment with Brax's interface.
-      max_episode_steps: number of steps after which an episode is truncated; default
-        the environment's own limit, or 1000 if it has none.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
-        integrator, terminal_limits.
+        integrator, terminal_limits, max_episode_steps.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
     """
     allowed = [field.name for field in dataclasses.fields(Settings)]
-    allowed.append("max_episode_steps")
     for setting in settings:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
@@ -228,13 +228,13 @@ def make(name: str, *, max_episode_steps: Any = None, **settings: Any) -> Env:
     batching.keep_loops()
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
-    if max_episode_steps is not None:
-        if not _is_whole(max_episode_steps, 1, limit):
+    if chosen.max_episode_steps is not None:
+        if not _is_whole(chosen.max_episode_steps, 1, limit):
             raise ValueError(
-                f"max_episode_steps is {max_episode_steps!r}: it must be a whole "
-                f"number from 1 to {limit}, the environment's own limit"
+                f"max_episode_steps is {chosen.max_episode_steps!r}: it must be a "
+                f"whole number from 1 to {limit}, the environment's own limit"
             )
-        limit = int(max_episode_steps)
+        limit = int(chosen.max_episode_steps)
     env = wrappers.EpisodeLimit(env, limit, terminal=chosen.terminal_limits)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, int(chosen.reward_delay))

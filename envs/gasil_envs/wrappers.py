@@ -28,6 +28,23 @@ def is_sound(x: jax.Array) -> jax.Array:
     return jnp.abs(x) < _LARGEST  # False for NaN.
 
 
+def step_is_sound(observation: jax.Array, stepped: State) -> jax.Array:
+    """Return whether the physics of a step has not failed, bool (...).
+
+    It has if `is_sound` is false for a number in the observation before or after the
+    step, for a reward, given or held back, or for what says that the episode ended.
+
+    Args:
+      observation: (..., obs), before the step.
+      stepped: the state after the step, (...).
+    """
+    sound = is_sound(observation).all(axis=-1) & is_sound(stepped.obs).all(axis=-1)
+    for number in (stepped.reward, stepped.done, *map(stepped.info.get, _OF_STEP)):
+        if number is not None:
+            sound &= is_sound(number)
+    return sound
+
+
 def action_range(env: Any) -> tuple[Any, Any]:
     """Return the lowest and the highest action; Brax's environments have -1 and 1."""
     return getattr(env, "action_range", (-1.0, 1.0))
@@ -179,13 +196,9 @@ class FaultyStepEnds(Wrapper):
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and terminate the episode if the physics fails."""
         stepped = self.env.step(state, action)
-        of_step = ("held_reward", *_LAST_STEP_INFO)
-        sound = is_sound(stepped.obs).all() & is_sound(stepped.reward)
-        sound &= ~state.info["unsound_start"]
-        for name in of_step:
-            sound &= is_sound(stepped.info.get(name, jnp.float32(0)))
+        sound = step_is_sound(state.obs, stepped) & ~state.info["unsound_start"]
         zero = lambda x: jnp.where(sound, x, jnp.zeros_like(x))
-        info = {k: zero(x) if k in of_step else x for k, x in stepped.info.items()}
+        info = {k: zero(x) if k in _OF_STEP else x for k, x in stepped.info.items()}
         info["unsound_start"] = jnp.zeros_like(state.info["unsound_start"])
         return stepped.replace(
             obs=jnp.where(sound, stepped.obs, state.obs),
@@ -233,5 +246,7 @@ class AutoReset(Wrapper):
         )
 
 
+# Numbers in info that belong to a step.
+_OF_STEP = ("truncation", "true_reward", "held_reward")
 # Entries of info about the episode's last step, which a reset must not overwrite.
 _LAST_STEP_INFO = ("truncation", "true_reward")

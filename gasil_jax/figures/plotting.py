@@ -58,8 +58,8 @@ def draw_returns(
     axes: Any,
     env_steps: np.ndarray,
     returns: np.ndarray,
-    evaluations: Mapping[str, np.ndarray] | None,
     *,
+    evaluations: Mapping[str, np.ndarray] | None,
     color: str,
     label: str = "training",
     evaluated: str = "evaluations",
@@ -109,8 +109,8 @@ def learning_curve(
     path: pathlib.Path,
     env_steps: np.ndarray,
     episode_return: np.ndarray,
-    title: str,
     *,
+    title: str,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
     """Save the returns over environment steps as a PNG: all seeds, mean and interval.
@@ -129,7 +129,7 @@ def learning_curve(
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
     axes.plot(steps / 1e6, returns.T, color="0.75", linewidth=0.8)
-    draw_returns(axes, steps, returns, evaluations, color=COLORS[0])
+    draw_returns(axes, steps, returns, evaluations=evaluations, color=COLORS[0])
     if evaluations is not None:
         axes.legend(frameon=False)
     elif not len(steps):
@@ -144,6 +144,7 @@ def final_returns(
     path: pathlib.Path,
     labels: Sequence[str],
     returns: np.ndarray,
+    *,
     best: int | None,
 ) -> None:
     """Save every seed's final return and their mean, in a row for each point.
@@ -177,8 +178,8 @@ def marginals(
     path: pathlib.Path,
     values: Mapping[str, Sequence[Any]],
     returns: np.ndarray,
-    importance: Mapping[str, float | None],
     *,
+    importance: Mapping[str, float | None],
     best: int | None,
     left_out: int,
 ) -> None:
@@ -200,7 +201,7 @@ def marginals(
     figure = Figure(figsize=size, layout="constrained")
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, name in zip(grid.flat, values):
-        _draw_marginal(axes, values[name], returns, best)
+        _draw_marginal(axes, values[name], returns, best=best)
         share = importance[name]
         title = "" if share is None else f"importance {share:.0%}"
         axes.set(xlabel=name.replace("_", " "), title=title)
@@ -226,7 +227,7 @@ def marginals(
 
 
 def _draw_marginal(
-    axes: Any, values: Sequence[Any], returns: np.ndarray, best: int | None
+    axes: Any, values: Sequence[Any], returns: np.ndarray, *, best: int | None
 ) -> None:
     """Draw the points' returns over one hyperparameter, and the means of its groups."""
     parts = groups(values)

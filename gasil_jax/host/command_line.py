@@ -108,6 +108,8 @@ def parse(
     arguments: Sequence[str] | None,
     program: str,
     default: T | None = None,
+    *,
+    why_not: Callable[[str], str] | None = None,
 ) -> T:
     """Return the options of a command line.
 
@@ -116,13 +118,14 @@ def parse(
       arguments: the command line; default that of this process.
       program: name of the module that was started.
       default: the values of options that are not given; default the dataclass's own.
+      why_not: returns why there is no option of a name, for an error message.
 
     Raises:
       HelpShown: with --help, once the help is printed.
       InputError: if tyro rejects the command line; the message is one line.
     """
     given = sys.argv[1:] if arguments is None else arguments
-    _check_flags(dict(_flags(options, default)), given)
+    _check_flags(dict(_flags(options, default)), given, why_not)
     printed = io.StringIO()
     try:
         with contextlib.redirect_stderr(printed), _REGISTRY:
@@ -139,12 +142,17 @@ def parse(
         raise InputError(_in_one_line(printed.getvalue())) from None
 
 
-def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
+def _check_flags(
+    kinds: Mapping[str, Any],
+    arguments: Sequence[str],
+    why_not: Callable[[str], str] | None,
+) -> None:
     """Check for mistakes that tyro accepts or reports with an unclear message.
 
     Args:
       kinds: the types of all options, by name.
       arguments: the command line.
+      why_not: see `parse`.
 
     Raises:
       InputError: if an option is unknown, is an on/off option with a value, or is a
@@ -158,6 +166,9 @@ def _check_flags(kinds: Mapping[str, Any], arguments: Sequence[str]) -> None:
         name = flag.removeprefix("--").replace("-", "_")
         if name not in ("help", "", *kinds) and name.removeprefix("no_") not in kinds:
             flags = [f"--{x.replace('_', '-')}" for x in kinds]
+            own = why_not(name.removeprefix("no_")) if why_not else ""
+            if " is a setting of " in own:
+                raise InputError(f"option {flag} is unknown: {own}")
             near = difflib.get_close_matches(flag, flags, n=3, cutoff=0.7)
             what = f"did you mean {' or '.join(near)}?" if near else "see --help"
             raise InputError(f"option {flag} is unknown: {what}")
@@ -205,7 +216,7 @@ def _in_one_line(printed: str) -> str:
         kind = "option " if missing[1].startswith("--") else ""
         return f"{kind}{missing[1]} is missing: see --help"
     if extra := re.match(r"Unrecognized options: (.*)", message):
-        return f"{extra[1]!r} belongs to no option: see --help"
+        return f"{extra[1]!r} is not an option or its value: see --help"
     if choice := re.match(
         r"invalid choice '(.*)' for argument '--([\w-]+)'. Expected one of \((.*)\)",
         message,

@@ -11,8 +11,10 @@ import jax
 import numpy as np
 
 from gasil_jax import checks
-from gasil_jax.config import Config, Range
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Range
 from gasil_jax.host import (
+    descriptions,
     driver,
     json_reader,
     metrics_files,
@@ -51,7 +53,7 @@ class FitResult(NamedTuple):
 
 def fit(
     env: Any,
-    config: Config,
+    algorithm: Algorithm,
     *,
     seeds: int | Sequence[int] | np.ndarray | jax.Array = 1,
     folder: str | os.PathLike[str] | None = None,
@@ -68,13 +70,13 @@ def fit(
 
     Args:
       env: one environment.
-      config: the config that the seeds share.
+      algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
       folder: folder of metrics.csv, evaluations.csv, checkpoints/ and, at the end,
         policy.npz for `gasil_jax.load_policy`. It is created if it is missing; None
         keeps nothing.
       resume: continue the training in the folder from its newest checkpoint. Of the
-        seeds, the config and the evaluations only `total_steps` may differ, and only
+        seeds, the algorithm and the evaluations only `total_steps` may differ, and only
         grow. The environment, and schedules that are functions, are not compared. If
         the folder holds no training yet, a new one begins.
       checkpoint_every: environment steps per seed between two checkpoints, rounded up
@@ -93,7 +95,7 @@ def fit(
       ValueError: if a value is not allowed, or if the folder holds other files.
     """
     checks.check_environment(env)
-    members = make_members(env, config, _numbers(seeds))
+    members = make_members(env, algorithm, _numbers(seeds))
     for name, value in (
         ("checkpoint_every", checkpoint_every),
         ("evaluate_every", evaluate_every),
@@ -119,8 +121,8 @@ def fit(
                 "seeds": tuple(members.seeds),
                 "evaluate_every": evaluate_every,
                 "evaluate_episodes": evaluate_episodes if evaluate_every else None,
-                **run_folder.flat(vars(config)),
-                **run_folder.expert_hash(config),
+                **descriptions.describe(algorithm),
+                **run_folder.expert_hash(algorithm),
             }
             path = pathlib.Path(folder)
             write_description = stack.enter_context(_opened(path, description, resume))
@@ -130,7 +132,7 @@ def fit(
             path,
             {"seed": members.seeds},
             schedule=schedule,
-            progress=Progress("fit", config.total_steps, shown=False),
+            progress=Progress("fit", algorithm.config.total_steps, shown=False),
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,

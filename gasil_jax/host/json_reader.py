@@ -36,7 +36,7 @@ def read(path: pathlib.Path, kind: Any) -> Any:
       OSError: if there is no such file.
     """
     try:
-        return _as(kind, json.loads(path.read_text()), "")
+        return as_type(kind, json.loads(path.read_text()), "")
     except NotImportable:
         raise
     # Deeply nested brackets cause a RecursionError.
@@ -46,7 +46,7 @@ def read(path: pathlib.Path, kind: Any) -> Any:
         ) from None
 
 
-def _as(kind: Any, value: Any, name: str) -> Any:
+def as_type(kind: Any, value: Any, name: str) -> Any:
     """Return a value of a JSON file as a type; see `read`.
 
     Args:
@@ -63,18 +63,20 @@ def _as(kind: Any, value: Any, name: str) -> Any:
     if origin in (typing.Union, types.UnionType):
         for option in arguments:
             try:
-                return _as(option, value, name)
+                return as_type(option, value, name)
             except InputError:
                 if isinstance(value, list | dict):
                     raise
     elif origin is dict and isinstance(value, dict):
-        return {key: _as(arguments[1], x, _join(name, key)) for key, x in value.items()}
-    elif origin is tuple and isinstance(value, list):
+        return {
+            key: as_type(arguments[1], x, _join(name, key)) for key, x in value.items()
+        }
+    elif origin is tuple and isinstance(value, list | tuple):
         kinds = arguments
         if len(arguments) == 2 and arguments[1] is ...:
             kinds = arguments[:1] * len(value)
         if len(value) == len(kinds):
-            return tuple(_as(one, x, name) for one, x in zip(kinds, value))
+            return tuple(as_type(one, x, name) for one, x in zip(kinds, value))
     elif isinstance(value, dict):
         if dataclasses.is_dataclass(kind):
             return _with_fields(kind, value, name)
@@ -83,7 +85,9 @@ def _as(kind: Any, value: Any, name: str) -> Any:
             if missing := sorted(kind.__required_keys__ - set(value)):
                 raise InputError(f"{_join(name, missing[0])} is missing")
             of = lambda key: hints.get(key, Any)
-            return {key: _as(of(key), x, _join(name, key)) for key, x in value.items()}
+            return {
+                key: as_type(of(key), x, _join(name, key)) for key, x in value.items()
+            }
     elif kind in _DESCRIPTIONS and _is_plain(kind, value):
         return value
     raise InputError(f"{name or 'it'} is {value!r}: it must be {_describe(kind)}")
@@ -92,12 +96,10 @@ def _as(kind: Any, value: Any, name: str) -> Any:
 def _with_fields(kind: Any, value: dict[str, Any], name: str) -> Any:
     """Return an instance of a dataclass; fields that are missing have their default."""
     hints = get_type_hints(kind)
-    # The type of one field may depend on the value of another.
-    hints |= getattr(kind, "types_of", lambda value: {})(value)
     for key in value:
         if key not in hints:
             raise InputError(f"{_join(name, key)} is unknown")
-    return kind(**{key: _as(hints[key], x, key) for key, x in value.items()})
+    return kind(**{key: as_type(hints[key], x, key) for key, x in value.items()})
 
 
 def _is_plain(kind: Any, value: Any) -> bool:

@@ -6,7 +6,7 @@ alone, not from the members beside it or from the device it runs on.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
 from typing import Any
 
@@ -17,7 +17,8 @@ from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
 from gasil_jax import checks, train
-from gasil_jax.config import Config, Hyperparameters, validate_hyperparameters
+from gasil_jax.algorithms import Algorithm, check_numbers
+from gasil_jax.config import Config
 
 
 def member(states: Any, index: int) -> Any:
@@ -33,20 +34,23 @@ def member(states: Any, index: int) -> Any:
 
 
 def init_member(
-    env: Any, config: Config, seed: jax.Array, hyperparameters: Hyperparameters
+    env: Any,
+    algorithm: Algorithm,
+    seed: jax.Array,
+    hyperparameters: Mapping[str, jax.Array],
 ) -> train.TrainState:
     """Return the first state of a member, whose key comes from its seed alone."""
-    return train.init(env, config, jax.random.key(seed), hyperparameters)
+    return train.init(env, algorithm, jax.random.key(seed), hyperparameters)
 
 
 def advance_members(
-    env: Any, config: Config, states: Any, num_iterations: jax.Array
+    env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
 
     Args:
       env: one environment.
-      config: the config of all members.
+      algorithm: the algorithm of all members.
       states: the members' training states, (members, ...) each leaf.
       num_iterations: the number of iterations, int32 ().
 
@@ -55,8 +59,8 @@ def advance_members(
       are filled and the others are NaN.
     """
     # A jitted function is traced once for both uses, which saves seconds.
-    step = jax.jit(jax.vmap(lambda state: train.iterate(env, config, state)))
-    chunk = chunk_size(config)
+    step = jax.jit(jax.vmap(lambda state: train.iterate(env, algorithm, state)))
+    chunk = chunk_size(algorithm.config)
     metrics = jax.tree.map(
         lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype),
         jax.eval_shape(step, states)[1],
@@ -86,17 +90,22 @@ class Members:
 
     Attributes:
       env: one environment.
-      config: the config that the members share.
+      algorithm: the algorithm that the members share.
       seeds: absolute seed number of each member.
-      hyperparameters: the hyperparameters of each member.
+      hyperparameters: the numbers of each member, by name.
       devices: the devices that the members are sharded over.
     """
 
     env: Any
-    config: Config
+    algorithm: Algorithm
     seeds: Sequence[int]
-    hyperparameters: Sequence[Hyperparameters]
+    hyperparameters: Sequence[Mapping[str, Any]]
     devices: Sequence[jax.Device]
+
+    @property
+    def config(self) -> Config:
+        """The settings of the training loop and of PPO that the members share."""
+        return self.algorithm.config
 
     @property
     def num_members(self) -> int:
@@ -140,7 +149,7 @@ class Members:
         """Return the first states of all members, (padded, ...) each leaf."""
         pad = lambda values: [*values, *[values[-1]] * self._padding]
         init_one = lambda seed, hyperparameters: init_member(
-            self.env, self.config, seed, hyperparameters
+            self.env, self.algorithm, seed, hyperparameters
         )
         init = jax.jit(
             self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
@@ -155,7 +164,7 @@ class Members:
     @functools.cached_property
     def advance(self) -> Any:
         """`advance_members`, jitted and sharded; it reuses the memory of its input."""
-        advance = functools.partial(advance_members, self.env, self.config)
+        advance = functools.partial(advance_members, self.env, self.algorithm)
         return jax.jit(self._shard(advance, (P("members"), P())), donate_argnums=0)
 
     def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
@@ -249,9 +258,9 @@ class Members:
 
 def make_members(
     env: Any,
-    config: Config,
+    algorithm: Algorithm,
     seeds: Sequence[int],
-    hyperparameters: Sequence[Hyperparameters] | None = None,
+    hyperparameters: Sequence[Mapping[str, Any]] | None = None,
     *,
     devices: Sequence[jax.Device] | None = None,
 ) -> Members:
@@ -259,20 +268,20 @@ def make_members(
 
     Args:
       env: one environment.
-      config: the config that the members share.
+      algorithm: the algorithm that the members share.
       seeds: absolute seed number of each member. Its key is ``jax.random.key(seed)``.
-      hyperparameters: the hyperparameters of each member; default the config's.
+      hyperparameters: numbers of each member by name; the algorithm has the others.
       devices: the devices to shard over, default all. At most one for each member is
         used.
 
     Raises:
-      ValueError: if the config or a hyperparameter is not allowed.
+      ValueError: if the algorithm or a number is not allowed.
     """
-    checks.check(env, config)
-    # The config's own are checked with it.
+    checks.check(env, algorithm)
+    # The algorithm's own are checked with it.
     for one in hyperparameters or ():
-        validate_hyperparameters(config, one)
-    if hyperparameters is None:
-        hyperparameters = [config.hyperparameters] * len(seeds)
+        check_numbers(algorithm, one)
+    every = hyperparameters or [{}] * len(seeds)
+    numbers = [{**algorithm.hyperparameters, **one} for one in every]
     devices = list(devices or jax.devices())[: len(seeds)]
-    return Members(env, config, seeds, hyperparameters, devices)
+    return Members(env, algorithm, seeds, numbers, devices)

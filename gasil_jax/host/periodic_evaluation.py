@@ -83,7 +83,7 @@ class PeriodicEvaluation:
         def score(state: TrainState, seed: jax.Array) -> dict[str, jax.Array]:
             return evaluate(
                 members.env,
-                members.config,
+                members.algorithm,
                 state,
                 evaluation_key(seed, state.iteration),
                 num_episodes=schedule.num_episodes,

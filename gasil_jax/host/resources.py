@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax
 
 from gasil_jax import train
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
 
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
@@ -46,24 +46,32 @@ def _size(tree: Any) -> int:
     return sum(map(bytes_of, jax.tree.leaves(tree)))
 
 
-def need(env: Any, config: Config) -> Need:
+def need(env: Any, algorithm: Algorithm) -> Need:
     """Estimate the bytes that one run needs; memory is within a factor of two."""
-    state = jax.eval_shape(lambda: train.init(env, config, jax.random.key(0)))
+    state = jax.eval_shape(lambda: train.init(env, algorithm, jax.random.key(0)))
+    config = algorithm.config
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + env.action_size + 12
     batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
-    # The imitation method's state may be large, and is copied if it is not donated.
-    memory = _size(state) + _size(state.imitation) + batches
-    episodes = (state.environments, state.history, state.reward_decomposition)
+    # The agent's state may be large, and is copied if it is not donated.
+    memory = _size(state) + _size(state.agent) + batches
+    episodes = (state.environments, state.history, state.rewards)
     parts = {
         f"batches, with batch_steps {config.batch_steps}": batches,
         f"running episodes, with num_envs {config.num_envs}": _size(episodes),
-        "good trajectories, with buffer_steps "
-        f"{config.hyperparameters.buffer_steps}": _size(state.good_trajectories),
-        f"the state of agent {config.agent!r}": 2 * _size(state.imitation),
+        f"the state of agent {algorithm.agent.name!r}{_of_buffer(algorithm)}": (
+            2 * _size(state.agent)
+        ),
         "networks": _size(state.actor_critic),
     }
     return Need(_size(state), memory, max(parts, key=lambda part: parts[part]))
+
+
+def _of_buffer(algorithm: Algorithm) -> str:
+    """Return the size of the agent's buffer in words, if it has one."""
+    names = ("buffer_steps", "sil_buffer_steps")
+    sizes = {x: y for x, y in algorithm.settings.items() if x in names}
+    return "".join(f", with {name} {size}" for name, size in sizes.items())
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
@@ -145,20 +153,20 @@ def _padded(count: int, devices: Sequence[jax.Device]) -> int:
 
 
 def check_memory(
-    env: Any, config: Config, num_members: int, devices: Sequence[jax.Device]
+    env: Any, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
     """Check that training fits the devices' memory.
 
     Args:
       env: one environment.
-      config: the config of the runs.
+      algorithm: the algorithm of the runs.
       num_members: number of members that are trained at once.
       devices: the devices that they are sharded over, at most one for each member.
 
     Raises:
       ValueError: if it does not fit; the message gives the sizes.
     """
-    one, used = need(env, config), devices[:num_members]
+    one, used = need(env, algorithm), devices[:num_members]
     required, free = _padded(num_members, used) * one.memory, available(used)
     if free is not None and required > free:
         # Each device trains the same number of members.
@@ -168,6 +176,7 @@ def check_memory(
                 f"a single seed needs about {_in_words(one.memory)} of memory, and "
                 f"{_in_words(free)} are free: most is for {one.largest_part}"
             )
+        config = algorithm.config
         sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
@@ -210,7 +219,7 @@ def check_episodes(
 
 def check_disk(
     env: Any,
-    runs: Sequence[tuple[Config, int]],
+    runs: Sequence[tuple[Algorithm, int]],
     folder: pathlib.Path,
     num_checkpoints: int,
     *,
@@ -220,7 +229,7 @@ def check_disk(
 
     Args:
       env: one environment.
-      runs: each config with the number of its members.
+      runs: each algorithm with the number of its members.
       folder: the folder of the checkpoints; it need not exist.
       num_checkpoints: number of checkpoints to keep of each member.
       written: bytes of the runs' earlier checkpoints, which new ones replace.
@@ -230,7 +239,7 @@ def check_disk(
     """
     while not folder.exists():
         folder = folder.parent
-    sizes = [need(env, config).state * num_members for config, num_members in runs]
+    sizes = [need(env, algorithm).state * count for algorithm, count in runs]
     # While a checkpoint is being written there is one more.
     required = num_checkpoints * sum(sizes) + max(sizes, default=0)
     free = _free_disk(folder)

@@ -14,9 +14,16 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Required, TypedDict
 
-from gasil_jax.config import Config, validate
-from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, json_reader, metrics_files, output_file
+from gasil_jax import algorithms
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.host import (
+    command_line,
+    descriptions,
+    json_reader,
+    metrics_files,
+    output_file,
+)
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
 from gasil_jax.imitation import expert
@@ -210,7 +217,8 @@ def has_run(folder: pathlib.Path) -> bool:
 
 def write_description(folder: pathlib.Path, description: Mapping[str, Any]) -> None:
     """Write config.json, the description of a run, sweep or shard."""
-    metrics_files.write_json(folder / _CONFIG, description)
+    algorithm = descriptions.describe(description["algorithm"])
+    metrics_files.write_json(folder / _CONFIG, {**description, "algorithm": algorithm})
 
 
 class _Description(TypedDict, total=False):
@@ -220,7 +228,7 @@ class _Description(TypedDict, total=False):
     seeds: Required[int]
     first_seed: Required[int]
     settings: Required[Settings]
-    config: Required[Config]
+    algorithm: Required[dict[str, Any]]
     out: str | None
     resume: bool
     checkpoint_every: int | None
@@ -234,7 +242,6 @@ class _Description(TypedDict, total=False):
     random: int | None
     points_file: str | None
     points: tuple[dict[str, float], ...]
-    share_counts: bool
     shard: str | None
     launcher: str | None
     shards: int | None
@@ -252,7 +259,7 @@ def _why_no_run(folder: pathlib.Path) -> str:
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
-    """Return the content of config.json, "config" and "settings" as dataclasses.
+    """Return the content of config.json, "algorithm" and "settings" as objects.
 
     Raises:
       InputError: if there is no such file, if it does not describe a run, or if its
@@ -264,17 +271,18 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}{_why_no_run(folder)}") from None
     try:
-        if "points" in description:
-            for name in ("share_counts", "shard"):
-                if name not in description:
-                    raise ValueError(f"{name} is missing")
-        validate(description["config"])
+        if "points" in description and "shard" not in description:
+            raise ValueError("shard is missing")
+        algorithm = descriptions.read(description["algorithm"])
+        algorithms.check(algorithm)
         check_seeds(description["seeds"], description["first_seed"])
+    except NotImportable:
+        raise
     except ValueError as error:
         raise InputError(
             f"{path} is damaged, or another program wrote it: {error}"
         ) from None
-    return description
+    return {**description, "algorithm": algorithm}
 
 
 class StoredRun(NamedTuple):
@@ -345,16 +353,17 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     return changes
 
 
-def expert_hash(config: Config) -> dict[str, str]:
+def expert_hash(algorithm: Algorithm) -> dict[str, str]:
     """Return the hash of the expert's trajectories as a field, or {} without an expert.
 
     Raises:
       ValueError: if the expert can't be read.
     """
-    if config.expert is None:
+    source = getattr(algorithm.agent, "expert", None)
+    if not isinstance(source, str):
         return {}
     digest = hashlib.sha256()
-    for values in expert.load(config.expert):
+    for values in expert.load(source):
         digest.update(values.tobytes())
     return {EXPERT_HASH: digest.hexdigest()}
 
@@ -367,7 +376,7 @@ def refuse_other_expert(
     Args:
       before: content of the run's config.json or fit.json. It has no hash if an older
         version wrote it.
-      now: the field "expert" of the config to continue with, and its `expert_hash`.
+      now: the setting "expert" of the run to continue, and its `expert_hash`.
       folder: folder of the run.
     """
     if EXPERT_HASH in before and before[EXPERT_HASH] != now.get(EXPERT_HASH):
@@ -378,10 +387,12 @@ def refuse_other_expert(
 
 
 def flat(description: Mapping[str, Any]) -> dict[str, Any]:
-    """Return every field by its own name, including those of nested dataclasses."""
+    """Return every field by its own name, including those of nested objects."""
     fields: dict[str, Any] = {}
     for name, value in description.items():
-        if dataclasses.is_dataclass(value):
+        if isinstance(value, Algorithm):
+            fields |= descriptions.describe(value)
+        elif dataclasses.is_dataclass(value):
             own = {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
             fields |= flat(own)
         else:

@@ -5,6 +5,7 @@ import contextlib
 import dataclasses
 import pathlib
 import shlex
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from typing import Annotated, Any, TypeVar
@@ -13,12 +14,15 @@ import jax
 import tyro
 
 from gasil_envs import own_code
-from gasil_jax import checks, presets
+from gasil_jax import algorithms, checks, presets
 from gasil_jax import train as training
-from gasil_jax.config import Config, own_names, validate
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Config, names, validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
     command_line,
+    descriptions,
+    devices,
     environments,
     output_file,
     run_folder,
@@ -29,7 +33,12 @@ from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.imitation import find_agent, unused
+from gasil_jax.imitation import PPOGASIL, Agent
+from gasil_jax.rewards import REWARD_MODELS, Decompose, Normalize, RewardModel
+
+_Part = TypeVar("_Part")
+#: A dataclass whose fields are options of their own, without a prefix.
+_Nested = Annotated[_Part, tyro.conf.arg(name="")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,6 +49,9 @@ class Options:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
         humanoid; one of Brax's as brax:NAME, for example brax:inverted_pendulum; or
         your own as MODULE:NAME.
+      agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
+        ppo+bonus, gail, or your own as MODULE:CLASS. Each has its own settings: this
+        help shows those of the one that is named beside it.
       seeds: number of seeds to train.
       first_seed: number of the first seed. A seed's random numbers depend only on
         its number.
@@ -60,14 +72,24 @@ class Options:
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
         rule of PPO for all locomotion tasks; or paper, the paper's own protocol, with
         one environment per seed. Options override them. The defaults that this help
-        shows are those without a preset.
+        shows are those of the preset if --env is named beside --help.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
+      decompose_rewards: whether PPO learns from a reward for each step, which a network
+        learns from the delayed sums, instead of from the delayed reward itself.
+      normalize_rewards: whether to divide PPO's rewards by the standard deviation of
+        their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
+        that unit, not in the environment's. It has no effect on the agents gasil and
+        gail, which do not use the environment's reward.
       settings: settings of the environment.
-      config: settings of the algorithm.
+      config: settings of the training loop and of PPO.
+      own: settings of the agent.
+      decompose: settings of the decomposition of rewards.
+      normalize: settings of the normalization of rewards.
     """
 
     env: str
+    agent: str = PPOGASIL.name
     seeds: int = 1
     first_seed: int = 0
     out: pathlib.Path | None = None
@@ -79,12 +101,56 @@ class Options:
     log: tuple[str, ...] = ()
     preset: str = presets.DEFAULT
     devices: int | None = None
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=Settings
-    )
-    config: Annotated[Config, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=Config
-    )
+    decompose_rewards: bool = False
+    normalize_rewards: bool = False
+    settings: _Nested[Settings] = dataclasses.field(default_factory=Settings)
+    config: _Nested[Config] = dataclasses.field(default_factory=Config)
+    own: _Nested[Agent] = dataclasses.field(default_factory=PPOGASIL)
+    decompose: _Nested[Decompose] = dataclasses.field(default_factory=Decompose)
+    normalize: _Nested[Normalize] = dataclasses.field(default_factory=Normalize)
+
+    @property
+    def algorithm(self) -> Algorithm:
+        """The algorithm that the options describe."""
+        rewards: list[RewardModel] = [self.decompose] if self.decompose_rewards else []
+        rewards += [self.normalize] if self.normalize_rewards else []
+        return Algorithm(self.own, tuple(rewards), self.config)
+
+
+#: The fields of `Options` that describe the algorithm.
+_OF_ALGORITHM = ("agent", "config", "own", "decompose", "normalize")
+
+
+def algorithm_options(algorithm: Algorithm) -> dict[str, Any]:
+    """Return the fields of `Options` that describe an algorithm."""
+    models = {type(model): model for model in algorithm.rewards}
+    return {
+        "agent": algorithm.agent.name,
+        "config": algorithm.config,
+        "own": algorithm.agent,
+        Decompose.switch: Decompose in models,
+        "decompose": models.get(Decompose, Decompose()),
+        Normalize.switch: Normalize in models,
+        "normalize": models.get(Normalize, Normalize()),
+    }
+
+
+def description(options: Options) -> dict[str, Any]:
+    """Return options as config.json has them: the algorithm, and all other fields."""
+    algorithm = options.algorithm
+    left_out = {*_OF_ALGORITHM, *(model.switch for model in REWARD_MODELS)}
+    fields = [f.name for f in dataclasses.fields(options) if f.name not in left_out]
+    with command_line.input_checked():
+        return {
+            **{name: getattr(options, name) for name in fields},
+            "algorithm": algorithm,
+            **run_folder.expert_hash(algorithm),
+        }
+
+
+def described(options: Options, algorithm: Algorithm) -> dict[str, Any]:
+    """Return every option by its own name, with the settings of an algorithm."""
+    return run_folder.flat({**description(options), "algorithm": algorithm})
 
 
 T = TypeVar("T", bound=Options)
@@ -109,21 +175,18 @@ def parse(
       InputError: if a flag or a value is unknown, or differs from the run's.
     """
     if resumed is not None:
-        stored = _stored_options(kind, resumed)
-        options = command_line.parse(kind, arguments, program, stored)
-        _refuse_changes(options, stored, resumed)
-        return options
-    default = _defaults_of_agent(kind, arguments)
-    given = command_line.parse(kind, arguments, program, default)
-    with command_line.input_checked():
-        config = presets.preset(
-            given.env,
-            given.config.agent,
-            given.preset,
-            reward_delay=given.settings.reward_delay,
-        )
-    default = kind(env=given.env, config=config)
-    return command_line.parse(kind, arguments, program, default)
+        default = _stored_options(kind, resumed)
+    else:
+        default = _preset_options(kind, arguments)
+    options = command_line.parse(
+        kind, arguments, program, default, why_not=default.algorithm.why_not
+    )
+    if resumed is not None:
+        _refuse_changes(options, default, resumed)
+    elif options.agent != default.agent or options.preset != default.preset:
+        # A value of a list, such as --grid, looks like a flag to the first reading.
+        raise InputError("agent and preset must be given as --agent and --preset")
+    return options
 
 
 def _stored_options(kind: type[T], run: StoredRun) -> T:
@@ -132,71 +195,92 @@ def _stored_options(kind: type[T], run: StoredRun) -> T:
     Raises:
       InputError: if its config.json was written by another program.
     """
-    folder, description = run
-    fields = [f for f in dataclasses.fields(kind) if f.name != "out"]
+    folder, stored = run
+    of_algorithm = algorithm_options(stored["algorithm"])
+    fields = [
+        f
+        for f in dataclasses.fields(kind)
+        if f.name != "out" and f.name not in of_algorithm
+    ]
     # An older version may have written the run, without options that exist now.
     newer = {
         f.name: f.default for f in fields if f.default is None or f.default is False
     }
     names = {f.name for f in fields}
-    missing = names - set(newer) - set(description)
-    others = {"out", "points", run_folder.EXPERT_HASH}
-    if ("points" in description) != ("grid" in names):
-        command = "sweep" if "points" in description else "run"
+    missing = names - set(newer) - set(stored)
+    others = {"out", "points", "algorithm", run_folder.EXPERT_HASH}
+    if ("points" in stored) != ("grid" in names):
+        command = "sweep" if "points" in stored else "run"
         raise InputError(
             f"out is {folder}, a {command}: continue it with python -m "
             f"gasil_jax.{command}"
         )
-    if missing or set(description) - names - others:
+    if missing or set(stored) - names - others:
         raise InputError(f"out is {folder}, which another program has written")
-    stored = {**newer, **description}
-    values: dict[str, Any] = {f.name: stored[f.name] for f in fields}
-    return kind(**values)
+    values = {**newer, **stored}
+    return kind(**{name: values[name] for name in names}, **of_algorithm)
 
 
 def _refuse_changes(options: Options, stored: Options, run: StoredRun) -> None:
-    """Raise `InputError` if the options to continue a run with differ from its own.
+    """Raise `InputError` if a run is continued with other options than it has.
 
     Args:
-      options: the options to continue with.
+      options: the options of the continuation.
       stored: the options that the run was started with.
       run: the run.
     """
-    if changed := run_folder.differences(vars(stored), vars(options)):
+    of = lambda each: run_folder.flat(vars(each))
+    if changed := run_folder.differences(of(stored), of(options)):
         raise InputError(
             f"resume continues the run in {run.folder}, where {'; '.join(changed)}: "
             "only total_steps may change, and grow, and checkpoint_every, "
             "keep_checkpoints, devices and log"
         )
-    with command_line.input_checked():
-        expert = run_folder.expert_hash(options.config)
-    now = {"expert": options.config.expert, **expert}
+    now = run_folder.flat(description(options))
     run_folder.refuse_other_expert(run.description, now, run.folder)
 
 
-def _defaults_of_agent(kind: type[T], arguments: Sequence[str] | None) -> T:
-    """Return default options with the agent that the command line names.
-
-    The agent's own hyperparameters are then options, too.
+def _preset_options(kind: type[T], arguments: Sequence[str] | None) -> T:
+    """Return the options of the preset that a command line names.
 
     Raises:
-      InputError: if there is no such agent, or if one of its hyperparameters has the
-        name of another option.
+      InputError: if there is no such agent, environment or preset, or if one of the
+        agent's settings has the name of another option.
     """
-    first = _first_arguments(arguments)
-    agent = Config.agent if first is None or first.agent is None else first.agent
+    given = _first_arguments(arguments)
     with command_line.input_checked():
-        own = own_names(agent)
-    taken = {
-        f.name for options in (kind, Settings) for f in dataclasses.fields(options)
-    }
-    for name in own:
-        if name in taken:
-            raise InputError(
-                f"agent {agent!r} has a hyperparameter {name!r}, a name that is "
-                "taken by an option: it must be a new one"
+        agent = descriptions.find_agent(given.agent)
+        taken = {
+            f.name for options in (kind, Settings) for f in dataclasses.fields(options)
+        }
+        for name in names(agent):
+            if name in taken:
+                raise InputError(
+                    f"agent {given.agent!r} has a setting {name!r}, a name that is "
+                    "taken by an option: it must be a new one"
+                )
+        algorithm = Algorithm(agent())
+        if given.env is not None:
+            algorithm = presets.preset(
+                given.env,
+                agent,
+                given.preset,
+                reward_delay=given.reward_delay,
+                action_size=_action_size(given.env, given.preset),
             )
-    return kind(env=tyro.MISSING, config=Config(agent=agent))
+    env = tyro.MISSING if given.env is None else given.env
+    fields = {**algorithm_options(algorithm), "agent": given.agent}
+    return kind(env=env, preset=given.preset, **fields)
+
+
+def _action_size(env: str, preset: str) -> int | None:
+    """Return the dimension of an action, if a preset needs it for an environment."""
+    if preset != "scaled" or env in presets.ACTION_SIZES:
+        return None
+    # The environment's arrays start JAX.
+    devices.use_devices(Settings(), None, environments.available_cores())
+    with announced(env, "building the environment"):
+        return int(environments.make_env(env).action_size)
 
 
 def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
@@ -207,7 +291,7 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
         the folder holds no run, or if the run's config.json is damaged.
     """
     given = _first_arguments(arguments)
-    if given is None or not given.resume:
+    if not given.resume:
         return None
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
@@ -221,22 +305,33 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
     return None
 
 
-def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace | None:
-    """Return the options that decide the defaults of others, or None after an error.
+def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options that decide which others there are, and their defaults.
 
-    The parser of all options reports the error.
+    The parser of all options reports what is wrong with their values.
     """
-    parser = argparse.ArgumentParser(
-        add_help=False, allow_abbrev=False, exit_on_error=False
-    )
+
+    def delay(text: str | None) -> int:
+        with contextlib.suppress(ValueError, TypeError, OverflowError):
+            return max(1, command_line.whole_number(text or ""))
+        return 1
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
-    parser.add_argument("--agent", nargs="?")
+    parser.add_argument("--agent", nargs="?", default=Options.agent)
     parser.add_argument("--env", nargs="?")
-    try:
-        return parser.parse_known_args(arguments)[0]
-    except argparse.ArgumentError:
-        return None
+    parser.add_argument("--preset", nargs="?", default=presets.DEFAULT)
+    parser.add_argument("--reward-delay", nargs="?", type=delay, default=1)
+    words = sys.argv[1:] if arguments is None else arguments
+    # This parser would exit at a value of --resume.
+    given = parser.parse_known_args(
+        [word for word in words if not word.startswith("--resume=")]
+    )[0]
+    given.agent = given.agent or Options.agent
+    given.preset = given.preset or presets.DEFAULT
+    given.reward_delay = given.reward_delay or 1
+    return given
 
 
 def check(options: Options) -> None:
@@ -248,7 +343,10 @@ def check(options: Options) -> None:
     with command_line.input_checked():
         environments.check(options.env, options.settings)
         presets.check(options.preset)
-        validate(options.config)
+        algorithms.check(options.algorithm)
+        # The algorithm has no model that is off.
+        for model in (options.decompose, options.normalize):
+            validate(model, options.config.total_steps)
         trackers.check(options.log)
     command_line.check_minimum(
         options,
@@ -258,6 +356,8 @@ def check(options: Options) -> None:
         evaluate_every=1,
         evaluate_episodes=1,
     )
+    # The environment, which is not built yet, has its own limit too.
+    command_line.check_minimum(options.settings, max_episode_steps=1)
     if options.evaluate_episodes is not None and options.evaluate_every is None:
         raise InputError(
             f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
@@ -265,20 +365,13 @@ def check(options: Options) -> None:
     run_folder.check_seeds(options.seeds, options.first_seed)
 
 
-def unused_fields(config: Config) -> dict[str, str]:
-    """Return the names of the fields that have no effect, each with the reason."""
-    reason = f"agent {config.agent!r} does not use it"
-    fields = dict.fromkeys(unused(config.agent), reason)
-    if not config.normalize_rewards:
-        fields["reward_clip"] = "normalize_rewards is off"
-    names = [x for x in run_folder.flat(vars(config)) if x.startswith("decomposition_")]
-    if not find_agent(config.agent).uses_reward:
-        names += ["normalize_rewards", "reward_clip", "decompose_rewards"]
-        reason = f"agent {config.agent!r} does not use the environment's reward"
-        fields |= dict.fromkeys(names, reason)
-    elif not config.decompose_rewards:
-        fields |= dict.fromkeys(names, "decompose_rewards is off")
-    return fields
+def without_effect(algorithm: Algorithm) -> dict[str, str]:
+    """Return the names of settings that have no effect, each with the reason."""
+    if algorithm.agent.uses_reward:
+        return {}
+    reason = f"agent {algorithm.agent.name!r} does not use the environment's reward"
+    every = [x for model in REWARD_MODELS for x in (model.switch, *names(model))]
+    return dict.fromkeys(every, reason)
 
 
 def note_options_without_effect(options: Options, num_members: int) -> None:
@@ -288,7 +381,7 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
       options: options that `check` accepts.
       num_members: number of seeds, over all points of a sweep.
     """
-    config, settings = options.config, options.settings
+    algorithm, settings = options.algorithm, options.settings
     for name in environments.without_effect(options.env, settings):
         value = getattr(settings, name)
         command_line.note(
@@ -296,12 +389,20 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
         )
     default = presets.preset(
         options.env,
-        config.agent,
+        type(options.own),
         options.preset,
         reward_delay=settings.reward_delay,
+        action_size=1,  # It decides no setting that is compared here.
     )
-    now, before = run_folder.flat(vars(config)), run_folder.flat(vars(default))
-    for name, reason in sorted(unused_fields(config).items()):
+    now = run_folder.flat(vars(options))
+    before = run_folder.flat(algorithm_options(default))
+    reasons = {
+        name: f"{model.switch} is off"
+        for model in REWARD_MODELS
+        if not now[model.switch]
+        for name in names(model)
+    }
+    for name, reason in sorted({**reasons, **without_effect(algorithm)}.items()):
         if now[name] != before[name]:
             command_line.note(f"{name} is {now[name]}, which has no effect: {reason}")
     if options.devices is not None and options.devices > num_members:
@@ -313,9 +414,12 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
 
 def note_if_untuned(options: Options) -> None:
     """Print a note if the preset has no values for the agent on the task."""
-    agent, delay = options.config.agent, options.settings.reward_delay
-    lacking = presets.describe_lack(options.env, agent, options.preset, delay)
-    if lacking is not None:
+    agent, delay = options.own.name, options.settings.reward_delay
+    # Other presets refuse an agent or a task that they have nothing for.
+    lacking = presets.describe_lack(
+        options.env, agent, presets.DEFAULT, reward_delay=delay
+    )
+    if options.preset == presets.DEFAULT and lacking is not None:
         command_line.note(f"{lacking}: options that are not given have their defaults")
 
 
@@ -350,7 +454,7 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
       output_file.WriteError: if the folder can no longer be written.
     """
     stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{options.env}-{options.config.agent}-{stamp}".replace(":", "-")
+    name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
     out = options.out
     folder = run_folder.create_new(name) if out is None else run_folder.create(out)
     with run_folder.lock(folder):
@@ -376,11 +480,8 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     """Write config.json: every option, and further fields that are given."""
-    description = {
-        f.name: getattr(options, f.name) for f in dataclasses.fields(options)
-    }
-    description |= run_folder.expert_hash(options.config)
-    run_folder.write_description(folder, description | {"out": str(folder)} | more)
+    described = description(options) | {"out": str(folder)} | more
+    run_folder.write_description(folder, described)
 
 
 def make_env(options: Options) -> Any:
@@ -393,14 +494,14 @@ def make_env(options: Options) -> Any:
     with command_line.input_checked():
         with announced(options.env, "building the environment"):
             env = environments.make_env(options.env, **settings)
-        checks.check(env, options.config)
-        if ":" in options.config.agent:
+        checks.check(env, options.algorithm)
+        if ":" in options.agent:
             with announced(options.env, "tracing the agent"):
-                _trace(env, options.config)
+                _trace(env, options.algorithm)
     return env
 
 
-def _trace(env: Any, config: Config) -> None:
+def _trace(env: Any, algorithm: Algorithm) -> None:
     """Trace the first state and one iteration of a custom agent, without running them.
 
     Raises:
@@ -408,10 +509,10 @@ def _trace(env: Any, config: Config) -> None:
     """
 
     def begin() -> Any:
-        state = training.init(env, config, jax.random.key(0))
-        return training.iterate(env, config, state)
+        state = training.init(env, algorithm, jax.random.key(0))
+        return training.iterate(env, algorithm, state)
 
     package = pathlib.Path(training.__file__).parent
-    what = f"agent {config.agent!r} can't be traced"
+    what = f"agent {algorithm.agent.name!r} can't be traced"
     with command_line.input_checked(), own_code.refused(what, package):
         jax.eval_shape(begin)

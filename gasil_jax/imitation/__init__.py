@@ -1,58 +1,48 @@
-"""The imitation methods, one file each, and the registry of agents.
+"""The agents: PPO, and the ways of imitating that are added to it, one file each.
 
-An agent is PPO plus one `Imitation`. To add an agent to the package, write a file that
-defines one and add it to `AGENTS`. An agent of your own code is named MODULE:NAME and
-needs no entry.
+To add one to the package, write a file that defines an `Agent` and add it to `AGENTS`.
+An agent of your own code is named MODULE:CLASS and needs no entry.
 """
 
-from gasil_jax import registry
-from gasil_jax.imitation import (
-    adaptive,
-    adversarial,
-    behavior_cloning,
-    constant_bonus,
-    none,
-    self_imitation,
-)
-from gasil_jax.imitation.interface import Imitation
+from collections.abc import Mapping
 
-AGENTS: dict[str, Imitation] = registry.AGENTS
-AGENTS |= {
-    "ppo": none.PPO,
-    "ppo+bonus": constant_bonus.PPO_BONUS,
-    "ppo+bc": behavior_cloning.PPO_BC,
-    "ppo+sil": self_imitation.PPO_SIL,
-    "gasil": adversarial.GASIL,
-    "ppo+gasil": adversarial.PPO_GASIL,
-    "ppo+gasil-adaptive": adaptive.PPO_GASIL_ADAPTIVE,
-    "gail": adversarial.GAIL,
+from gasil_jax.config import names
+from gasil_jax.imitation.adaptive import PPOGASILAdaptive
+from gasil_jax.imitation.adversarial import GAIL, GASIL, PPOGASIL
+from gasil_jax.imitation.behavior_cloning import PPOBC
+from gasil_jax.imitation.constant_bonus import PPOBonus
+from gasil_jax.imitation.interface import Agent
+from gasil_jax.imitation.none import PPO
+from gasil_jax.imitation.self_imitation import PPOSIL
+
+#: The package's own agents by name.
+AGENTS: Mapping[str, type[Agent]] = {
+    agent.name: agent
+    for agent in (PPO, PPOBonus, PPOBC, PPOSIL, GASIL, PPOGASIL, PPOGASILAdaptive, GAIL)
 }
 
 
 def agents() -> tuple[str, ...]:
-    """Return the names of the package's agents, which `Config.agent` may have."""
+    """Return the names of the package's agents."""
     return tuple(AGENTS)
 
 
-def find_agent(name: str) -> Imitation:
-    """Return the agent with a name of `AGENTS`, or of the form MODULE:NAME.
-
-    Raises:
-      ValueError: if there is no such agent.
-    """
-    return registry.find(name)
+def agents_with(setting: str) -> list[str]:
+    """Return the names of the package's agents that have a setting."""
+    return [name for name, agent in AGENTS.items() if setting in names(agent)]
 
 
-def unused(agent: str) -> frozenset[str]:
-    """Return the names of the fields that other agents use and this one does not.
-
-    The set is empty if the agent does not say which fields it uses.
-    """
-    used = find_agent(agent).fields
-    if used is None:
-        return frozenset()
-    every = {name for each in AGENTS.values() for name in each.fields or ()}
-    return frozenset(every.difference(used))
-
-
-__all__ = ["AGENTS", "Imitation", "agents", "find_agent", "unused"]
+__all__ = [
+    "AGENTS",
+    "GAIL",
+    "GASIL",
+    "PPO",
+    "PPOBC",
+    "PPOGASIL",
+    "PPOSIL",
+    "Agent",
+    "PPOBonus",
+    "PPOGASILAdaptive",
+    "agents",
+    "agents_with",
+]

@@ -16,25 +16,25 @@ Standardized advantages have no unit, so there is no alpha to tune. The weight w
   latest episodes, both discounted as the buffer ranks them: imitation counts more, the
   better the buffer is than the policy.
 
-`Config.imitation_rule` names the factors that are used. While the buffer is empty, w
+`imitation_rule` names the factors that are used. While the buffer is empty, w
 is 0.
 """
 
 from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_jax import good_trajectories, reward_normalization
-from gasil_jax.config import Config, Hyperparameters
-from gasil_jax.imitation import adversarial
-from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
+from gasil_jax import good_trajectories
+from gasil_jax.config import choice, number
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.imitation.adversarial import SelfImitatingAgent
 from gasil_jax.learner import Learner
-from gasil_jax.rollout import Rollout
+from gasil_jax.rewards import normalization as reward_normalization
 
-# The hyperparameter's own value clips only the environment's rewards.
-_BONUS_CLIP = Hyperparameters.reward_clip
 # Decay of the moving mean of the policy's returns, for each new episode.
 _DECAY = 0.9
 # The gap is 1 if the buffer is better by at least this share of its own return.
@@ -59,68 +59,41 @@ class Adaptive(struct.PyTreeNode):
       policy_return: float32 (), moving mean of the returns of the policy's latest
         episodes, discounted as the buffer ranks them; 0 before the first episode.
       has_episodes: bool (), whether an episode has been counted.
+      buffer: the good-trajectory buffer.
     """
 
     discriminator: Learner
     bonus_normalizer: reward_normalization.RewardNormalizer
     policy_return: jax.Array
     has_episodes: jax.Array
-
-
-def _init(
-    key: jax.Array, config: Config, observation_size: int, action_size: int
-) -> Adaptive:
-    return Adaptive(
-        discriminator=adversarial.init(key, config, observation_size, action_size),
-        bonus_normalizer=reward_normalization.init(config.num_envs),
-        policy_return=jnp.float32(0.0),
-        has_episodes=jnp.bool_(False),
-    )
+    buffer: GoodTrajectories
 
 
 def follow_return(
-    policy_return: jax.Array, has_episodes: jax.Array, batch: Rollout
+    policy_return: jax.Array,
+    has_episodes: jax.Array,
+    completed: jax.Array,
+    *,
+    return_: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
     """Return the moving mean of the policy's returns, updated by a batch's episodes.
 
     Args:
       policy_return: float32 (), the mean before the batch.
       has_episodes: bool (), whether there were episodes before the batch.
-      batch: of the environment's own rewards; episodes that were cut short or have a
-        faulty step do not count.
+      completed: bool (time, env), whether a whole episode ended with this step.
+      return_: float32 (time, env), the episode's return up to this step, of the
+        environment's own rewards; NaN if it has a faulty step, and does not count.
 
     Returns:
       The mean, and whether there are episodes after the batch.
     """
-    counted = batch.completed & jnp.isfinite(batch.discounted_return)
+    counted = completed & jnp.isfinite(return_)
     count = jnp.sum(counted)
-    mean = jnp.sum(jnp.where(counted, batch.discounted_return, 0.0)) / jnp.maximum(
-        count, 1
-    )
+    mean = jnp.sum(jnp.where(counted, return_, 0.0)) / jnp.maximum(count, 1)
     past = jnp.where(has_episodes, _DECAY**count, 0.0)
     moved = past * policy_return + (1.0 - past) * mean
     return jnp.where(count > 0, moved, policy_return), has_episodes | (count > 0)
-
-
-def _update_and_reward(
-    state: Adaptive, context: Context, key: jax.Array
-) -> tuple[Adaptive, jax.Array, Metrics]:
-    discriminator, bonus, metrics = adversarial.update_and_score(
-        state.discriminator, context, key
-    )
-    batch = context.rollout
-    normalizer = reward_normalization.update(
-        state.bonus_normalizer, bonus, batch.ended, context.hyperparameters.gamma
-    )
-    policy_return, has_episodes = follow_return(
-        state.policy_return, state.has_episodes, batch
-    )
-    metrics["bonus"] = jnp.mean(bonus)
-    metrics["bonus_deviation"] = jnp.std(bonus)
-    normalized = reward_normalization.normalize(normalizer, bonus, _BONUS_CLIP)
-    streams = jnp.stack([batch.reward, normalized], axis=-1)
-    state = Adaptive(discriminator, normalizer, policy_return, has_episodes)
-    return state, streams, metrics
 
 
 def correlation(advantages: jax.Array) -> jax.Array:
@@ -139,37 +112,81 @@ def mix(advantages: jax.Array, weight: jax.Array | float) -> jax.Array:
     return (1.0 - weight) * advantages[..., 0] + weight * advantages[..., 1]
 
 
-def _mix(
-    state: Adaptive, advantages: jax.Array, context: Context
-) -> tuple[jax.Array, Metrics]:
-    advantage_correlation = correlation(advantages)
-    buffer = context.good_trajectories
-    good_return = good_trajectories.mean_return(buffer)
-    return_gap = gap(good_return, state.policy_return)
-    factor = RULES[context.config.imitation_rule](
-        jnp.maximum(advantage_correlation, 0.0), return_gap
-    )
-    weight = context.hyperparameters.imitation_weight * factor
-    weight = jnp.where(buffer.size > 0, weight, 0.0)
-    metrics = {
-        "imitation_weight": weight,
-        "advantage_correlation": advantage_correlation,
-        "return_gap": return_gap,
-    }
-    return mix(advantages, weight), metrics
+class PPOGASILAdaptive(SelfImitatingAgent):
+    """PPO on two streams, the environment's reward and the discriminator's bonus.
 
+    Where rewards are delayed, its preset also decomposes them.
 
-#: Where rewards are delayed, its preset also decomposes them.
-PPO_GASIL_ADAPTIVE = Imitation(
-    _init,
-    _update_and_reward,
-    leave_policy,
-    fields=(
-        "imitation_weight",
-        "imitation_rule",
-        *adversarial.FIELDS,
-        *good_trajectories.FIELDS,
-    ),
-    num_streams=2,
-    mix=_mix,
-)
+    Attributes:
+      imitation_weight: largest share of imitation in the policy's advantage, in
+        ppo+gasil-adaptive.
+      imitation_rule: how ppo+gasil-adaptive weights imitation in the policy's
+        advantage: by the "agreement" of the two advantages, by the "gap" between the
+        buffer's returns and the policy's, by "both", or by neither, "fixed".
+    """
+
+    name = "ppo+gasil-adaptive"
+    num_streams: ClassVar[int] = 2
+
+    imitation_weight: float = number(0.7, 0.0, 1.0)
+    imitation_rule: str = choice("both", RULES)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Adaptive:
+        """Return the state before the first batch."""
+        return Adaptive(
+            discriminator=self.init_discriminator(key, sizes),
+            bonus_normalizer=reward_normalization.init(sizes.num_envs),
+            policy_return=jnp.float32(0.0),
+            has_episodes=jnp.bool_(False),
+            buffer=self.init_buffer(sizes),
+        )
+
+    def update_and_reward(
+        self, state: Adaptive, context: Context, key: jax.Array
+    ) -> tuple[Adaptive, jax.Array, Metrics]:
+        """Train the discriminator, and return both streams, (time, env, 2)."""
+        discriminator, bonus, metrics = self.update_and_score(
+            state.discriminator, self.source(state.buffer), context, key
+        )
+        batch = context.rollout
+        normalizer = reward_normalization.update(
+            state.bonus_normalizer, bonus, batch.ended, context.config.gamma
+        )
+        policy_return, has_episodes = follow_return(
+            state.policy_return,
+            state.has_episodes,
+            batch.completed,
+            return_=self.ranked_by(batch),
+        )
+        metrics["bonus"] = jnp.mean(bonus)
+        metrics["bonus_deviation"] = jnp.std(bonus)
+        normalized = reward_normalization.normalize(
+            normalizer, bonus, reward_normalization.CLIP
+        )
+        streams = jnp.stack([batch.reward, normalized], axis=-1)
+        state = state.replace(
+            discriminator=discriminator,
+            bonus_normalizer=normalizer,
+            policy_return=policy_return,
+            has_episodes=has_episodes,
+        )
+        return state, streams, {**metrics, **self.buffer_metrics(state.buffer)}
+
+    def mix(
+        self, state: Adaptive, advantages: jax.Array, context: Context
+    ) -> tuple[jax.Array, Metrics]:
+        """Return (1 - w) A_r + w A_b, and w with what decides it."""
+        advantage_correlation = correlation(advantages)
+        good_return = good_trajectories.mean_return(state.buffer)
+        return_gap = gap(good_return, state.policy_return)
+        factor = RULES[self.imitation_rule](
+            jnp.maximum(advantage_correlation, 0.0), return_gap
+        )
+        weight = self.imitation_weight * factor
+        weight = jnp.where(state.buffer.size > 0, weight, 0.0)
+        metrics = {
+            "imitation_weight": weight,
+            "advantage_correlation": advantage_correlation,
+            "return_gap": return_gap,
+        }
+        return mix(advantages, weight), metrics

@@ -19,11 +19,24 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 
-from gasil_jax import good_trajectories, learner, normalization
-from gasil_jax.config import Config
+from gasil_jax import learner, normalization
+from gasil_jax.config import (
+    Schedule,
+    choice,
+    count,
+    number,
+    schedule,
+    switch,
+    text,
+    widths,
+)
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.imitation import expert
-from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
+from gasil_jax.imitation.buffered import BufferedAgent
+from gasil_jax.imitation.interface import Agent
 from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
 
@@ -101,7 +114,11 @@ def loss(
 
 
 def gradient_penalty(
-    logit: Callable[..., jax.Array], policy_pair: Any, good_pair: Any, share: jax.Array
+    logit: Callable[..., jax.Array],
+    policy_pair: Any,
+    good_pair: Any,
+    *,
+    share: jax.Array,
 ) -> jax.Array:
     """Return the mean of (|gradient of the logit| - 1)^2 between pairs, ().
 
@@ -126,217 +143,270 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
-def _network(config: Config) -> Any:
-    # Typed as Any because Flax declares that `apply` may also return variables.
-    return Discriminator(config.discriminator_hidden_sizes)
-
-
-def init(
-    key: jax.Array, config: Config, observation_size: int, action_size: int
-) -> Learner:
-    """Return an untrained discriminator. The key is consumed."""
-    params = _network(config).init(
-        key, jnp.zeros(observation_size), jnp.zeros(action_size)
-    )
-    return learner.init(params, learner.adam())
-
-
 class Source(NamedTuple):
     """The source of the pairs that the policy imitates.
 
     Attributes:
-      sample: (key, context, n) -> observation (n, obs), action (n, action).
-      is_ready: context -> bool (), whether there is anything to sample.
+      sample: (key, n) -> observation (n, obs), action (n, action).
+      is_ready: bool (), whether there is anything to sample.
     """
 
-    sample: Callable[[jax.Array, Context, int], tuple[jax.Array, jax.Array]]
-    is_ready: Callable[[Context], jax.Array]
+    sample: Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
+    is_ready: jax.Array
 
 
-def _sample_good(
-    key: jax.Array, context: Context, num_samples: int
-) -> tuple[jax.Array, jax.Array]:
-    return good_trajectories.sample(
-        key, context.good_trajectories, num_samples, context.config.sample_by_return
-    )
+class AdversarialAgent(Agent):
+    """An agent with a discriminator.
 
-
-def _sample_expert(
-    key: jax.Array, context: Context, num_samples: int
-) -> tuple[jax.Array, jax.Array]:
-    assert context.config.expert is not None  # Ensured by `_check_expert`.
-    observation, action = expert.load(context.config.expert)
-    rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
-    return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
-
-
-GOOD_TRAJECTORIES = Source(
-    _sample_good, lambda context: context.good_trajectories.size > 0
-)
-_EXPERT = Source(_sample_expert, lambda context: jnp.bool_(True))
-
-
-def _preprocessor(
-    context: Context,
-) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-    """Return the function that makes the discriminator's inputs from pairs."""
-    normalize = lambda x: normalization.normalize(context.normalizer, x)
-    if not context.config.discriminator_normalizes_actions:
-        return lambda observation, action: (normalize(observation), action)
-    actions = context.rollout.action
-    batch = normalization.update(normalization.init(actions.shape[-1]), actions)
-    return lambda observation, action: (
-        normalize(observation),
-        normalization.normalize(batch, action),
-    )
-
-
-def _train_discriminator(
-    state: Learner, source: Source, context: Context, key: jax.Array
-) -> tuple[Learner, Metrics]:
-    """Take gradient steps on the discriminator, if the source is ready.
-
-    The loop has as many steps as the config's `discriminator_updates`, which is static.
-    Only the first ones, as many as this run's own `discriminator_updates`, are kept.
+    Attributes:
+      bonus: form of the discriminator's reward: softplus (-log D, the paper's), logit,
+        dail or centered.
+      discriminator_learning_rate: Adam's step size for the discriminator.
+      discriminator_updates: gradient steps of the discriminator in an iteration.
+      discriminator_minibatch_size: steps of the policy, and as many good steps, in one
+        gradient step of the discriminator.
+      discriminator_hidden_sizes: widths of the discriminator's tanh layers.
+      discriminator_entropy_coefficient: weight of the entropy of the discriminator's
+        output.
+      discriminator_gradient_penalty: weight of a gradient penalty on the
+        discriminator, as in WGAN-GP: at points between good pairs and the policy's, the
+        norm of its gradient with respect to its input is pulled to 1.
+      discriminator_normalizes_actions: whether the discriminator sees actions in units
+        of the batch's mean and standard deviation; otherwise as they are.
     """
-    config, hyperparameters = context.config, context.hyperparameters
-    network, transform = _network(config), learner.adam()
-    rollout = context.rollout
-    observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
-    action = rollout.action.reshape(-1, rollout.action.shape[-1])
-    minibatch_size = config.discriminator_minibatch_size
 
-    preprocess = _preprocessor(context)
-    penalty = config.discriminator_gradient_penalty
+    bonus: str = choice("softplus", BONUSES)
+    discriminator_learning_rate: float = number(1e-4, 0.0, excludes_low=True)
+    discriminator_updates: int = count(5)
+    discriminator_minibatch_size: int = count(128)
+    discriminator_hidden_sizes: tuple[int, ...] = widths(100, 100)
+    discriminator_entropy_coefficient: float = number(1e-3, 0.0)
+    # Without a penalty its gradient is not computed.
+    discriminator_gradient_penalty: float = number(0.0, 0.0, traced=False)
+    discriminator_normalizes_actions: bool = switch(False)
 
-    def objective(params: Any, policy_pair: Any, good_pair: Any, key: Any) -> Any:
-        value, metrics = loss(
-            network.apply(params, *policy_pair),
-            network.apply(params, *good_pair),
-            hyperparameters.discriminator_entropy_coefficient,
-        )
-        if penalty:
-            share = jax.random.uniform(key, (minibatch_size,))
-            logit = lambda *pair: network.apply(params, *pair)
-            value += penalty * gradient_penalty(logit, policy_pair, good_pair, share)
-        return value, metrics
+    @property
+    def _network(self) -> Any:
+        # Typed as Any because Flax declares that `apply` may also return variables.
+        return Discriminator(self.discriminator_hidden_sizes)
 
-    def step(state: Learner, key_and_is_taken: tuple[Any, Any]) -> Any:
-        key, is_taken = key_and_is_taken
-        policy_key, good_key, between_key = jax.random.split(key, 3)
-        rows = jax.random.randint(
-            policy_key, (minibatch_size,), 0, observation.shape[0]
-        )
-        gradient, metrics = jax.grad(objective, has_aux=True)(
-            state.params,
-            preprocess(observation[rows], action[rows]),
-            preprocess(*source.sample(good_key, context, minibatch_size)),
-            between_key,
-        )
-        stepped = learner.descend(
-            state, gradient, transform, hyperparameters.discriminator_learning_rate
-        )
-        return learner.select(is_taken, stepped, state), metrics
+    def init_discriminator(self, key: jax.Array, sizes: Sizes) -> Learner:
+        """Return an untrained discriminator; consumes the key."""
+        pair = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
+        return learner.init(self._network.init(key, *pair), learner.adam())
 
-    num_updates = config.hyperparameters.discriminator_updates
-    is_taken = jnp.arange(num_updates) < jnp.asarray(
-        hyperparameters.discriminator_updates, jnp.int32
-    )
-    trained, metrics = jax.lax.scan(
-        step, state, (jax.random.split(key, num_updates), is_taken)
-    )
-    ready = source.is_ready(context)
-    # XLA turns a division by a constant into this product. So a constant count and a
-    # traced one give the same bits.
-    mean = lambda x: jnp.sum(x, where=is_taken) * (1.0 / jnp.sum(is_taken))
-    metrics = {
-        name: jnp.where(ready, mean(value), jnp.nan) for name, value in metrics.items()
-    }
-    return learner.select(ready, trained, state), metrics
-
-
-@jax.named_scope("discriminator")
-def update_and_score(
-    state: Learner, context: Context, key: jax.Array, source: Source = GOOD_TRAJECTORIES
-) -> tuple[Learner, jax.Array, Metrics]:
-    """Train the discriminator, and return the bonus of each step of the batch.
-
-    Args:
-      state: the discriminator.
-      context: the iteration's data.
-      key: random key; consumed.
-      source: the pairs that the policy imitates.
-
-    Returns:
-      The discriminator; the bonus without alpha, float32 (time, env), which is 0 while
-      there is nothing to imitate; and metrics.
-    """
-    state, metrics = _train_discriminator(state, source, context, key)
-    rollout = context.rollout
-    pairs = _preprocessor(context)(rollout.observation, rollout.action)
-    logit = _network(context.config).apply(state.params, *pairs)
-    form = BONUSES[context.config.bonus]
-    return state, jnp.where(source.is_ready(context), form(logit), 0.0), metrics
-
-
-def _update_and_reward(
-    source: Source,
-    combine: Callable[[jax.Array, jax.Array], jax.Array],
-) -> Callable[[Learner, Context, jax.Array], Any]:
-    def update_and_reward(
-        state: Learner, context: Context, key: jax.Array
+    @jax.named_scope("discriminator")
+    def update_and_score(
+        self, discriminator: Learner, source: Source, context: Context, key: jax.Array
     ) -> tuple[Learner, jax.Array, Metrics]:
-        state, bonus, metrics = update_and_score(state, context, key, source)
-        shaped = context.hyperparameters.alpha * bonus
-        metrics["bonus"] = jnp.mean(shaped)
-        metrics["bonus_deviation"] = jnp.std(shaped)
-        return state, combine(context.rollout.reward, shaped), metrics
+        """Train the discriminator, and return the bonus of each step of the batch.
 
-    return update_and_reward
+        Args:
+          discriminator: the discriminator before the update.
+          source: the pairs that the policy imitates.
+          context: the iteration's data.
+          key: random key; consumed.
+
+        Returns:
+          The discriminator; the bonus without alpha, float32 (time, env), which is 0
+          while there is nothing to imitate; and metrics.
+        """
+        discriminator, metrics = self._train(discriminator, source, context, key)
+        rollout = context.rollout
+        pairs = self._preprocessor(context)(rollout.observation, rollout.action)
+        bonus = BONUSES[self.bonus](self._network.apply(discriminator.params, *pairs))
+        return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
+
+    def _preprocessor(
+        self, context: Context
+    ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
+        """Return the function that makes the discriminator's inputs from pairs."""
+        normalize = lambda x: normalization.normalize(context.normalizer, x)
+        if not self.discriminator_normalizes_actions:
+            return lambda observation, action: (normalize(observation), action)
+        actions = context.rollout.action
+        batch = normalization.update(normalization.init(actions.shape[-1]), actions)
+        return lambda observation, action: (
+            normalize(observation),
+            normalization.normalize(batch, action),
+        )
+
+    def _train(
+        self, discriminator: Learner, source: Source, context: Context, key: jax.Array
+    ) -> tuple[Learner, Metrics]:
+        """Take gradient steps on the discriminator, if the source is ready."""
+        network, transform = self._network, learner.adam()
+        rollout = context.rollout
+        observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
+        action = rollout.action.reshape(-1, rollout.action.shape[-1])
+        minibatch_size = self.discriminator_minibatch_size
+        preprocess = self._preprocessor(context)
+        penalty = self.discriminator_gradient_penalty
+
+        def objective(params: Any, policy_pair: Any, good_pair: Any, key: Any) -> Any:
+            value, metrics = loss(
+                network.apply(params, *policy_pair),
+                network.apply(params, *good_pair),
+                self.discriminator_entropy_coefficient,
+            )
+            if penalty:
+                share = jax.random.uniform(key, (minibatch_size,))
+                logit = lambda *pair: network.apply(params, *pair)
+                value += penalty * gradient_penalty(
+                    logit, policy_pair, good_pair, share=share
+                )
+            return value, metrics
+
+        def step(discriminator: Learner, key: jax.Array) -> Any:
+            policy_key, good_key, between_key = jax.random.split(key, 3)
+            rows = jax.random.randint(
+                policy_key, (minibatch_size,), 0, observation.shape[0]
+            )
+            gradient, metrics = jax.grad(objective, has_aux=True)(
+                discriminator.params,
+                preprocess(observation[rows], action[rows]),
+                preprocess(*source.sample(good_key, minibatch_size)),
+                between_key,
+            )
+            stepped = learner.descend(
+                discriminator,
+                gradient,
+                transform,
+                step_size=self.discriminator_learning_rate,
+            )
+            return stepped, metrics
+
+        keys = jax.random.split(key, self.discriminator_updates)
+        trained, metrics = jax.lax.scan(step, discriminator, keys)
+        ready = source.is_ready
+        metrics = {
+            name: jnp.where(ready, jnp.mean(value), jnp.nan)
+            for name, value in metrics.items()
+        }
+        return learner.select(ready, trained, discriminator), metrics
 
 
-def _check_expert(config: Config, observation_size: int, action_size: int) -> None:
-    expert.check(config.expert, observation_size, action_size)
+class SelfImitation(struct.PyTreeNode):
+    """The discriminator and what it learns from.
+
+    Attributes:
+      discriminator: D.
+      buffer: the good-trajectory buffer, B in the paper.
+    """
+
+    discriminator: Learner
+    buffer: GoodTrajectories
 
 
-_reward_and_bonus = lambda reward, bonus: reward + bonus
-_bonus_alone = lambda reward, bonus: bonus
+class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
+    """An agent whose discriminator learns from the buffer, `state.buffer`."""
 
-#: Fields that every agent with a discriminator uses.
-FIELDS = (
-    "bonus",
-    "discriminator_learning_rate",
-    "discriminator_hidden_sizes",
-    "discriminator_entropy_coefficient",
-    "discriminator_updates",
-    "discriminator_minibatch_size",
-    "discriminator_gradient_penalty",
-    "discriminator_normalizes_actions",
-)
-_GAIL_FIELDS = ("alpha", "alpha_schedule", *FIELDS)
-_GASIL_FIELDS = (*_GAIL_FIELDS, *good_trajectories.FIELDS)
+    def remember(self, state: Any, context: Context) -> Any:
+        """Insert the episodes that ended in a batch into the buffer."""
+        return state.replace(buffer=self.insert(state.buffer, context))
 
-#: r - alpha log D (section 4.3).
-PPO_GASIL = Imitation(
-    init,
-    _update_and_reward(GOOD_TRAJECTORIES, _reward_and_bonus),
-    leave_policy,
-    fields=_GASIL_FIELDS,
-)
-#: -alpha log D alone (Algorithm 1).
-GASIL = Imitation(
-    init,
-    _update_and_reward(GOOD_TRAJECTORIES, _bonus_alone),
-    leave_policy,
-    fields=_GASIL_FIELDS,
-    uses_reward=False,
-)
-#: -alpha log D alone, D against expert trajectories (section 3.2).
-GAIL = Imitation(
-    init,
-    _update_and_reward(_EXPERT, _bonus_alone),
-    leave_policy,
-    _check_expert,
-    _GAIL_FIELDS,
-    uses_reward=False,
-)
+    def good_trajectories(self, state: Any) -> GoodTrajectories:
+        """Return the buffer in a state."""
+        return state.buffer
+
+    def source(self, buffer: GoodTrajectories) -> Source:
+        """Return the buffer as the source of what the policy imitates."""
+        return Source(
+            lambda key, num_samples: self.sample(buffer, key, num_samples),
+            buffer.size > 0,
+        )
+
+
+class PPOGASIL(SelfImitatingAgent):
+    """PPO on r - alpha log D (section 4.3).
+
+    Attributes:
+      alpha: scale of the discriminator's reward (paper, section 4.3).
+      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
+        pairs. On Humanoid the paper's alpha is 0 for 2M steps and then rises to its
+        full value at 3M. That is 2e6 0 3e6 1 on the command line and
+        ((2e6, 0), (3e6, 1)) in Python.
+    """
+
+    name = "ppo+gasil"
+
+    alpha: float = number(0.1, 0.0)
+    alpha_schedule: Schedule = schedule()
+
+    def init(self, key: jax.Array, sizes: Sizes) -> SelfImitation:
+        """Return an untrained discriminator and an empty buffer."""
+        return SelfImitation(
+            self.init_discriminator(key, sizes), self.init_buffer(sizes)
+        )
+
+    def update_and_reward(
+        self, state: SelfImitation, context: Context, key: jax.Array
+    ) -> tuple[SelfImitation, jax.Array, Metrics]:
+        """Train the discriminator (equation 8), and shape the reward with it."""
+        buffer = state.buffer
+        discriminator, bonus, metrics = self.update_and_score(
+            state.discriminator, self.source(buffer), context, key
+        )
+        reward, shaped = _shaped(self, context, bonus)
+        state = state.replace(discriminator=discriminator)
+        return state, reward, {**metrics, **shaped, **self.buffer_metrics(buffer)}
+
+
+class GASIL(PPOGASIL):
+    """PPO on -alpha log D alone (Algorithm 1)."""
+
+    name = "gasil"
+    uses_reward = False
+
+
+class GAIL(AdversarialAgent):
+    """PPO on -alpha log D alone, with D against expert trajectories (section 3.2).
+
+    Attributes:
+      alpha: scale of the discriminator's reward (paper, section 4.3).
+      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
+        pairs.
+      expert: expert that GAIL imitates: minari:NAME for a Minari data set, or an .npz
+        file with the arrays "observation" and "action".
+    """
+
+    name = "gail"
+    uses_reward = False
+
+    alpha: float = number(0.1, 0.0)
+    alpha_schedule: Schedule = schedule()
+    expert: str | None = text()
+
+    def check(self, sizes: Sizes) -> None:
+        """Raise `ValueError` unless there is an expert that fits the environment."""
+        expert.check(self.expert, sizes.observation, sizes.action)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Learner:
+        """Return an untrained discriminator."""
+        return self.init_discriminator(key, sizes)
+
+    def update_and_reward(
+        self, state: Learner, context: Context, key: jax.Array
+    ) -> tuple[Learner, jax.Array, Metrics]:
+        """Train the discriminator (equation 8), and reward with it alone."""
+        assert self.expert is not None  # Ensured by `check`.
+        observation, action = expert.load(self.expert)
+
+        def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
+            rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
+            return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
+
+        source = Source(sample, jnp.bool_(True))
+        state, bonus, metrics = self.update_and_score(state, source, context, key)
+        reward, shaped = _shaped(self, context, bonus)
+        return state, reward, {**metrics, **shaped}
+
+
+def _shaped(
+    agent: PPOGASIL | GAIL, context: Context, bonus: jax.Array
+) -> tuple[jax.Array, Metrics]:
+    """Return the rewards that PPO maximizes, (time, env), and metrics of the bonus."""
+    shaped = agent.alpha * bonus
+    metrics = {"bonus": jnp.mean(shaped), "bonus_deviation": jnp.std(shaped)}
+    reward = context.rollout.reward
+    return (reward + shaped if agent.uses_reward else shaped), metrics

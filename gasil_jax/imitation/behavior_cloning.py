@@ -13,9 +13,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gasil_jax import good_trajectories, learner, normalization, ppo
-from gasil_jax.imitation.interface import Context, Imitation, Metrics
-from gasil_jax.imitation.none import no_state, plain_reward
+from gasil_jax import learner, normalization, ppo
+from gasil_jax.config import count, number
+from gasil_jax.context import Context, Metrics
+from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.imitation.buffered import BufferedAgent
 from gasil_jax.learner import Learner
 from gasil_jax.networks import gaussian_log_prob
 from gasil_jax.ppo import ActorCritic
@@ -26,50 +28,56 @@ def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
     return -jnp.mean(gaussian_log_prob(mean, log_std, action))
 
 
-def _update_policy(
-    state: tuple[()], actor_critic: ActorCritic, context: Context, key: jax.Array
-) -> tuple[tuple[()], ActorCritic, Metrics]:
-    config = context.config
-    coefficient = context.hyperparameters.behavior_cloning_coefficient
+class PPOBC(BufferedAgent):
+    """PPO on the environment's reward, then cloning of the buffer, which is its state.
 
-    def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
-        mean, log_std = context.policy(params, observation)
-        value = loss(mean, log_std, action)
-        return coefficient * value, value
+    Attributes:
+      behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
+      behavior_cloning_updates: gradient steps on PPO+BC's cloning loss in an iteration.
+      behavior_cloning_minibatch_size: good steps in one gradient step on PPO+BC's
+        cloning loss.
+    """
 
-    def step(policy: Learner, key: jax.Array) -> Any:
-        observation, action = good_trajectories.sample(
-            key,
-            context.good_trajectories,
-            config.behavior_cloning_minibatch_size,
-            config.sample_by_return,
+    name = "ppo+bc"
+
+    behavior_cloning_coefficient: float = number(0.1, 0.0)
+    behavior_cloning_updates: int = count(10)
+    behavior_cloning_minibatch_size: int = count(64)
+
+    def update_policy(
+        self,
+        state: GoodTrajectories,
+        actor_critic: ActorCritic,
+        context: Context,
+        key: jax.Array,
+    ) -> tuple[GoodTrajectories, ActorCritic, Metrics]:
+        """Take gradient steps on the cloning loss, if the buffer is not empty."""
+
+        def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
+            mean, log_std = context.policy(params, observation)
+            value = loss(mean, log_std, action)
+            return self.behavior_cloning_coefficient * value, value
+
+        def step(policy: Learner, key: jax.Array) -> Any:
+            observation, action = self.sample(
+                state, key, self.behavior_cloning_minibatch_size
+            )
+            observation = normalization.normalize(context.normalizer, observation)
+            gradient, value = jax.grad(objective, has_aux=True)(
+                policy.params, observation, action
+            )
+            return ppo.descend_one(policy, gradient, context.config), value
+
+        cloned, values = jax.lax.scan(
+            step,
+            actor_critic.policy,
+            jax.random.split(key, self.behavior_cloning_updates),
         )
-        observation = normalization.normalize(context.normalizer, observation)
-        gradient, value = jax.grad(objective, has_aux=True)(
-            policy.params, observation, action
-        )
-        return ppo.descend_one(policy, gradient, context.hyperparameters), value
-
-    cloned, values = jax.lax.scan(
-        step,
-        actor_critic.policy,
-        jax.random.split(key, config.behavior_cloning_updates),
-    )
-    filled = context.good_trajectories.size > 0
-    policy = learner.select(filled, cloned, actor_critic.policy)
-    cloning_loss = jnp.where(filled, jnp.mean(values), jnp.nan)
-    metrics = {"behavior_cloning_loss": cloning_loss}
-    return state, actor_critic.replace(policy=policy), metrics
-
-
-PPO_BC = Imitation(
-    no_state,
-    plain_reward,
-    _update_policy,
-    fields=(
-        *good_trajectories.FIELDS,
-        "behavior_cloning_coefficient",
-        "behavior_cloning_updates",
-        "behavior_cloning_minibatch_size",
-    ),
-)
+        filled = state.size > 0
+        policy = learner.select(filled, cloned, actor_critic.policy)
+        cloning_loss = jnp.where(filled, jnp.mean(values), jnp.nan)
+        metrics = {
+            "behavior_cloning_loss": cloning_loss,
+            **self.buffer_metrics(state),
+        }
+        return state, actor_critic.replace(policy=policy), metrics

@@ -7,16 +7,27 @@ agent is the effect of imitation.
 
 import jax
 
-from gasil_jax.imitation.interface import Context, Imitation, Metrics, leave_policy
-from gasil_jax.imitation.none import no_state
+from gasil_jax.config import Schedule, number, schedule
+from gasil_jax.context import Context, Metrics
+from gasil_jax.imitation.interface import Agent
 
 
-def _reward_and_constant(
-    state: tuple[()], context: Context, key: jax.Array
-) -> tuple[tuple[()], jax.Array, Metrics]:
-    return state, context.rollout.reward + context.hyperparameters.alpha, {}
+class PPOBonus(Agent):
+    """PPO on the environment's reward plus a constant in each step.
 
+    Attributes:
+      alpha: the bonus of a step.
+      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
+        pairs (see the learning rate's).
+    """
 
-PPO_BONUS = Imitation(
-    no_state, _reward_and_constant, leave_policy, fields=("alpha", "alpha_schedule")
-)
+    name = "ppo+bonus"
+
+    alpha: float = number(0.1, 0.0)
+    alpha_schedule: Schedule = schedule()
+
+    def update_and_reward(
+        self, state: tuple[()], context: Context, key: jax.Array
+    ) -> tuple[tuple[()], jax.Array, Metrics]:
+        """Add the bonus to the environment's reward."""
+        return state, context.rollout.reward + self.alpha, {}

@@ -11,16 +11,14 @@ of Oh et al.)
 with w the importance weights of the prioritized sampling. As in the authors' code the
 advantage is clipped at one standard deviation of the returns (they divide rewards by
 it). The mean is over the steps with a positive advantage, or over 64 if they are fewer.
-The advantage of the first term is in units of that standard deviation. That of the
-second term is in the unit of the returns, as in PPO's value loss here.
+In the first term the advantage is divided by that standard deviation; in the second it
+is not, as in PPO's value loss here.
 
 R is a sum of rewards that were not clipped, but V learns from PPO's rewards. So if many
-normalized rewards are clipped (the metric `clipped_rewards`), R - V is too large. If an
-iteration's update is undone because it is not finite, its insertion into the replay is
-undone too, and PPO+SIL never gets the episodes that ended in it.
+normalized rewards are clipped (the metric `clipped_rewards`), R - V is too large.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import chex
 import jax
@@ -28,9 +26,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import learner, normalization, ppo
-from gasil_jax.config import Config
+from gasil_jax.config import count, number
+from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import History
-from gasil_jax.imitation.interface import Context, Imitation, Metrics
+from gasil_jax.imitation.interface import Agent
 from gasil_jax.networks import gaussian_log_prob
 from gasil_jax.ppo import ActorCritic
 
@@ -117,7 +116,7 @@ def returns_to_go(
     return return_.T, is_complete.T & jnp.isfinite(return_.T)
 
 
-def insert(replay: Replay, history: History, num_steps: int, gamma: Any) -> Replay:
+def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> Replay:
     """Return the replay with the steps of the episodes that ended in the last batch.
 
     Steps are added one environment after the other, each in time order. They get the
@@ -206,80 +205,82 @@ def loss(
     return policy_loss + value_coefficient * value_loss, fraction
 
 
-def _init(
-    key: jax.Array, config: Config, observation_size: int, action_size: int
-) -> Replay:
-    return init_replay(config.sil_buffer_steps, observation_size, action_size)
+class PPOSIL(Agent):
+    """PPO on the environment's reward, then self-imitation of the replay, its state.
 
+    Attributes:
+      sil_coefficient: weight of the loss of PPO+SIL.
+      sil_value_coefficient: weight of the value's loss within PPO+SIL's loss.
+      sil_updates: gradient steps on PPO+SIL's loss in an iteration.
+      sil_minibatch_size: replayed steps in one gradient step on PPO+SIL's loss.
+      sil_buffer_steps: capacity of PPO+SIL's replay buffer, in steps.
+    """
 
-def _update_and_reward(
-    replay: Replay, context: Context, key: jax.Array
-) -> tuple[Replay, jax.Array, Metrics]:
-    config, gamma = context.config, context.hyperparameters.gamma
-    replay = insert(replay, context.history, config.num_steps, gamma)
-    return replay, context.rollout.reward, {}
+    name = "ppo+sil"
+    history_episodes: ClassVar[int] = 1
 
+    sil_coefficient: float = number(0.1, 0.0)
+    sil_value_coefficient: float = number(0.01, 0.0)
+    sil_updates: int = count(10)
+    sil_minibatch_size: int = count(512)
+    sil_buffer_steps: int = count(50_000)
 
-def _update_policy(
-    replay: Replay, actor_critic: ActorCritic, context: Context, key: jax.Array
-) -> tuple[Replay, ActorCritic, Metrics]:
-    config, hyperparameters = context.config, context.hyperparameters
-    normalize = lambda x: normalization.normalize(context.normalizer, x)
-    # The replay's returns are in the environment's unit, the value's targets in that of
-    # the normalized reward.
-    scale = return_scale(replay) / context.reward_scale
+    def init(self, key: jax.Array, sizes: Sizes) -> Replay:
+        """Return an empty replay."""
+        return init_replay(self.sil_buffer_steps, sizes.observation, sizes.action)
 
-    def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
-        observation = normalize(rows.observation)
-        log_prob = gaussian_log_prob(
-            *context.policy(params["policy"], observation), rows.action
+    def remember(self, state: Replay, context: Context) -> Replay:
+        """Add the steps of the episodes that ended in a batch to the replay."""
+        config = context.config
+        assert context.history is not None  # Ensured by `history_episodes`.
+        return insert(state, context.history, config.num_steps, gamma=config.gamma)
+
+    def update_policy(
+        self, state: Replay, actor_critic: ActorCritic, context: Context, key: jax.Array
+    ) -> tuple[Replay, ActorCritic, Metrics]:
+        """Take gradient steps on the loss, if the replay is not empty."""
+        normalize = lambda x: normalization.normalize(context.normalizer, x)
+        # The replay's returns are in the environment's unit, the value's targets in
+        # that of the normalized reward.
+        scale = return_scale(state) / context.reward_scale
+
+        def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
+            observation = normalize(rows.observation)
+            log_prob = gaussian_log_prob(
+                *context.policy(params["policy"], observation), rows.action
+            )
+            (critic,) = params["values"]
+            value = context.value(critic, observation)
+            total, fraction = loss(
+                log_prob,
+                value,
+                rows.return_,
+                weight,
+                scale,
+                self.sil_value_coefficient,
+            )
+            return self.sil_coefficient * total, (value, fraction)
+
+        def step(carry: Any, key: jax.Array) -> Any:
+            actor_critic, priority = carry
+            index, weight = sample(
+                key, state.replace(priority=priority), self.sil_minibatch_size
+            )
+            rows = state.at(index)
+            rows = rows._replace(return_=rows.return_ / context.reward_scale)
+            gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
+                actor_critic.params, rows, weight
+            )
+            actor_critic = ppo.descend(actor_critic, gradient, context.config)
+            advantage = clipped_advantage(rows.return_, value, scale)
+            priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
+            return (actor_critic, priority), fraction
+
+        before = (actor_critic, state.priority)
+        after, fraction = jax.lax.scan(
+            step, before, jax.random.split(key, self.sil_updates)
         )
-        (critic,) = params["values"]
-        value = context.value(critic, observation)
-        total, fraction = loss(
-            log_prob,
-            value,
-            rows.return_,
-            weight,
-            scale,
-            hyperparameters.sil_value_coefficient,
-        )
-        return hyperparameters.sil_coefficient * total, (value, fraction)
-
-    def step(carry: Any, key: jax.Array) -> Any:
-        actor_critic, priority = carry
-        index, weight = sample(
-            key, replay.replace(priority=priority), config.sil_minibatch_size
-        )
-        rows = replay.at(index)
-        rows = rows._replace(return_=rows.return_ / context.reward_scale)
-        gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
-            actor_critic.params, rows, weight
-        )
-        actor_critic = ppo.descend(actor_critic, gradient, hyperparameters)
-        advantage = clipped_advantage(rows.return_, value, scale)
-        priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
-        return (actor_critic, priority), fraction
-
-    before = (actor_critic, replay.priority)
-    after, fraction = jax.lax.scan(
-        step, before, jax.random.split(key, config.sil_updates)
-    )
-    filled = jnp.any(replay.priority > 0)
-    actor_critic, priority = learner.select(filled, after, before)
-    metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}
-    return replay.replace(priority=priority), actor_critic, metrics
-
-
-PPO_SIL = Imitation(
-    _init,
-    _update_and_reward,
-    _update_policy,
-    fields=(
-        "sil_coefficient",
-        "sil_value_coefficient",
-        "sil_updates",
-        "sil_minibatch_size",
-        "sil_buffer_steps",
-    ),
-)
+        filled = jnp.any(state.priority > 0)
+        actor_critic, priority = learner.select(filled, after, before)
+        metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}
+        return state.replace(priority=priority), actor_critic, metrics

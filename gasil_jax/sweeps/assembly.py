@@ -11,14 +11,13 @@ from typing import Any
 import jax
 
 from gasil_jax import train as training
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.host import (
     command_line,
     devices,
     driver,
     environments,
     resources,
-    run_folder,
     run_options,
     trackers,
 )
@@ -26,7 +25,12 @@ from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.progress import Progress, announced
-from gasil_jax.host.run_options import Options, evaluation_schedule, make_env
+from gasil_jax.host.run_options import (
+    Options,
+    described,
+    evaluation_schedule,
+    make_env,
+)
 from gasil_jax.sweeps.shards import Program
 
 
@@ -35,7 +39,7 @@ class Job:
     """A program and the folder that it is trained in.
 
     Attributes:
-      program: the program, with its config and members.
+      program: the program, with its algorithm and members.
       folder: folder of its metrics.csv and checkpoints, created if it is missing.
       labels: columns that identify the members in the tables, (members,) each.
       name: name of the program's run in trackers.
@@ -51,7 +55,7 @@ class Job:
     @property
     def env_steps(self) -> int:
         """The number of environment steps over all members."""
-        config = self.program.config
+        config = self.program.algorithm.config
         return config.num_iterations * config.batch_steps * len(self.program.members)
 
 
@@ -82,7 +86,7 @@ def prepare(
     with command_line.input_checked():
         for program in programs:
             count = len(program.members)
-            resources.check_memory(env, program.config, count, every)
+            resources.check_memory(env, program.algorithm, count, every)
             if schedule is not None:
                 resources.check_episodes(
                     env,
@@ -93,7 +97,7 @@ def prepare(
                 )
         resources.check_disk(
             env,
-            [(program.config, len(program.members)) for program in unfinished],
+            [(program.algorithm, len(program.members)) for program in unfinished],
             out or pathlib.Path("runs"),
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
@@ -101,15 +105,15 @@ def prepare(
         )
     run_options.note_if_untuned(options)
     run_options.note_options_without_effect(options, num_members)
-    note_if_no_episode_ends(env, [program.config for program in programs])
+    note_if_no_episode_ends(env, [program.algorithm for program in programs])
     return env
 
 
-def note_if_no_episode_ends(env: Any, configs: Sequence[Config]) -> None:
+def note_if_no_episode_ends(env: Any, algorithms: Sequence[Algorithm]) -> None:
     """Print a note if no episode can end within the steps of an environment."""
-    for config in configs:
+    for config in (algorithm.config for algorithm in algorithms):
         steps = config.num_iterations * config.num_steps
-        limit = training.max_episode_steps(env, config)
+        limit = training.max_episode_steps(env)
         if steps < limit and not environments.ends_early(env):
             command_line.note(
                 f"no episode can end, so no return is known: each of {config.num_envs} "
@@ -147,7 +151,7 @@ def train(
     """
     schedule = CheckpointSchedule(options.checkpoint_every, options.keep_checkpoints)
     num_members = sum(len(job.program.members) for job in jobs)
-    total_steps = options.config.total_steps * num_members
+    total_steps = options.algorithm.config.total_steps * num_members
     kind = "seeds" if num_members == options.seeds else "members"
     steps_before = 0
     with (
@@ -160,17 +164,16 @@ def train(
                     raise Interrupted(interruption.signal)
                 job.folder.mkdir(parents=True, exist_ok=True)
                 with progress.aside("starting the trackers"):
-                    # The points of a program may change fields of the config.
-                    own = dataclasses.replace(options, config=job.program.config)
                     job_trackers = trackers.make(
                         options.log,
                         job.folder,
                         run_name=job.name,
-                        config=run_folder.flat(vars(own)),
+                        # The points of a program may change settings of the algorithm.
+                        config=described(options, job.program.algorithm),
                     )
                 members = make_members(
                     env,
-                    job.program.config,
+                    job.program.algorithm,
                     [seed for _, seed in job.program.members],
                     job.program.hyperparameters,
                 )

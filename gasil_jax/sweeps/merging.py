@@ -71,7 +71,7 @@ def _read_all(folders: Sequence[pathlib.Path]) -> list[StoredRun]:
         shard = shards.parse(each.description["shard"])
         if shard in stored:
             raise InputError(
-                f"shard {shard} is there twice: {stored[shard].folder}, {each.folder}"
+                f"shard {shard} is given twice: {stored[shard].folder}, {each.folder}"
             )
         stored[shard] = each
     counts = {shard.count for shard in stored}

@@ -5,27 +5,22 @@ import itertools
 import json
 import math
 import pathlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from gasil_jax.config import Config, Hyperparameters, own_names, ranges, validate
+from gasil_jax import algorithms
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import names, ranges
 from gasil_jax.errors import InputError, did_you_mean
 from gasil_jax.host.command_line import whole_number
-from gasil_jax.imitation import unused
+from gasil_jax.imitation import agents_with
+from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
 
-_FIXED = ("total_steps", "num_envs", "max_episode_steps")
-#: The names that a sweep may vary, with the type of their values.
-KINDS: Mapping[str, type] = {
-    name: int if allowed.whole else float
-    for kind in (Hyperparameters, Config)
-    for name, allowed in ranges(kind).items()
-    if name not in _FIXED and not name.endswith("hidden_sizes")
-}
-
+_FIXED = ("total_steps", "num_envs")
 #: The ranges of the paper's appendix, from which `--random` draws.
 PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
     "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
@@ -36,23 +31,28 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 }
 
 
-def kinds(agent: str) -> Mapping[str, type]:
-    """Return `KINDS` with the agent's own hyperparameters."""
-    return {**dict.fromkeys(own_names(agent), float), **KINDS}
+def kinds(algorithm: Algorithm) -> Mapping[str, type]:
+    """Return the names that a sweep may vary, with the type of their values."""
+    return {
+        name: int if allowed.whole else float
+        for part in algorithm.parts
+        for name, allowed in ranges(part).items()
+        if name not in _FIXED
+    }
 
 
-def parse_grid(grid: Sequence[str], agent: str) -> dict[str, tuple[Any, ...]]:
-    """Return the values by name from entries NAME=VALUE,VALUE,... for an agent.
+def parse_grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
+    """Return the values by name from entries NAME=VALUE,VALUE,... for an algorithm.
 
     Raises:
       InputError: if a name is unknown or given twice, or if a value is not a number.
     """
-    values, allowed = {}, kinds(agent)
+    values, allowed = {}, kinds(algorithm)
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name not in allowed:
-            raise InputError(f"grid: {_unknown_name(name, allowed)}")
+            raise InputError(f"grid: {_why_not(name, algorithm)}")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
         try:
@@ -71,8 +71,8 @@ def parse_grid(grid: Sequence[str], agent: str) -> dict[str, tuple[Any, ...]]:
     return values
 
 
-def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
-    """Return the points that a JSON file lists, for an agent.
+def read_points(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
+    """Return the points that a JSON file lists, for an algorithm.
 
     Raises:
       InputError: if the file can't be read or is not a list of points.
@@ -91,8 +91,8 @@ def read_points(path: pathlib.Path, agent: str) -> list[dict[str, Any]]:
         if not isinstance(point, dict):
             raise InputError(f"points_file is {path}: {point!r} is not a point")
         with _errors_name(f"points_file is {path}"):
-            check_point(point, agent)
-    allowed = kinds(agent)
+            check_point(point, algorithm)
+    allowed = kinds(algorithm)
     with _errors_name(f"points_file is {path}"):
         read = [
             {name: allowed[name](value) for name, value in point.items()}
@@ -114,12 +114,12 @@ def _errors_name(source: str) -> Iterator[None]:
         raise InputError(f"{source}: {error}") from None
 
 
-def check_point(point: Point, agent: str) -> None:
+def check_point(point: Point, algorithm: Algorithm) -> None:
     """Raise `InputError` if a name can't vary or a value is not of its type."""
-    allowed = kinds(agent)
+    allowed = kinds(algorithm)
     for name, value in point.items():
         if name not in allowed:
-            raise InputError(_unknown_name(name, allowed))
+            raise InputError(_why_not(name, algorithm))
         whole = allowed[name] is int
         if isinstance(value, bool) or not isinstance(
             value, int if whole else int | float
@@ -128,24 +128,32 @@ def check_point(point: Point, agent: str) -> None:
             raise InputError(f"{name} is {value!r}, not {kind}")
 
 
-def check_saved(points: Sequence[Point], config: Config, path: pathlib.Path) -> None:
-    """Raise `InputError` if the points in a config.json do not fit its config."""
+def check_saved(
+    points: Sequence[Point], algorithm: Algorithm, path: pathlib.Path
+) -> None:
+    """Raise `InputError` if the points in a config.json do not fit its algorithm."""
     with _errors_name(f"{path} is damaged, or another program wrote it: points"):
         for point in points:
-            check_point(point, config.agent)
-            validate(config.replace(**point))
+            check_point(point, algorithm)
+            algorithms.check(algorithm.replace(**point))
 
 
-def _unknown_name(name: str, allowed: Iterable[str]) -> str:
-    return f"{name!r} can't vary: {did_you_mean(name, tuple(allowed))}"
+def _why_not(name: str, algorithm: Algorithm) -> str:
+    """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
+    allowed = tuple(kinds(algorithm))
+    of_models = {x for model in REWARD_MODELS for x in names(model)}
+    if name not in algorithm.settings and (name in of_models or agents_with(name)):
+        return f"{algorithm.why_not(name)}. What can vary: {', '.join(allowed)}"
+    return f"{name!r} can't vary: {did_you_mean(name, allowed)}"
 
 
 def make_points(
     grid: Sequence[str],
     random: int | None,
     points_file: str | None,
+    *,
     seed: int,
-    agent: str,
+    algorithm: Algorithm,
 ) -> list[dict[str, Any]]:
     """Return the points of a sweep, without repetitions.
 
@@ -155,7 +163,7 @@ def make_points(
         `PAPER_RANGES`; None takes the whole grid.
       points_file: a file that lists the points, instead of grid and random.
       seed: seed of the draws.
-      agent: the agent of the sweep. Names that it does not use are left out of
+      algorithm: what the points change. Names that it does not have are left out of
         `PAPER_RANGES`.
 
     Raises:
@@ -164,8 +172,8 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file can't be combined with grid or random")
-        return read_points(pathlib.Path(points_file), agent)
-    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, agent)
+        return read_points(pathlib.Path(points_file), algorithm)
+    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, algorithm)
     if random is None:
         if not values:
             raise InputError(
@@ -179,7 +187,7 @@ def make_points(
     if random < 1:
         raise InputError(f"random is {random}: it must be 1 or more")
     values = values or {
-        name: PAPER_RANGES[name] for name in PAPER_RANGES if name not in unused(agent)
+        name: PAPER_RANGES[name] for name in PAPER_RANGES if name in kinds(algorithm)
     }
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax import numpy_policy, policy, train
-from gasil_jax.config import Config
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
     checkpoint,
@@ -71,9 +71,9 @@ def find(
         return _find_point(folder, description, point)
     if point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    config, seeds = description["config"], run_folder.seeds_of(description)
+    seeds = run_folder.seeds_of(description)
     # A run is a sweep of one point, in one program.
-    (program,) = shards.programs(config, [{}], seeds)
+    (program,) = shards.programs(description["algorithm"], [{}], seeds)
     return Saved(folder / "checkpoints", program, range(len(seeds)))
 
 
@@ -118,8 +118,8 @@ def load(
     which: str = "last",
     point: int | None = None,
     seed: int | None = None,
-) -> tuple[Any, Config, list[int], Any]:
-    """Return environment, config, seed numbers and states (seed, ...) of a run.
+) -> tuple[Any, Algorithm, list[int], Any]:
+    """Return environment, algorithm, seed numbers and states (seed, ...) of a run.
 
     Args:
       folder: folder of the run or sweep, which need not be finished.
@@ -138,7 +138,7 @@ def load(
     chosen, errors = checkpoint.latest(saved.root)
     for error in errors:
         print(f"warning: {error}", file=sys.stderr)
-    config, count = saved.program.config, len(saved.program.members)
+    algorithm, count = saved.program.algorithm, len(saved.program.members)
     if which == "best":
         if len(saved.indices) < count:
             raise InputError(
@@ -154,7 +154,7 @@ def load(
         env = environments.make_env(description["env"], **settings)
         # The leaves of all members have the same shapes.
         init = lambda seed: train.init(
-            env, config, jax.random.key(seed), saved.program.hyperparameters[0]
+            env, algorithm, jax.random.key(seed), saved.program.hyperparameters[0]
         )
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
         states = chosen.restore(like)
@@ -165,7 +165,7 @@ def load(
         seeds, indices = [seed], indices[[seeds.index(seed)]]
     if len(indices) < count:
         states = jax.tree.map(lambda x: x[indices], states)
-    return env, config, seeds, states
+    return env, algorithm, seeds, states
 
 
 class Policies(NamedTuple):
@@ -202,11 +202,11 @@ def load_policies(
       InputError: as `load` does, or if the zoo has no such policy.
     """
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        env, config, seeds, states = load(pathlib.Path(folder), which, point, seed)
+        env, _, seeds, states = load(pathlib.Path(folder), which, point, seed)
         every = jax.device_get(policy.weights(states, env))
         shared = {name: every.pop(name) for name in ("low", "high")}
         weights = [member(every, i) | shared for i in range(len(seeds))]
-        return Policies(env, train.max_episode_steps(env, config), seeds, weights)
+        return Policies(env, train.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":
         raise InputError(f"run is {folder}: it has no points and no checkpoints")
     with command_line.input_checked():

@@ -1,24 +1,21 @@
 """Divide a sweep into programs, each compiled once, and shards, each run separately.
 
-A member is a point with a seed. The members of a program differ in `Hyperparameters`
-alone. Points that differ in a hyperparameter that is a count have separate programs,
-unless `share_counts` is set. A shard is one of n nearly equal parts of all members. It
-takes members program by program, so that it compiles few programs.
+A member is a point with a seed. The members of a program differ in hyperparameters, the
+numbers that are traced, alone: points that differ in a count have separate programs. A
+shard is one of n nearly equal parts of all members. It takes members program by
+program, so that it compiles few programs.
 """
 
 import dataclasses
 import pathlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-from gasil_jax.config import Config, Hyperparameters, ranges
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.sweeps.points import Point
-
-#: Hyperparameters that are counts. A program's config has their largest values, which
-#: decide shapes.
-COUNTS = tuple(x for x, allowed in ranges(Hyperparameters).items() if allowed.whole)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,15 +24,15 @@ class Program:
 
     Attributes:
       number: number of the program in the whole sweep, and name of its folder.
-      config: the config that its members share.
+      algorithm: the algorithm that its members share.
       members: (index of the point, absolute seed number) of each member.
-      hyperparameters: the hyperparameters of each member.
+      hyperparameters: the numbers of each member, by name.
     """
 
     number: int
-    config: Config
+    algorithm: Algorithm
     members: tuple[tuple[int, int], ...]
-    hyperparameters: tuple[Hyperparameters, ...]
+    hyperparameters: tuple[Mapping[str, Any], ...]
 
     def part(self, begin: int, end: int) -> "Program":
         """Return the program with only the members from index `begin` to `end`."""
@@ -51,37 +48,26 @@ class Program:
 
 
 def programs(
-    config: Config,
-    points: Sequence[Point],
-    seeds: Sequence[int],
-    share_counts: bool = False,
+    algorithm: Algorithm, points: Sequence[Point], seeds: Sequence[int]
 ) -> list[Program]:
     """Return the programs that train all points with all seeds.
 
     Args:
-      config: the config that the points change.
-      points: changed hyperparameters and fields of `Config`, by name.
+      algorithm: the algorithm that the points change.
+      points: changed settings, by name.
       seeds: absolute seed numbers.
-      share_counts: whether points with different `buffer_steps` or
-        `discriminator_updates` share a program, which then has the largest values.
     """
-    configs = [config.replace(**point) for point in points]
-    counts = [
-        {name: getattr(own.hyperparameters, name) for name in COUNTS} for own in configs
-    ]
-    if share_counts:
-        largest = {name: max(own[name] for own in counts) for name in COUNTS}
-        counts = [largest] * len(configs)
-    groups: dict[Config, list[int]] = {}
-    for index, own in enumerate(configs):
-        shared = config.hyperparameters.replace(**counts[index])
-        groups.setdefault(own.replace(hyperparameters=shared), []).append(index)
+    changed = [algorithm.replace(**point) for point in points]
+    groups: dict[Algorithm, list[int]] = {}
+    for index, own in enumerate(changed):
+        shared = own.replace(**algorithm.hyperparameters)
+        groups.setdefault(shared, []).append(index)
     return [
         Program(
             number,
             shared,
             tuple((i, seed) for i in indices for seed in seeds),
-            tuple(configs[i].hyperparameters for i in indices for _ in seeds),
+            tuple(changed[i].hyperparameters for i in indices for _ in seeds),
         )
         for number, (shared, indices) in enumerate(groups.items())
     ]

@@ -114,10 +114,10 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     metrics_files.write_json(folder / "summary.json", summary)
     with output_file.atomic(folder / "sweep.png") as partial:
         final, best = results.finals["final_return"], summary["best_by_mean"]
-        plotting.final_returns(partial, _labels(results.points), final, best)
+        plotting.final_returns(partial, _labels(results.points), final, best=best)
     if varied:
         with output_file.atomic(folder / "hyperparameters.png") as partial:
-            _draw_hyperparameters(partial, results, varied, summary)
+            _draw_hyperparameters(partial, results, varied, summary=summary)
     return summary
 
 
@@ -184,6 +184,7 @@ def _draw_hyperparameters(
     path: pathlib.Path,
     results: Results,
     varied: Mapping[str, Sequence[Any]],
+    *,
     summary: Mapping[str, Any],
 ) -> None:
     """Draw the mean final returns over each hyperparameter that `_varied` returns."""
@@ -192,7 +193,7 @@ def _draw_hyperparameters(
         path,
         varied,
         results.mean[ended],
-        summary["importance"],
+        importance=summary["importance"],
         best=None if best is None else ended.index(best),
         left_out=len(results.points) - len(ended),
     )
@@ -205,7 +206,7 @@ def _varied(
     trained: dict[int, dict[str, Any]] = {}
     for program in (program for part in parts for program in part.programs):
         for (point, _), own in zip(program.members, program.hyperparameters):
-            trained[point] = vars(program.config) | vars(own)
+            trained[point] = program.algorithm.settings | dict(own)
     values = {name: [trained[point][name] for point in points] for name in names}
     return {name: listed for name, listed in values.items() if len(set(listed)) > 1}
 

@@ -34,7 +34,7 @@ def write_training(folder: pathlib.Path, program: Program, **measured: Any) -> N
         and "evaluation_seconds" (None without evaluations), all measured in the
         process that finished the program; "device" and "device_count".
     """
-    iterations = program.config.num_iterations
+    iterations = program.algorithm.config.num_iterations
     content = {"iterations": iterations, "members": len(program.members), **measured}
     content["versions"] = metrics_files.versions()
     metrics_files.write_json(program.folder(folder) / _TRAINING, content)
@@ -59,13 +59,13 @@ def read_training(folder: pathlib.Path, program: Program) -> dict[str, Any] | No
 
     Args:
       folder: folder of the sweep or shard.
-      program: the program, whose config says where its end is.
+      program: the program, whose algorithm says where its end is.
     """
     try:
         content = json_reader.read(program.folder(folder) / _TRAINING, _Training)
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
-    ended = content["iterations"] == program.config.num_iterations
+    ended = content["iterations"] == program.algorithm.config.num_iterations
     return content if ended and content["members"] == len(program.members) else None
 
 
@@ -90,16 +90,10 @@ class TrainedPrograms:
         Raises:
           InputError: if its points can't be trained.
         """
-        check_saved(
-            description["points"], description["config"], folder / "config.json"
-        )
+        algorithm, points = description["algorithm"], description["points"]
+        check_saved(points, algorithm, folder / "config.json")
         seeds = run_folder.seeds_of(description)
-        programs = shards.programs(
-            description["config"],
-            description["points"],
-            seeds,
-            description["share_counts"],
-        )
+        programs = shards.programs(algorithm, points, seeds)
         if description["shard"] is not None:
             programs = shards.cut_evenly(programs, shards.parse(description["shard"]))
         return cls(folder, programs)
@@ -125,8 +119,11 @@ class TrainedPrograms:
         """
         every: dict[Member, dict[str, np.ndarray]] = {}
         for program in self.programs:
-            required, rows = metrics_files.SUMMARIZED, program.config.num_iterations
-            every |= self._table(program, "metrics.csv", required, rows)
+            required, rows = (
+                metrics_files.SUMMARIZED,
+                program.algorithm.config.num_iterations,
+            )
+            every |= self._table(program, "metrics.csv", required, rows=rows)
         return every
 
     def evaluations(self) -> dict[Member, dict[str, np.ndarray]]:
@@ -146,10 +143,11 @@ class TrainedPrograms:
         program: Program,
         name: str,
         required: Sequence[str],
+        *,
         rows: int | None = None,
     ) -> dict[Member, dict[str, np.ndarray]]:
         """Return a program's complete table by member, checking columns and `rows`."""
-        path, config = program.folder(self.folder) / name, program.config
+        path, config = program.folder(self.folder) / name, program.algorithm.config
         try:
             columns = metrics_files.read_metrics(
                 path, (), len(program.members), (*LABELS, *required)

@@ -1,7 +1,6 @@
 """PPO+GASIL with adaptive imitation, the bonus's forms, and the control."""
 
 import functools
-from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,18 +11,19 @@ from test_train import SMALL
 
 import gasil_jax
 from gasil_jax import good_trajectories
-from gasil_jax.imitation import adaptive, adversarial, find_agent
+from gasil_jax.context import Sizes
+from gasil_jax.imitation import adaptive, adversarial
 from gasil_jax.testing import example_context
 
-AGENT = "ppo+gasil-adaptive"
+ADAPTIVE = SMALL["ppo+gasil-adaptive"]
 ENV = gasil_jax.make_env("point_mass")
 
 
 @functools.cache
-def train(**changes):
-    """Train one seed of PPO, but for the changes."""
-    config = SMALL.replace(**{"agent": "ppo", **changes})
-    return jax.jit(gasil_jax.make_train(ENV, config))(jax.random.key(0))
+def train(agent, **changes):
+    """Train one seed of an agent."""
+    train = gasil_jax.make_train(ENV, SMALL[agent].replace(**changes))
+    return jax.jit(train)(jax.random.key(0))
 
 
 def test_mix_and_correlation_are_their_formulas():
@@ -57,10 +57,9 @@ def test_the_policys_return_follows_its_latest_whole_episodes():
         returns = rng.normal(size=(5, 3))
         completed = rng.random((5, 3)) < 0.2
         returns[rng.random((5, 3)) < 0.2] = np.nan  # of faulty episodes
-        batch = SimpleNamespace(
-            completed=jnp.array(completed), discounted_return=jnp.array(returns)
+        followed, has_episodes = adaptive.follow_return(
+            followed, has_episodes, jnp.array(completed), return_=jnp.array(returns)
         )
-        followed, has_episodes = adaptive.follow_return(followed, has_episodes, batch)
         counted = returns[completed & np.isfinite(returns)]
         if len(counted):
             past = 0.0 if twin is None else 0.9 ** len(counted)
@@ -71,30 +70,31 @@ def test_the_policys_return_follows_its_latest_whole_episodes():
 
 
 def test_without_weight_it_is_ppo():
-    (state, _), (plain, _) = train(agent=AGENT, imitation_weight=0.0), train()
+    state, _ = train("ppo+gasil-adaptive", imitation_weight=0.0)
+    plain, _ = train("ppo")
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     jax.tree.map(close, state.actor_critic.policy, plain.actor_critic.policy)
 
 
 @functools.cache
 def context_and_state():
-    """The context of the first iteration, and a state of adaptive imitation."""
-    config, key = SMALL.replace(agent=AGENT), jax.random.key(0)
-    context = jax.jit(lambda key: example_context(ENV, config, key))(key)
-    state = find_agent(AGENT).init(key, config, ENV.observation_size, ENV.action_size)
-    return context, state
+    """The context of the first iteration, and adaptive imitation's state with it."""
+    agent, key = ADAPTIVE.agent, jax.random.key(0)
+    context = jax.jit(lambda key: example_context(ENV, ADAPTIVE, key))(key)
+    sizes = Sizes(ADAPTIVE.config.num_envs, ENV.observation_size, ENV.action_size)
+    return context, agent.remember(agent.init(key, sizes), context)
 
 
 @pytest.mark.parametrize("rule", adaptive.RULES)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 def test_a_rule_is_the_product_of_the_factors_in_its_name(rule, sign):
     context, state = context_and_state()
-    context = context.replace(config=context.config.replace(imitation_rule=rule))
-    good_return = good_trajectories.mean_return(context.good_trajectories)
+    good_return = good_trajectories.mean_return(state.buffer)
     state = state.replace(policy_return=good_return - 0.1 * jnp.abs(good_return))
     rewards, noise = np.random.default_rng(0).normal(size=(2, 64, 4))
     streams = jnp.stack([rewards, 0.6 * sign * rewards + 0.8 * noise], axis=-1)
-    advantage, metrics = find_agent(AGENT).mix(state, streams, context)
+    agent = ADAPTIVE.agent.replace(imitation_rule=rule)
+    advantage, metrics = agent.mix(state, streams, context)
     agreement = np.mean(streams[..., 0] * streams[..., 1])
     assert sign * agreement > 0.3
     expected = 0.7
@@ -139,26 +139,27 @@ def test_which_bonus_pays_for_staying_up(name, pays):
 
 
 def test_the_control_is_paid_for_every_step():
-    (without, _), (plain, _) = train(agent="ppo+bonus", alpha=0.0), train()
+    (without, _), (plain, _) = train("ppo+bonus", alpha=0.0), train("ppo")
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     jax.tree.map(close, without.actor_critic, plain.actor_critic)
-    config, key = SMALL.replace(agent="ppo+bonus", alpha=0.7), jax.random.key(0)
-    context = jax.jit(lambda key: example_context(ENV, config, key))(key)
-    _, rewards, _ = find_agent("ppo+bonus").update_and_reward((), context, key)
+    algorithm, key = SMALL["ppo+bonus"].replace(alpha=0.7), jax.random.key(0)
+    context = jax.jit(lambda key: example_context(ENV, algorithm, key))(key)
+    _, rewards, _ = algorithm.agent.update_and_reward((), context, key)
     np.testing.assert_allclose(rewards - context.rollout.reward, 0.7, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("agent", "share"), [("ppo+gasil", 1.0), ("gasil", 0.0)])
 def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
-    config = SMALL.replace(agent=agent, alpha=0.7)
+    algorithm = SMALL[agent].replace(alpha=0.7)
 
     @jax.jit
     def first(key):
-        context = example_context(ENV, config, key)
-        state = gasil_jax.init(ENV, config, key).imitation
-        _, rewards, _ = find_agent(agent).update_and_reward(state, context, key)
-        _, bonus, _ = adversarial.update_and_score(state, context, key)
-        return context.good_trajectories.size, context.rollout.reward, bonus, rewards
+        agent, context = algorithm.agent, example_context(ENV, algorithm, key)
+        state = agent.remember(gasil_jax.init(ENV, algorithm, key).agent, context)
+        _, rewards, _ = agent.update_and_reward(state, context, key)
+        source = agent.source(state.buffer)
+        _, bonus, _ = agent.update_and_score(state.discriminator, source, context, key)
+        return state.buffer.size, context.rollout.reward, bonus, rewards
 
     size, reward, bonus, rewards = first(jax.random.key(0))
     assert size > 0 and bonus.std() > 0.01
@@ -168,23 +169,23 @@ def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
 
 def test_a_form_that_does_not_exist_is_refused():
     with pytest.raises(ValueError, match=r"bonus 'softmax' is unknown: .*softplus"):
-        gasil_jax.make_train(ENV, SMALL.replace(bonus="softmax"))
+        gasil_jax.make_train(ENV, ADAPTIVE.replace(bonus="softmax"))
     with pytest.raises(ValueError, match=r"imitation_rule 'bot' is unknown: .*'both'"):
-        gasil_jax.make_train(ENV, SMALL.replace(imitation_rule="bot"))
+        gasil_jax.make_train(ENV, ADAPTIVE.replace(imitation_rule="bot"))
 
 
 @functools.cache
 def first_update(**changes):
     """The discriminator after an iteration of GASIL, (parameters,), and the buffer."""
-    several = {"agent": "gasil", "batch_steps": 1024, "buffer_steps": 300}
-    config = SMALL.replace(**several, **changes)
+    settings = {"batch_steps": 1024, "buffer_steps": 300, **changes}
+    algorithm = SMALL["gasil"].replace(**settings)
 
     @jax.jit
     def first(key):
-        context = example_context(ENV, config, key)
-        state = gasil_jax.init(ENV, config, key).imitation
-        state, *_ = find_agent("gasil").update_and_reward(state, context, key)
-        return ravel_pytree(state.params)[0], context.good_trajectories
+        agent, context = algorithm.agent, example_context(ENV, algorithm, key)
+        state = agent.remember(gasil_jax.init(ENV, algorithm, key).agent, context)
+        state, *_ = agent.update_and_reward(state, context, key)
+        return ravel_pytree(state.discriminator.params)[0], state.buffer
 
     return first(jax.random.key(0))
 
@@ -194,6 +195,8 @@ def first_update(**changes):
     [
         {"discriminator_gradient_penalty": 10.0},
         {"discriminator_normalizes_actions": True},
+        {"discriminator_updates": 1},
+        {"buffer_steps": 150},
         {"buffer_episodes": 1},
         {"buffer_discounts": False},
         {"sample_by_return": True},
@@ -203,6 +206,8 @@ def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):
     (plain, before), (params, buffer) = first_update(), first_update(**change)
     assert np.all(np.isfinite(params))
     assert not np.allclose(plain, params, atol=1e-7)
+    if "buffer_steps" in change:
+        assert buffer.size == 150 < before.size
     if "buffer_episodes" in change:
         assert buffer.size == 50 < before.size
     if "buffer_discounts" in change:

@@ -46,7 +46,7 @@ def test_the_gradient_penalty_is_its_formula():
     gradient = np.concatenate([np.tile(w[:3], (5, 1)), w[3:] + between], axis=-1)
     expected = np.mean((np.linalg.norm(gradient, axis=-1) - 1) ** 2)
     pairs = [(jnp.array(observations[i]), jnp.array(actions[i])) for i in range(2)]
-    result = adversarial.gradient_penalty(logit, *pairs, jnp.array(share))
+    result = adversarial.gradient_penalty(logit, *pairs, share=jnp.array(share))
     np.testing.assert_allclose(result, expected, rtol=1e-4)
 
 

@@ -1,9 +1,10 @@
-"""Every agent learns, looks at its own fields, and does not depend on reward units.
+"""Every agent learns, looks at its own numbers, and does not depend on reward units.
 
 All checks of an agent share one compiled iteration of two members. Their random keys,
 hyperparameters and reward units are data.
 """
 
+import dataclasses
 import functools
 
 import jax
@@ -14,32 +15,43 @@ from brax.envs import Wrapper
 
 import gasil_jax
 from gasil_jax import normalization
-from gasil_jax.imitation import AGENTS, behavior_cloning
+from gasil_jax.config import traced_names
+from gasil_jax.imitation import behavior_cloning
 from gasil_jax.networks import Policy
 
 ENV = gasil_jax.make_env("point_mass")
 CONFIG = gasil_jax.Config(
-    total_steps=40 * 2048,
-    normalize_rewards=True,
-    # Half the epochs take half the time, and learn as fast at twice the step size.
-    num_epochs=5,
-    hidden_sizes=(64,),
-    discriminator_hidden_sizes=(64,),
-    hyperparameters=gasil_jax.Hyperparameters(
-        learning_rate=6e-4,
-        alpha=1.0,
-        discriminator_updates=20,
-        discriminator_learning_rate=3e-4,
-    ),
+    total_steps=40 * 2048, num_epochs=5, hidden_sizes=(64,), learning_rate=6e-4
 )
-PLAIN = CONFIG.hyperparameters
+DISCRIMINATOR = {
+    "discriminator_hidden_sizes": (64,),
+    "discriminator_updates": 20,
+    "discriminator_learning_rate": 3e-4,
+}
 # GAIL needs an expert: test_gail.py.
-SELF_TAUGHT = [name for name in gasil_jax.agents() if name != "gail"]
-# One worker for each agent, so that it is compiled once.
-EACH_AGENT = [
-    pytest.param(name, marks=pytest.mark.xdist_group(f"agent {name}"))
-    for name in SELF_TAUGHT
-]
+SELF_TAUGHT = (
+    gasil_jax.PPO(),
+    # A constant bonus as large as the normalized reward drowns it.
+    gasil_jax.PPOBonus(alpha=0.1),
+    # The best two episodes, which differ from the others.
+    gasil_jax.PPOBC(buffer_steps=100),
+    gasil_jax.PPOSIL(),
+    gasil_jax.GASIL(alpha=1.0, **DISCRIMINATOR),
+    gasil_jax.PPOGASIL(alpha=1.0, **DISCRIMINATOR),
+    gasil_jax.PPOGASILAdaptive(**DISCRIMINATOR),
+)
+ALGORITHMS = {
+    agent.name: gasil_jax.Algorithm(agent, (gasil_jax.Normalize(),), CONFIG)
+    for agent in SELF_TAUGHT
+}
+
+
+def each(agents):
+    """Parameters of a test; one worker for each agent, so that it is compiled once."""
+    return [
+        pytest.param(agent.name, marks=pytest.mark.xdist_group(f"agent {agent.name}"))
+        for agent in agents
+    ]
 
 
 class Scaled(Wrapper):
@@ -57,23 +69,23 @@ class Scaled(Wrapper):
 @functools.cache
 def programs(agent):
     """Compiled functions of two members: their first states, and an iteration."""
-    config = CONFIG.replace(agent=agent)
+    algorithm = ALGORITHMS[agent]
     two = jax.ShapeDtypeStruct((2,), jnp.float32)
     keys = jax.eval_shape(jax.vmap(jax.random.key), jnp.arange(2))
-    init = jax.vmap(functools.partial(gasil_jax.init, ENV, config))
-    init = jax.jit(init).lower(keys, jax.tree.map(lambda _: two, PLAIN)).compile()
+    init = jax.vmap(functools.partial(gasil_jax.init, ENV, algorithm))
+    numbers = dict.fromkeys(algorithm.hyperparameters, two)
+    init = jax.jit(init).lower(keys, numbers).compile()
     iterate = jax.vmap(
-        lambda state, factor: gasil_jax.iterate(Scaled(ENV, factor), config, state)
+        lambda state, factor: gasil_jax.iterate(Scaled(ENV, factor), algorithm, state)
     )
     return init, jax.jit(iterate).lower(init.out_info, two).compile()
 
 
-def train(
-    agent, iterations, *, hyperparameters=(PLAIN, PLAIN), units=(1, 1), seeds=(0, 0)
-):
+def train(agent, iterations, *, changes=({}, {}), units=(1, 1), seeds=(0, 0)):
     """Train two members; return their last states, and metrics (2, iterations)."""
     init, iterate = programs(agent)
-    stacked = jax.tree.map(lambda *x: np.array(x, np.float32), *hyperparameters)
+    members = [ALGORITHMS[agent].replace(**x).hyperparameters for x in changes]
+    stacked = jax.tree.map(lambda *x: np.array(x, np.float32), *members)
     state = init(jax.vmap(jax.random.key)(jnp.array(seeds)), stacked)
     rows = []
     for _ in range(iterations):
@@ -82,34 +94,33 @@ def train(
     return state, jax.tree.map(lambda *x: np.stack(x, axis=1), *rows)
 
 
-@pytest.mark.parametrize("agent", EACH_AGENT)
+def test_every_agent_but_the_taught_one_is_tested():
+    assert [*ALGORITHMS, "gail"] == list(gasil_jax.agents())
+
+
+@pytest.mark.parametrize("agent", each(SELF_TAUGHT))
 def test_it_learns_on_the_point_mass(agent):
-    # A constant bonus as large as the normalized reward drowns it.
-    point = PLAIN.replace(alpha=0.1) if agent == "ppo+bonus" else PLAIN
-    _, metrics = train(agent, 18, seeds=(0, 1), hyperparameters=(point, point))
+    _, metrics = train(agent, 18, seeds=(0, 1))
     returns = metrics["episode_return"]
     # From about 5 at random, a blue object now and then; both and a green one are 20.
     assert np.all(returns[:, 0] < 8.0)
     assert np.all(returns[:, -3:].mean(1) > 15.0)
 
 
-@pytest.mark.parametrize("agent", EACH_AGENT)
-def test_an_agent_looks_at_the_fields_that_it_says_and_at_no_others(agent):
-    fields = {name for each in AGENTS.values() for name in each.fields}
-    fields = {name for name in fields if hasattr(PLAIN, name)}
-    used = fields.intersection(AGENTS[agent].fields)
+def halved(agent, names):
+    """Changes that halve an agent's numbers."""
+    return {name: 0.5 * ALGORITHMS[agent].hyperparameters[name] for name in names}
 
-    def differs(names):
-        changed = PLAIN.replace(**{name: getattr(PLAIN, name) / 2 for name in names})
-        state, _ = train(agent, 2, hyperparameters=(PLAIN, changed))
+
+@pytest.mark.parametrize("agent", each(x for x in SELF_TAUGHT if traced_names(x)))
+def test_an_agent_looks_at_each_of_its_numbers(agent):
+    for name in traced_names(ALGORITHMS[agent].agent):
+        state, _ = train(agent, 2, changes=({}, halved(agent, [name])))
         kernel = np.asarray(jax.tree.leaves(state.actor_critic)[0])
-        return (kernel[0] != kernel[1]).any()
-
-    assert not differs(fields - used), fields - used
-    assert [name for name in sorted(used) if differs([name])] == sorted(used)
+        assert (kernel[0] != kernel[1]).any(), name
 
 
-@pytest.mark.parametrize("agent", EACH_AGENT)
+@pytest.mark.parametrize("agent", each(SELF_TAUGHT))
 def test_the_unit_of_the_reward_does_not_matter(agent):
     # Without normalization it does: to a bonus beside it, and to the value's loss.
     _, metrics = train(agent, 3, units=(1, 1024))
@@ -119,22 +130,19 @@ def test_the_unit_of_the_reward_does_not_matter(agent):
         if name in metrics:
             close(metrics[name][1], metrics[name][0], err_msg=name)
     # The buffer holds the environment's own returns.
-    for name in ("reward_scale", "good_return"):
+    for name in metrics.keys() & {"reward_scale", "good_return"}:
         usual, scaled = metrics[name]
         np.testing.assert_allclose(scaled, 1024.0 * usual, rtol=1e-4, err_msg=name)
 
 
 @pytest.mark.xdist_group("agent ppo+gasil")
 def test_vmap_over_every_hyperparameter_equals_single_runs():
-    # Counts may be smaller than those of the config, which decide the shapes.
-    counts = {"buffer_steps": 500, "discriminator_updates": 10}
-    plain = PLAIN.replace(**counts)
-    half = jax.tree.map(lambda x: 0.5 * x, PLAIN).replace(**counts)
-    _, together = train("ppo+gasil", 2, hyperparameters=(plain, half))
-    config = CONFIG.replace(agent="ppo+gasil", **counts)
-    init = jax.jit(functools.partial(gasil_jax.init, ENV, config))
-    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, config))
-    for i, hyperparameters in enumerate((plain, half)):
+    algorithm = ALGORITHMS["ppo+gasil"]
+    half = halved("ppo+gasil", algorithm.hyperparameters)
+    _, together = train("ppo+gasil", 2, changes=({}, half))
+    init = jax.jit(functools.partial(gasil_jax.init, ENV, algorithm))
+    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, algorithm))
+    for i, hyperparameters in enumerate((algorithm.hyperparameters, half)):
         state = init(jax.random.key(0), hyperparameters)
         for iteration in range(2):
             state, metrics = iterate(state)
@@ -149,22 +157,25 @@ def test_vmap_over_every_hyperparameter_equals_single_runs():
     assert np.all(together["bonus"][0] > together["bonus"][1])
 
 
-@pytest.mark.xdist_group("agent ppo")
-def test_two_streams_of_the_same_reward_are_that_reward(monkeypatch):
-    """Each stream has its own value; with one of them at weight 0 it is plain PPO."""
+class TwoStreams(gasil_jax.Agent):
+    """PPO on the first of two streams."""
 
-    def twice(state, context, key):
+    num_streams = 2
+
+    def update_and_reward(self, state, context, key):
         reward = context.rollout.reward
         return state, jnp.stack([reward, -3.0 * reward], axis=-1), {}
 
-    first_alone = lambda state, advantages, context: (advantages[..., 0], {})
-    two = AGENTS["ppo"]._replace(
-        update_and_reward=twice, num_streams=2, mix=first_alone
-    )
-    monkeypatch.setitem(AGENTS, "two streams", two)
-    config = CONFIG.replace(agent="two streams")
-    init = jax.jit(functools.partial(gasil_jax.init, ENV, config))
-    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, config))
+    def mix(self, state, advantages, context):
+        return advantages[..., 0], {}
+
+
+@pytest.mark.xdist_group("agent ppo")
+def test_two_streams_of_the_same_reward_are_that_reward():
+    """Each stream has its own value; with one of them at weight 0 it is plain PPO."""
+    algorithm = dataclasses.replace(ALGORITHMS["ppo"], agent=TwoStreams())
+    init = jax.jit(functools.partial(gasil_jax.init, ENV, algorithm))
+    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, algorithm))
     state, _ = iterate(init(jax.random.key(0)))
     plain = gasil_jax.member(train("ppo", 1)[0], 0).actor_critic
     close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
@@ -178,16 +189,15 @@ def test_two_streams_of_the_same_reward_are_that_reward(monkeypatch):
 
 @pytest.mark.xdist_group("agent ppo+bc")
 def test_cloning_makes_the_good_steps_likelier():
-    # Large steps, on the best two episodes, which differ from the others.
-    fast = PLAIN.replace(learning_rate=1e-3, buffer_steps=100)
+    fast = {"learning_rate": 1e-3}
     strong, without = (
-        fast.replace(behavior_cloning_coefficient=weight) for weight in (10.0, 0.0)
+        {**fast, "behavior_cloning_coefficient": weight} for weight in (10.0, 0.0)
     )
     # Only the cloning, which comes last in the iteration, differs.
-    states, _ = train("ppo+bc", 1, hyperparameters=(strong, without))
-    good = gasil_jax.member(states.good_trajectories, 0)
-    np.testing.assert_array_equal(states.good_trajectories.size, 100)
-    np.testing.assert_array_equal(states.good_trajectories.action[1], good.action)
+    states, _ = train("ppo+bc", 1, changes=(strong, without))
+    good = gasil_jax.member(states.agent, 0)
+    np.testing.assert_array_equal(states.agent.size, 100)
+    np.testing.assert_array_equal(states.agent.action[1], good.action)
     normalizer = normalization.init(ENV.observation_size)
     observation = normalization.normalize(normalizer, good.observation[:100])
     network = Policy(CONFIG.hidden_sizes, ENV.action_size)
@@ -200,7 +210,7 @@ def test_cloning_makes_the_good_steps_likelier():
     assert losses[0] < losses[1] - 0.01
     # Without weight it is PPO. Adam's momentum still acts on the policy, so that only
     # the value, which cloning leaves alone, is equal.
-    plain, _ = train("ppo", 1, hyperparameters=(fast, fast))
+    plain, _ = train("ppo", 1, changes=(fast, fast))
     jax.tree.map(
         functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6),
         gasil_jax.member(states.actor_critic.params["values"], 1),

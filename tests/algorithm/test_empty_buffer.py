@@ -6,7 +6,6 @@ import pytest
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax.imitation import find_agent
 from gasil_jax.testing import example_context
 
 
@@ -22,32 +21,30 @@ def assert_equal(left, right):
 def test_nothing_is_imitated_while_the_buffer_is_empty(agent):
     env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
     # No episode, of 50 steps, ends within a batch of 16 steps in each environment.
-    config = SMALL.replace(agent=agent, batch_steps=64, stagger_episodes=False)
-    used = find_agent(agent)
+    algorithm = SMALL[agent].replace(batch_steps=64, stagger_episodes=False)
 
     @jax.jit
     def first(key):
-        state = gasil_jax.init(env, config, key)
-        context = example_context(env, config, key)
-        imitation, rewards, learned = used.update_and_reward(
-            state.imitation, context, key
-        )
+        used, state = algorithm.agent, gasil_jax.init(env, algorithm, key)
+        context = example_context(env, algorithm, key)
+        remembered = used.remember(state.agent, context)
+        after, rewards, learned = used.update_and_reward(remembered, context, key)
         after, actor_critic, own = used.update_policy(
-            imitation, state.actor_critic, context, key
+            after, state.actor_critic, context, key
         )
-        return state, context.rollout.reward, rewards, after, actor_critic, learned, own
+        reward = context.rollout.reward
+        return state, remembered, reward, rewards, after, actor_critic, learned, own
 
-    state, reward, rewards, imitation, actor_critic, learned, own = first(key)
-    assert state.good_trajectories.size == 0
+    state, remembered, reward, rewards, after, actor_critic, learned, own = first(key)
+    assert_equal(remembered, state.agent)
     assert_equal(actor_critic, state.actor_critic)
     if agent == "ppo+gasil-adaptive":
         np.testing.assert_array_equal(rewards[..., 0], reward)
         np.testing.assert_array_equal(rewards[..., 1], 0.0)
-        assert_equal(imitation.discriminator, state.imitation.discriminator)
+        assert_equal(after.discriminator, state.agent.discriminator)
     else:
         np.testing.assert_array_equal(rewards, 0.0 if agent == "gasil" else reward)
-    if agent in ("gasil", "ppo+gasil"):
-        assert_equal(imitation, state.imitation)
+        assert_equal(after, state.agent)
     unknown = {
         "ppo+bc": "behavior_cloning_loss",
         "ppo+sil": "sil_fraction",

@@ -53,20 +53,18 @@ def expert(tmp_path_factory):
 def test_a_scripted_expert_is_imitated(expert):
     env, path, expert_return = expert
     assert expert_return > 35.0
-    config = gasil_jax.Config(
-        agent="gail",
+    algorithm = gasil_jax.algorithm(
+        "gail",
         expert=path,
         total_steps=32 * 2048,
         num_epochs=5,
-        hyperparameters=gasil_jax.Hyperparameters(
-            learning_rate=6e-4,
-            alpha=1.0,
-            discriminator_updates=20,
-            discriminator_learning_rate=3e-4,
-        ),
+        learning_rate=6e-4,
+        alpha=1.0,
+        discriminator_updates=20,
+        discriminator_learning_rate=3e-4,
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
-    train = jax.jit(jax.vmap(gasil_jax.make_train(env, config)))
+    train = jax.jit(jax.vmap(gasil_jax.make_train(env, algorithm)))
     returns = np.asarray(train(keys)[1]["episode_return"])
     # At random about 5, with both blue objects 10.
     assert np.all(returns[:, 0] < 8.0)
@@ -81,9 +79,9 @@ def test_an_expert_of_another_size_is_refused(expert, tmp_path):
             observation=arrays["observation"][:, :3],
             action=arrays["action"],
         )
-    config = gasil_jax.Config(agent="gail", expert=str(tmp_path / "other.npz"))
+    algorithm = gasil_jax.algorithm("gail", expert=str(tmp_path / "other.npz"))
     with pytest.raises(ValueError, match="of size 3 and actions of size 2"):
-        gasil_jax.make_train(env, config)
+        gasil_jax.make_train(env, algorithm)
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set

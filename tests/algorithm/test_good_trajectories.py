@@ -34,31 +34,24 @@ class ListBuffer:
 
 
 @functools.partial(jax.jit, static_argnames="max_episodes")
-def push(
-    buffer,
-    history,
-    observation,
-    ended,
-    return_,
-    length,
-    max_steps=CAPACITY,
-    max_episodes=None,
-):
+def push(buffer, history, observation, ended, return_, length, max_episodes=None):
     action = -observation
     history = good_trajectories.record(
-        history, observation, action, jnp.zeros_like(return_), ended
+        history, observation, action, reward=jnp.zeros_like(return_), ended=ended
     )
-    episodes = good_trajectories.ended_episodes(history, ended, return_, length)
+    episodes = good_trajectories.ended_episodes(history, ended, return_, length=length)
     buffer = good_trajectories.insert(
-        buffer, history, episodes, max_steps=max_steps, max_episodes=max_episodes
+        buffer, history, episodes, max_episodes=max_episodes
     )
     return buffer, history
 
 
-def empty(capacity=CAPACITY):
+def empty():
     return (
-        good_trajectories.init(capacity, 1, 1),
-        good_trajectories.init_history(NUM_ENVS, NUM_STEPS, MAX_EPISODE, 1, 1),
+        good_trajectories.init(CAPACITY, 1, 1),
+        good_trajectories.init_history(
+            NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=1, action_size=1
+        ),
     )
 
 
@@ -123,7 +116,7 @@ def test_buffer_equals_a_sorted_list(batches, max_episodes):
         buffer.observation[:size, 0], [s[3] for s in expected]
     )
     np.testing.assert_array_equal(buffer.action, -buffer.observation)
-    assert np.all(np.isneginf(buffer.return_[size:]))
+    assert np.all(buffer.return_[size:] == 0)
     assert np.all(buffer.observation[size:] == 0)
 
 
@@ -199,41 +192,31 @@ def test_vmapped_insertion_equals_one_by_one():
         )
 
 
-def test_limits_in_one_program_are_as_capacities():
-    rng = np.random.default_rng(1)
-    limits = jnp.array([2.0, 5.0, CAPACITY])
-    limited, history = jax.vmap(lambda _: empty(CAPACITY))(limits)
-    own = [empty(int(limit)) for limit in limits]
-    for _ in range(8):
-        observation = rng.normal(size=(NUM_STEPS, NUM_ENVS, 1)).astype(np.float32)
-        ended = rng.random((NUM_STEPS, NUM_ENVS)) < 0.6
-        return_ = rng.normal(size=ended.shape).astype(np.float32)
-        length = rng.integers(1, MAX_EPISODE, size=ended.shape).astype(np.int32)
-        batch = (observation, ended, return_, length)
-        limited, history = jax.vmap(push, in_axes=(0, 0, *[None] * 4, 0))(
-            limited, history, *batch, limits
-        )
-        own = [push(*each, *batch) for each in own]
-        for i, (expected, _) in enumerate(own):
-            assert limited.size[i] == expected.size
-            filled = slice(int(expected.size))
-            for name in ("observation", "action", "return_", "time"):
-                np.testing.assert_array_equal(
-                    getattr(limited, name)[i][filled], getattr(expected, name)[filled]
-                )
-    assert [int(buffer.size) for buffer, _ in own] == [2, 5, CAPACITY]
-
-
 def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
-    history = good_trajectories.init_history(1, 2, 2, 1, 1, keep_next=True)
+    history = good_trajectories.init_history(
+        1, 2, 2, observation_size=1, action_size=1, keep_next=True
+    )
     assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
     for first in (0.0, 2.0, 4.0):
         observation = first + jnp.arange(2.0)[:, None, None]
         zeros = jnp.zeros((2, 1))
-        batch = (observation, zeros[..., None], zeros, zeros > 0)
-        history = good_trajectories.record(history, *batch, observation + 1)
+        history = good_trajectories.record(
+            history,
+            observation,
+            zeros[..., None],
+            reward=zeros,
+            ended=zeros > 0,
+            next_observation=observation + 1,
+        )
     assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
     assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
-    history = good_trajectories.init_history(1, 2, 2, 1, 1)
-    history = good_trajectories.record(history, *batch, observation + 1)
+    history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
+    history = good_trajectories.record(
+        history,
+        observation,
+        zeros[..., None],
+        reward=zeros,
+        ended=zeros > 0,
+        next_observation=observation + 1,
+    )
     assert history.next_observation is None

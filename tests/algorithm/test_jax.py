@@ -41,7 +41,7 @@ def test_the_release_that_miscompiles_is_refused_at_import():
     compatibility.check(jaxlib.__version__)
 
 
-CONFIG = gasil_jax.Config(
+ALGORITHM = gasil_jax.algorithm(
     num_envs=2,
     batch_steps=4,
     total_steps=8,
@@ -50,8 +50,8 @@ CONFIG = gasil_jax.Config(
     hidden_sizes=(4,),
     discriminator_hidden_sizes=(4,),
     discriminator_minibatch_size=8,
-    max_episode_steps=2,
-    hyperparameters=gasil_jax.Hyperparameters(discriminator_updates=1, buffer_steps=3),
+    discriminator_updates=1,
+    buffer_steps=3,
 )
 
 
@@ -71,13 +71,13 @@ def assert_close(compiled, eager):
 @pytest.mark.compiled_as_for_users
 def test_a_compiled_iteration_equals_an_eager_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
-    env = gasil_jax.make_env("point_mass", reward_delay=2)
-    iterate = lambda state: gasil_jax.iterate(env, CONFIG, state)
-    init = jax.jit(lambda key: gasil_jax.init(env, CONFIG, key))
+    env = gasil_jax.make_env("point_mass", reward_delay=2, max_episode_steps=2)
+    iterate = lambda state: gasil_jax.iterate(env, ALGORITHM, state)
+    init = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))
     with without_optimizations():  # Both begin with the same state.
         first = init(jax.random.key(0))
     state, _ = jax.jit(iterate)(first)
-    assert int(state.good_trajectories.size) == 3
+    assert int(state.agent.buffer.size) == 3
     compiled = jax.jit(iterate)(state)
     # Eagerly each operation is compiled by itself, where nothing can be optimized.
     with jax.disable_jit(), without_optimizations():
@@ -112,18 +112,18 @@ def products(jaxpr):
 def test_matrices_are_multiplied_in_full_precision():
     """Products are in full float32; by default a GPU uses TF32."""
     highest = jax.lax.Precision.HIGHEST
-    env = gasil_jax.make_env("point_mass")
-    state = jax.eval_shape(lambda: gasil_jax.init(env, CONFIG, jax.random.key(0)))
-    jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
+    env = gasil_jax.make_env("point_mass", max_episode_steps=2)
+    state = jax.eval_shape(lambda: gasil_jax.init(env, ALGORITHM, jax.random.key(0)))
+    jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, ALGORITHM, x))(state)
     precisions = list(products(jaxpr.jaxpr))
     assert len(precisions) > 10
     assert set(precisions) == {(highest, highest)}
-    act = policy.from_state(gasil_jax.init(env, CONFIG, jax.random.key(0)), env)
+    act = policy.from_state(gasil_jax.init(env, ALGORITHM, jax.random.key(0)), env)
     precisions = list(
         products(jax.make_jaxpr(act)(jnp.zeros(env.observation_size)).jaxpr)
     )
     assert precisions and set(precisions) == {(highest, highest)}
     # What the program asks for itself it gets.
     with jax.default_matmul_precision("default"):
-        jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, CONFIG, x))(state)
+        jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, ALGORITHM, x))(state)
     assert (highest, highest) not in set(products(jaxpr.jaxpr))

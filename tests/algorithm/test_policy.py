@@ -19,24 +19,24 @@ pytestmark = pytest.mark.xdist_group("trained_point_mass")
 
 @pytest.fixture
 def saved(trained_point_mass, tmp_path_factory):
-    env, config, states = trained_point_mass
+    env, algorithm, states = trained_point_mass
     folder = tmp_path_factory.mktemp("run")
     policy_file.save(
         folder / "policy.npz", states, env, [5, 6, 7], np.array([1, 3, np.nan])
     )
-    return env, config, states, folder
+    return env, algorithm, states, folder
 
 
 @pytest.mark.parametrize("seed", [5, 6, 7, None])
 def test_it_is_the_networks_gaussian(saved, seed):
-    env, config, states, folder = saved
+    env, algorithm, states, folder = saved
     state = gasil_jax.member(states, 1 if seed is None else seed - 5)
     observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
     # The last one is far beyond the clip.
     observation = observation.at[-1].multiply(1e3)
     normalized = normalization.normalize(state.normalizer, observation)
     assert jnp.abs(normalized).max() == numpy_policy.CLIP
-    network = Policy(config.hidden_sizes, env.action_size)
+    network = Policy(algorithm.config.hidden_sizes, env.action_size)
     mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 
     act = gasil_jax.load_policy(folder, seed)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from gasil_jax import learner, ppo
-from gasil_jax.config import Hyperparameters
+from gasil_jax.config import Config
 
 
 def test_gae_equals_a_plain_loop():
@@ -27,7 +27,13 @@ def test_gae_equals_a_plain_loop():
                 if ended[t, env]:
                     break
     result = ppo.generalized_advantage_estimation(
-        reward, value, next_value, terminated, ended, gamma=gamma, gae_lambda=lam
+        reward,
+        value,
+        next_value,
+        terminated=terminated,
+        ended=ended,
+        gamma=gamma,
+        gae_lambda=lam,
     )
     np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-5)
 
@@ -36,7 +42,13 @@ def test_gae_equals_a_plain_loop():
 def test_truncation_bootstraps_and_termination_does_not(terminated):
     one = jnp.ones((1, 1))
     advantage = ppo.generalized_advantage_estimation(
-        one, 0 * one, 10 * one, one == terminated, one == 1, gamma=0.9, gae_lambda=0.5
+        one,
+        0 * one,
+        10 * one,
+        terminated=one == terminated,
+        ended=one == 1,
+        gamma=0.9,
+        gae_lambda=0.5,
     )
     np.testing.assert_allclose(advantage, 1.0 if terminated else 10.0)
 
@@ -57,9 +69,7 @@ def test_loss_equals_numpy():
         ]
     )
     old = log_prob + rng.normal(size=n) * 0.3
-    hp = Hyperparameters(
-        clip_epsilon=0.2, entropy_coefficient=0.01, value_coefficient=0.7
-    )
+    config = Config(clip_epsilon=0.2, entropy_coefficient=0.01, value_coefficient=0.7)
     surrogate = []
     for ratio, adv in zip(np.exp(log_prob - old), advantage, strict=True):
         surrogate.append(min(ratio * adv, min(max(ratio, 0.8), 1.2) * adv))
@@ -75,7 +85,7 @@ def test_loss_equals_numpy():
         batch,
         policy=lambda params, observation: (observation, params),
         value=lambda params, observation: jnp.asarray(value, jnp.float32),
-        hyperparameters=hp,
+        config=config,
     )
     np.testing.assert_allclose(total, expected, rtol=1e-5)
     kl = np.mean(np.exp(log_prob - old) - 1 - (log_prob - old))
@@ -84,12 +94,11 @@ def test_loss_equals_numpy():
 
 def test_a_step_clips_the_gradients_norm_and_is_adams():
     params, gradient = {"w": jnp.array([1.0, 2.0])}, {"w": jnp.array([3.0, 4.0])}
-    hp = Hyperparameters(max_grad_norm=1.0)
-    hp = hp.replace(learning_rate=0.1)
-    network = learner.init(params, ppo.optimizer(hp))
+    config = Config(max_grad_norm=1.0, learning_rate=0.1)
+    network = learner.init(params, ppo.optimizer(config))
     mean, square, expected = np.zeros(2), np.zeros(2), np.array([1.0, 2.0])
     for step in range(1, 4):
-        network = ppo.descend_one(network, gradient, hp)
+        network = ppo.descend_one(network, gradient, config)
         clipped = np.array([3.0, 4.0]) / 5.0
         mean = 0.9 * mean + 0.1 * clipped
         square = 0.999 * square + 0.001 * clipped**2

@@ -12,13 +12,12 @@ import gasil_jax
 from experiments.search import ADAPTIVE, AGENTS, DELAY, TASKS, Search
 from experiments.store import RESULTS, Store
 from gasil_envs import locomotion
-from gasil_jax import presets, run
-from gasil_jax.config import Config, validate
+from gasil_jax import algorithms, presets, run
 from gasil_jax.host import run_options
 
 
 def parse(*arguments):
-    return run_options.parse(run_options.Options, ["--env", *arguments], "x").config
+    return run_options.parse(run_options.Options, ["--env", *arguments], "x").algorithm
 
 
 @pytest.mark.parametrize("name", presets.names())
@@ -27,9 +26,9 @@ def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
     rows = presets.PRESETS[name][reward_delay > 1]
     for (env, agent), overrides in rows.items():
         assert env in gasil_envs.names() and agent in gasil_jax.agents()
-        config = gasil_jax.preset(env, agent, name, reward_delay=reward_delay)
-        validate(config)
-        assert overrides and config != Config(agent=agent)
+        algorithm = gasil_jax.preset(env, agent, name, reward_delay=reward_delay)
+        algorithms.check(algorithm)
+        assert overrides and algorithm != gasil_jax.algorithm(agent)
 
 
 @pytest.mark.parametrize("reward_delay", [1, DELAY])
@@ -40,7 +39,7 @@ def test_the_tuned_rows_are_what_the_searches_chose(env, reward_delay):
         search = Search(env, agent, reward_delay)
         if agent != ADAPTIVE and (point := search.chosen(store)) is not None:
             tuned = gasil_jax.preset(env, agent, reward_delay=reward_delay)
-            assert tuned == search.config(point)
+            assert tuned == search.algorithm(point)
 
 
 @pytest.mark.parametrize("env", TASKS)
@@ -48,7 +47,7 @@ def test_the_rows_on_decomposed_rewards_are_the_best_of_their_searches(env):
     search = Search(env, "ppo", DELAY, decompose_rewards=True)
     point = search.leading(Store(RESULTS / "runs"))
     row = gasil_jax.preset(env, "ppo", "decomposed", reward_delay=DELAY)
-    assert row == search.config(point) and row.decompose_rewards
+    assert row == search.algorithm(point) and row.settings["decompose_rewards"]
 
 
 @pytest.mark.parametrize("env", TASKS)
@@ -66,8 +65,21 @@ def test_scaled_rows_follow_the_number_of_actions(env):
         row = gasil_jax.preset(env, "ppo", "scaled", reward_delay=delay)
         for name, values in ends.items():
             expected = np.interp(actions, (2, 8), values)
-            assert getattr(row.hyperparameters, name) == pytest.approx(expected)
-        assert row.decompose_rewards == (delay > 1)
+            assert row.settings[name] == pytest.approx(expected)
+        assert row.settings["decompose_rewards"] == (delay > 1)
+        sized = gasil_jax.preset(
+            "brax:reacher", "ppo", "scaled", reward_delay=delay, action_size=actions
+        )
+        assert sized == row
+
+
+def test_an_environment_of_ones_own_is_scaled_by_its_actions():
+    row = gasil_jax.preset("my:env", "ppo", "scaled", action_size=2)
+    # It has two, and fewer have the values of two.
+    assert parse("point_mass", "--agent", "ppo", "--preset", "scaled") == row
+    assert gasil_jax.preset("my:env", "ppo", "scaled", action_size=1) == row
+    with pytest.raises(ValueError, match=r"has nothing for agent 'ppo' on my:env"):
+        gasil_jax.preset("my:env", "ppo", "scaled")
 
 
 def test_the_command_line_starts_from_the_preset():
@@ -75,39 +87,40 @@ def test_the_command_line_starts_from_the_preset():
         "point_mass", "gasil"
     )
     without_row = parse("point_mass", "--agent", "ppo+bonus")
-    assert without_row == Config(agent="ppo+bonus")
+    assert without_row == gasil_jax.algorithm("ppo+bonus")
     delayed = parse("walker2d", "--reward-delay", "20")
     assert delayed == gasil_jax.preset("walker2d", "ppo+gasil", reward_delay=20)
     assert delayed != parse("walker2d")
 
 
 def test_flags_override_the_preset():
-    config = parse("point_mass", "--agent", "gasil", "--alpha", "0.3")
-    assert config.hyperparameters.alpha == 0.3
-    assert config.hyperparameters.discriminator_updates == 20
+    agent = parse("point_mass", "--agent", "gasil", "--alpha", "0.3").agent
+    assert agent.alpha == 0.3
+    assert agent.discriminator_updates == 20
 
 
 @pytest.mark.parametrize("env", ["walker2d", "point_mass"])
 def test_the_papers_batch_is_of_one_environment(env):
-    config = parse(env, "--preset", "paper")
+    config = parse(env, "--preset", "paper").config
     assert (config.num_envs, config.num_steps) == (1, 2048)
     assert not config.stagger_episodes
-    assert parse(env, "--preset", "paper", "--num-envs", "8").num_envs == 8
+    more = parse(env, "--preset", "paper", "--num-envs", "8")
+    assert more.config.num_envs == 8
 
 
 def test_the_papers_rule_for_humanoid():
-    config = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper")
-    assert config.hyperparameters.alpha == 0.02
-    assert config.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
+    agent = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper").agent
+    assert agent.alpha == 0.02
+    assert agent.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
 
 
 def test_a_preset_that_has_nothing_for_the_run_is_refused(capsys):
-    """But for the default, with which a run starts from the defaults of `Config`."""
-    arguments = ["--env", "point_mass", "--agent", "ppo", "--preset", "scaled"]
+    """But for the default, with which a run starts from the defaults."""
+    arguments = ["--env", "point_mass", "--agent", "gasil", "--preset", "scaled"]
     assert run.main(arguments) == 2
     assert (
-        "preset 'scaled' has nothing for agent 'ppo' on point_mass with dense rewards: "
-        "it has ppo on hopper, walker2d, halfcheetah, swimmer, ant, humanoid"
+        "preset 'scaled' has nothing for agent 'gasil' on point_mass with dense "
+        "rewards: it has ppo on hopper, walker2d, halfcheetah, swimmer, ant, humanoid"
     ) in capsys.readouterr().err
     with pytest.raises(ValueError, match="with dense rewards: it has rows for delayed"):
         gasil_jax.preset("walker2d", "ppo", "decomposed")

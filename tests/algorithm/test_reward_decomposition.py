@@ -10,16 +10,16 @@ from brax.envs import State
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax import good_trajectories, normalization, reward_decomposition
-from gasil_jax.imitation import AGENTS
+from gasil_jax import good_trajectories, normalization
+from gasil_jax.context import Context, Sizes
+from gasil_jax.rewards import decomposition
 from gasil_jax.rollout import Rollout
 
 NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT = 3, 8, 20, 2, 1
 CONFIG = gasil_jax.Config(
-    num_envs=NUM_ENVS,
-    batch_steps=NUM_ENVS * NUM_STEPS,
-    minibatch_size=NUM_STEPS,
-    decompose_rewards=True,
+    num_envs=NUM_ENVS, batch_steps=NUM_ENVS * NUM_STEPS, minibatch_size=NUM_STEPS
+)
+MODEL = gasil_jax.Decompose(
     decomposition_window_steps=4,
     decomposition_minibatch_size=32,
     decomposition_hidden_sizes=(16,),
@@ -58,6 +58,7 @@ def random_batches(seed, num_batches, delay=5):
             truncated=np.zeros(shape, bool),
             episode_return=zeros,
             discounted_return=zeros,
+            undiscounted_return=zeros,
             episode_length=np.zeros(shape, np.int32),
             faulty=faulty,
             cut_short=ended & ~faulty & (rng.random(shape) < 0.2),
@@ -66,29 +67,28 @@ def random_batches(seed, num_batches, delay=5):
 
 @functools.cache
 def decompose_once():
-    def step(decomposition, history, batch, key, learning_rate):
+    def step(state, history, batch, key, learning_rate):
         history = good_trajectories.record(
             history,
             batch.observation,
             batch.action,
-            jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
-            batch.ended,
-            batch.next_observation,
+            reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
+            ended=batch.ended,
+            next_observation=batch.next_observation,
         )
-        hyperparameters = CONFIG.hyperparameters.replace(
-            decomposition_learning_rate=learning_rate
-        )
-        decomposition, batch, _, metrics = reward_decomposition.decompose(
-            decomposition,
-            batch,
-            history,
-            normalization.init(OBS),
-            key,
-            config=CONFIG,
-            hyperparameters=hyperparameters,
+        context = Context(
+            rollout=batch,
+            history=history,
+            normalizer=normalization.init(OBS),
+            reward_scale=jnp.float32(1.0),
             action_range=(-1.0, 1.0),
+            config=CONFIG,
+            policy=None,
+            value=None,
         )
-        return decomposition, history, batch.reward, metrics
+        model = MODEL.replace(decomposition_learning_rate=learning_rate)
+        state, context, _, metrics = model.update(state, context, key)
+        return state, history, context.rollout.reward, metrics
 
     return jax.jit(step)
 
@@ -96,25 +96,39 @@ def decompose_once():
 def decompose_all(batches, failed=()):
     """Decompose all batches; updates of the network after some of them are infinite."""
     history = good_trajectories.init_history(
-        NUM_ENVS, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True
+        NUM_ENVS,
+        NUM_STEPS,
+        LIMIT,
+        observation_size=OBS,
+        action_size=ACT,
+        keep_next=True,
     )
-    decomposition = reward_decomposition.init(jax.random.key(0), CONFIG, history, ACT)
+    history_steps = history.reward.shape[1]
+    state = MODEL.init(
+        jax.random.key(0), Sizes(CONFIG.num_envs, OBS, ACT, history_steps)
+    )
     for i, batch in enumerate(batches):
-        decomposition, history, reward, metrics = decompose_once()(
-            decomposition,
+        state, history, reward, metrics = decompose_once()(
+            state,
             history,
             batch,
             jax.random.key(i),
             jnp.inf if i in failed else 1e-3,
         )
-        yield decomposition, history, np.asarray(reward), metrics
+        yield state, history, np.asarray(reward), metrics
 
 
 @pytest.mark.parametrize(("num_episodes", "complete"), [(1, 1), (4, 4)])
 def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, complete):
     """A window as long as an episode is complete only where all of it is kept."""
     history = good_trajectories.init_history(
-        1, NUM_STEPS, LIMIT, OBS, ACT, keep_next=True, num_episodes=num_episodes
+        1,
+        NUM_STEPS,
+        LIMIT,
+        observation_size=OBS,
+        action_size=ACT,
+        keep_next=True,
+        num_episodes=num_episodes,
     )
     most = 0
     for batch in range(30):
@@ -122,32 +136,48 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
         ended = (step + 1) % LIMIT == 0
         zeros = jnp.zeros((NUM_STEPS, 1, OBS))
         history = good_trajectories.record(
-            history, zeros, zeros[..., :ACT], ended * 1.0, ended, zeros
+            history,
+            zeros,
+            zeros[..., :ACT],
+            reward=ended * 1.0,
+            ended=ended,
+            next_observation=zeros,
         )
         recorded = jnp.int32((batch + 1) * NUM_STEPS)
-        windows = reward_decomposition.windows(history, recorded)
+        windows = decomposition.windows(history, recorded)
         most = max(most, int(windows.ends.sum()))
         assert (windows.length[windows.ends] == LIMIT).all()
     assert most == complete
 
 
-def test_the_length_of_the_history_follows_the_configuration():
+def test_the_length_of_the_history_follows_the_agent_and_the_models():
     env = gasil_jax.make_env("point_mass")
-    length = lambda **changes: jax.eval_shape(
-        lambda: gasil_jax.init(env, CONFIG.replace(**changes), jax.random.key(0))
-    ).history.reward.shape[1]
-    episode = env.episode_length
-    assert length() == -(-(episode + NUM_STEPS) // NUM_STEPS) * NUM_STEPS
-    longer = length(decomposition_history_episodes=3)
-    assert longer == -(-(3 * episode + NUM_STEPS) // NUM_STEPS) * NUM_STEPS
-    plain = {"decompose_rewards": False, "decomposition_history_episodes": 3}
-    assert length(**plain) == length()
+    history = lambda *parts: (
+        jax.eval_shape(
+            lambda: gasil_jax.init(
+                env, gasil_jax.Algorithm(*parts, config=CONFIG), jax.random.key(0)
+            )
+        ).history
+    )
+    length = lambda *parts: history(*parts).reward.shape[1]
+    ppo, buffered = gasil_jax.PPO(), gasil_jax.PPOGASIL()
+    long = MODEL.replace(decomposition_history_episodes=3)
+    for episodes, *parts in (
+        (1, ppo, (MODEL,)),
+        (1, buffered),
+        (1, buffered, (MODEL,)),
+        (3, ppo, (long,)),
+        (3, buffered, (long,)),
+    ):
+        steps = episodes * env.episode_length + NUM_STEPS
+        assert length(*parts) == -(-steps // NUM_STEPS) * NUM_STEPS
+    assert history(ppo, (gasil_jax.Normalize(),)) is None
 
 
 def test_windows_of_the_history_are_those_of_a_plain_loop():
     batches = list(random_batches(0, 9))
     steps = []
-    for batch, (decomposition, history, _, _) in zip(
+    for batch, (state, history, _, _) in zip(
         batches, decompose_all(batches), strict=True
     ):
         unknown = batch.faulty | batch.cut_short
@@ -165,7 +195,7 @@ def test_windows_of_the_history_are_those_of_a_plain_loop():
                         position = ring - len(steps) + t
                         expected[env, position] = (payout[env], t + 1 - begin)
                     begin = t + 1
-        result = reward_decomposition.windows(history, decomposition.recorded_steps)
+        result = decomposition.windows(history, state.recorded_steps)
         ends = np.nonzero(np.asarray(result.ends))
         assert set(zip(*ends, strict=True)) == set(expected)
         for place, (payout, length) in expected.items():
@@ -198,9 +228,9 @@ def test_a_window_is_given_what_it_paid():
 def test_in_the_history_every_window_has_what_it_paid():
     """Also one that began in an earlier batch, for a replay of whole episodes."""
     begin_before = 0
-    for decomposition, history, _, _ in decompose_all(random_batches(1, 9)):
-        complete = reward_decomposition.windows(history, decomposition.recorded_steps)
-        reward = np.asarray(history.in_time(decomposition.reward))
+    for state, history, _, _ in decompose_all(random_batches(1, 9)):
+        complete = decomposition.windows(history, state.recorded_steps)
+        reward = np.asarray(history.in_time(state.reward))
         for env, end in zip(*np.nonzero(np.asarray(complete.ends)), strict=True):
             begin = end + 1 - int(complete.length[env, end])
             begin_before += begin < reward.shape[1] - NUM_STEPS <= end
@@ -217,7 +247,7 @@ def test_a_failed_update_leaves_the_network_and_nothing_else():
     batches = list(random_batches(2, 5))
     usual = list(decompose_all(batches))
     failed = list(decompose_all(batches, failed=(1,)))
-    before, after = (decomposition for decomposition, *_ in failed[:2])
+    before, after = (state for state, *_ in failed[:2])
     for old, new in zip(
         jax.tree.leaves(before.network), jax.tree.leaves(after.network), strict=True
     ):
@@ -228,8 +258,8 @@ def test_a_failed_update_leaves_the_network_and_nothing_else():
         np.testing.assert_array_equal(left.open_steps, right.open_steps)
         np.testing.assert_array_equal(left.rates.mean, right.rates.mean)
         for mine, other in zip(
-            reward_decomposition.windows(history, left.recorded_steps),
-            reward_decomposition.windows(history, right.recorded_steps),
+            decomposition.windows(history, left.recorded_steps),
+            decomposition.windows(history, right.recorded_steps),
             strict=True,
         ):
             np.testing.assert_array_equal(mine, other)
@@ -239,7 +269,7 @@ def test_fit_is_r_squared_of_the_windows_that_count():
     rng = np.random.default_rng(0)
     predicted, actual = rng.normal(size=(2, 7, 3)).astype(np.float32)
     valid = rng.random((7, 3)) < 0.5
-    metrics = reward_decomposition.goodness_of_fit(predicted, actual, valid)
+    metrics = decomposition.goodness_of_fit(predicted, actual, valid)
     p, a = predicted[valid], actual[valid]
     np.testing.assert_allclose(
         metrics["decomposition_fit"],
@@ -254,7 +284,7 @@ def test_fit_is_r_squared_of_the_windows_that_count():
         (np.full_like(actual, -1.3), valid),
         (np.zeros_like(actual), valid),
     ):
-        unknown = reward_decomposition.goodness_of_fit(predicted, paid, counts)
+        unknown = decomposition.goodness_of_fit(predicted, paid, counts)
         assert np.isnan(unknown["decomposition_fit"])
 
 
@@ -262,7 +292,7 @@ def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():
     length = jnp.array([1, 4, 9])
     keys = jax.random.split(jax.random.key(0), 200)
     offset, weight = jax.vmap(
-        lambda key: reward_decomposition.sample_window_steps(key, length, 4)
+        lambda key: decomposition.sample_window_steps(key, length, 4)
     )(keys)
     np.testing.assert_allclose(weight.sum(axis=-1), 1.0, rtol=1e-6)
     assert (weight[:, 0] > 0).sum() == 200  # one step of it
@@ -307,83 +337,78 @@ class Line:
 
 
 def test_where_every_step_pays_it_changes_nothing():
-    config = SMALL.replace(agent="ppo")
-    run = lambda config: jax.jit(gasil_jax.make_train(Line(), config))(
-        jax.random.key(0)
-    )
-    (plain, _), (state, metrics) = (
-        run(config),
-        run(config.replace(decompose_rewards=True)),
-    )
+    run = lambda **changes: jax.jit(
+        gasil_jax.make_train(Line(), SMALL["ppo"].replace(**changes))
+    )(jax.random.key(0))
+    (plain, _), (state, metrics) = run(), run(decompose_rewards=True)
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
     jax.tree.map(close, state.actor_critic, plain.actor_critic)
     # The network learns nothing: no window has more than one step.
     assert np.all(np.isnan(metrics["decomposition_fit"]))
-    assert np.all(state.reward_decomposition.network.optimizer_state.count == 0)
+    (model,) = state.rewards
+    assert np.all(model.network.optimizer_state.count == 0)
 
 
 def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
     env = gasil_jax.make_env("point_mass", reward_delay=50)
     config = gasil_jax.Config(
-        agent="ppo",
-        total_steps=20 * 2048,
-        num_epochs=5,
-        hidden_sizes=(64,),
-        decomposition_minibatch_size=16,
-        decomposition_hidden_sizes=(32,),
-        hyperparameters=gasil_jax.Hyperparameters(learning_rate=6e-4),
+        total_steps=20 * 2048, num_epochs=5, hidden_sizes=(64,), learning_rate=6e-4
+    )
+    model = gasil_jax.Decompose(
+        decomposition_minibatch_size=16, decomposition_hidden_sizes=(32,)
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
 
-    def late(**changes):
-        train = gasil_jax.make_train(env, config.replace(**changes))
+    def late(*rewards):
+        algorithm = gasil_jax.Algorithm(gasil_jax.PPO(), rewards, config)
+        train = gasil_jax.make_train(env, algorithm)
         metrics = jax.jit(jax.vmap(train))(keys)[1]
         return np.asarray(metrics["episode_return"])[:, -5:].mean()
 
-    with_it, without = late(decompose_rewards=True), late()
+    with_it, without = late(model), late()
     print("returns:", with_it, without)
     assert with_it > without + 2.0
 
 
+class Look(gasil_jax.PPOBC):
+    """Reports the share of the steps that pay, in the batch and in the history."""
+
+    def update_and_reward(self, state, context, key):
+        reward = context.rollout.reward
+        paid = lambda reward: jnp.mean(reward != 0.0)
+        metrics = {"batch": paid(reward), "history": paid(context.history.reward)}
+        return state, reward, metrics
+
+
 def test_agents_and_ppo_see_decomposed_rewards_and_the_buffer_the_environments():
     env = gasil_jax.make_env("point_mass", reward_delay=50)
-    config = SMALL.replace(agent="ppo", decompose_rewards=True)
-    seen = {}
-
-    def look(state, context, key):
-        seen.update(batch=context.rollout.reward, history=context.history.reward)
-        return state, context.rollout.reward, dict(zip("ab", map(paid, seen.values())))
-
-    paid = lambda reward: jnp.mean(reward != 0.0)
-    AGENTS["look"] = AGENTS["ppo"]._replace(update_and_reward=look)
-    try:
-        train = gasil_jax.make_train(env, config.replace(agent="look"))
-        state, metrics = jax.jit(train)(jax.random.key(0))
-    finally:
-        del AGENTS["look"]
+    config = SMALL["ppo"].config
+    algorithm = gasil_jax.Algorithm(Look(), (gasil_jax.Decompose(),), config)
+    train = gasil_jax.make_train(env, algorithm)
+    state, metrics = jax.jit(train)(jax.random.key(0))
     # Of 50 steps one pays, of the decomposed rewards all do; half of the history is
     # not recorded yet.
-    assert metrics["a"][-1] > 0.9 and metrics["b"][-1] > 0.45
+    assert metrics["batch"][-1] > 0.9 and metrics["history"][-1] > 0.45
     # First episodes that were cut short have no return: NaN, and harmless.
     assert np.isnan(state.history.reward).any()
     assert np.all(metrics["skipped_updates"] == 0)
     assert jnp.nanmean(state.history.reward != 0.0) < 0.1
-    assert state.good_trajectories.size > 0
+    assert state.agent.size > 0
 
 
 def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():
     rng = np.random.default_rng(0)
     rows, target = rng.normal(size=(12, 3)), rng.normal(size=12)
     gradient = jax.grad(lambda w, drawn: jnp.mean((drawn[0] @ w - drawn[1]) ** 2))
-    of = lambda parts: reward_decomposition.mean_gradient(
-        gradient, jnp.ones(3), (rows, target), parts
+    of = lambda parts: decomposition.mean_gradient(
+        gradient, jnp.ones(3), (rows, target), parts=parts
     )
     for parts in (2, 3, 12):
         np.testing.assert_allclose(of(parts), of(1), rtol=1e-5)
 
 
 def test_large_inputs_are_read_in_as_few_parts_as_fit():
-    num_parts = reward_decomposition.num_parts
+    num_parts = decomposition.num_parts
     assert num_parts(64, 32 * 40) == 1
     assert num_parts(64, 32 * 713) == 4
     assert num_parts(7, 2**18) == 7

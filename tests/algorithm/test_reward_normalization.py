@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gasil_jax
-from gasil_jax import reward_normalization
+from gasil_jax.rewards import normalization
 
 
 def plain_scale(reward, ended, gamma):
@@ -22,20 +22,18 @@ def test_batches_give_the_scale_of_all_steps():
     rng = np.random.default_rng(0)
     reward = rng.normal(0.5, 30.0, (60, 3))
     ended = rng.random((60, 3)) < 0.1
-    normalizer = reward_normalization.init(3)
+    normalizer = normalization.init(3)
     for begin, end in ((0, 7), (7, 8), (8, 60)):
-        normalizer = reward_normalization.update(
+        normalizer = normalization.update(
             normalizer,
             jnp.asarray(reward[begin:end], jnp.float32),
             jnp.asarray(ended[begin:end]),
             0.9,
         )
         expected = plain_scale(reward[:end], ended[:end], 0.9)
-        np.testing.assert_allclose(
-            reward_normalization.scale(normalizer), expected, rtol=1e-4
-        )
+        np.testing.assert_allclose(normalization.scale(normalizer), expected, rtol=1e-4)
     rewards = jnp.array([30.0, -1e9])
-    normalized = reward_normalization.normalize(normalizer, rewards, 10.0)
+    normalized = normalization.normalize(normalizer, rewards, 10.0)
     np.testing.assert_allclose(normalized, [30.0 / expected, -10.0], rtol=1e-4)
 
 
@@ -45,41 +43,38 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
     for length in (20, 1000):
         reward = np.zeros((2 * length, 4), np.float32)
         reward[length - 1 :: length] = payments = rng.uniform(500, 3000, (2, 4))
-        normalizer = reward_normalization.update(
-            reward_normalization.init(4),
+        normalizer = normalization.update(
+            normalization.init(4),
             jnp.asarray(reward),
             jnp.asarray(reward > 0),
             0.99,
         )
         scale = plain_scale(reward, reward > 0, 0.99)
         expected = np.mean(payments / scale > 10.0)
-        share[length] = reward_normalization.clipped(
-            normalizer, jnp.asarray(reward), 10.0
-        )
+        share[length] = normalization.clipped(normalizer, jnp.asarray(reward), 10.0)
         np.testing.assert_allclose(share[length], expected)
         for clip in (10.0, 1e9):
             np.testing.assert_allclose(
-                reward_normalization.normalize(normalizer, jnp.asarray(reward), clip),
+                normalization.normalize(normalizer, jnp.asarray(reward), clip),
                 np.minimum(reward / scale, clip),
                 rtol=1e-4,
             )
     assert share[20] == 0.0 and share[1000] > 0.5
     nothing = jnp.zeros((5, 4))
-    assert np.isnan(reward_normalization.clipped(normalizer, nothing, 10.0))
+    assert np.isnan(normalization.clipped(normalizer, nothing, 10.0))
 
 
 def test_no_reward_stays_none():
     nothing = jnp.zeros((5, 2))
-    normalizer = reward_normalization.update(
-        reward_normalization.init(2), nothing, nothing > 0, 0.99
-    )
-    assert not np.any(reward_normalization.normalize(normalizer, nothing, 10.0))
+    normalizer = normalization.update(normalization.init(2), nothing, nothing > 0, 0.99)
+    assert not np.any(normalization.normalize(normalizer, nothing, 10.0))
 
 
 def test_without_normalization_there_is_no_scale():
-    env, config = gasil_jax.make_env("point_mass"), gasil_jax.Config(total_steps=2048)
+    env = gasil_jax.make_env("point_mass")
     for normalize in (True, False):
-        train = gasil_jax.make_train(env, config.replace(normalize_rewards=normalize))
+        algorithm = gasil_jax.algorithm(total_steps=2048, normalize_rewards=normalize)
+        train = gasil_jax.make_train(env, algorithm)
         _, metrics = jax.eval_shape(train, jax.random.key(0))
         assert ("reward_scale" in metrics) == normalize
         assert ("clipped_rewards" in metrics) == normalize

@@ -22,24 +22,23 @@ def test_the_papers_rule_for_humanoid(steps, expected):
 
 
 def test_steps_beyond_a_32_bit_integer():
-    config = gasil_jax.Config(batch_steps=2**21, alpha_schedule=HUMANOID)
-    at = schedules.at(config, config.hyperparameters, jnp.int32(1024))
-    np.testing.assert_allclose(at.alpha, config.hyperparameters.alpha)
+    algorithm = gasil_jax.algorithm(batch_steps=2**21, alpha_schedule=HUMANOID)
+    at = schedules.at(algorithm, algorithm.hyperparameters, jnp.int32(1024))
+    np.testing.assert_allclose(at.agent.alpha, algorithm.agent.alpha)
 
 
 def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
-    config = gasil_jax.Config(total_steps=4 * 2048)
-    hp = config.hyperparameters
-    at = lambda iteration: schedules.at(config, hp, jnp.int32(iteration))
+    algorithm = gasil_jax.algorithm(total_steps=4 * 2048, normalize_rewards=True)
+    hyperparameters = algorithm.hyperparameters
     for iteration in range(4):
-        expected = hp.learning_rate * (1 - iteration / 4)
-        np.testing.assert_allclose(at(iteration).learning_rate, expected, rtol=1e-6)
-        np.testing.assert_allclose(at(iteration).clip_epsilon, hp.clip_epsilon)
-        np.testing.assert_allclose(at(iteration).alpha, hp.alpha)
+        now = schedules.at(algorithm, hyperparameters, jnp.int32(iteration))
+        rate = hyperparameters["learning_rate"] * (1 - iteration / 4)
+        np.testing.assert_allclose(now.config.learning_rate, rate, rtol=1e-6)
+        assert now == algorithm.replace(learning_rate=now.config.learning_rate)
 
 
 def test_a_run_follows_its_schedules():
-    config = gasil_jax.Config(
+    algorithm = gasil_jax.algorithm(
         total_steps=1024,
         batch_steps=256,
         num_envs=4,
@@ -49,7 +48,7 @@ def test_a_run_follows_its_schedules():
         learning_rate_schedule=((0, 1.0), (256, 0.0)),
     )
     env = gasil_jax.make_env("point_mass")
-    _, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    _, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
     bonus, rate = np.asarray(metrics["bonus"]), np.asarray(metrics["learning_rate"])
     assert np.all(bonus[:2] == 0) and np.all(bonus[2:] > 0)
     assert rate[0] > 0 and np.all(rate[1:] == 0)
@@ -59,20 +58,20 @@ def test_a_run_follows_its_schedules():
 
 def test_an_optax_schedule_is_the_factor():
     halved = optax.piecewise_constant_schedule(1.0, {2 * 2048: 0.5})
-    config = gasil_jax.Config(
+    algorithm = gasil_jax.algorithm(
         alpha_schedule=halved,
         clip_epsilon_schedule=optax.linear_schedule(1.0, 0.0, 4 * 2048),
     )
     env = gasil_jax.make_env("point_mass")
-    gasil_jax.make_train(env, config)  # is accepted
-    hp = config.hyperparameters
-    at = jax.jit(lambda iteration: schedules.at(config, hp, iteration))
+    gasil_jax.make_train(env, algorithm)  # is accepted
+    before = algorithm.hyperparameters
+    at = jax.jit(lambda x: schedules.at(algorithm, before, x).hyperparameters)
     for iteration in range(6):
         now = at(jnp.int32(iteration))
-        expected = hp.alpha * (1.0 if iteration < 2 else 0.5)
-        np.testing.assert_allclose(now.alpha, expected, rtol=1e-6)
-        expected = hp.clip_epsilon * max(0.0, 1 - iteration / 4)
-        np.testing.assert_allclose(now.clip_epsilon, expected, rtol=1e-6)
+        expected = before["alpha"] * (1.0 if iteration < 2 else 0.5)
+        np.testing.assert_allclose(now["alpha"], expected, rtol=1e-6)
+        expected = before["clip_epsilon"] * max(0.0, 1 - iteration / 4)
+        np.testing.assert_allclose(now["clip_epsilon"], expected, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -81,11 +80,11 @@ def test_an_optax_schedule_is_the_factor():
 def test_a_bad_schedule_is_refused(points):
     env = gasil_jax.make_env("point_mass")
     with pytest.raises(ValueError, match="alpha_schedule is"):
-        gasil_jax.make_train(env, gasil_jax.Config(alpha_schedule=points))
+        gasil_jax.make_train(env, gasil_jax.algorithm(alpha_schedule=points))
 
 
 def test_a_longer_loop_does_not_anneal_below_0():
-    config = gasil_jax.Config(total_steps=4 * 2048)
+    algorithm = gasil_jax.algorithm(total_steps=4 * 2048)
     for iteration in (4, 5, 9):
-        at = schedules.at(config, config.hyperparameters, jnp.int32(iteration))
-        assert at.learning_rate == 0.0
+        at = schedules.at(algorithm, algorithm.hyperparameters, jnp.int32(iteration))
+        assert at.config.learning_rate == 0.0

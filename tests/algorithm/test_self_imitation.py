@@ -14,7 +14,9 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
     """Four batches of three steps in two environments, against lists of episodes."""
     rng = np.random.default_rng(1)
     num_steps, num_envs, capacity = 3, 2, 15
-    history = good_trajectories.init_history(num_envs, num_steps, 9, 1, 1)
+    history = good_trajectories.init_history(
+        num_envs, num_steps, 9, observation_size=1, action_size=1
+    )
     replay = self_imitation.init_replay(capacity, 1, 1)
     running = [[] for _ in range(num_envs)]
     expected = []
@@ -25,9 +27,9 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
         if batch == 3:
             reward[1, 0] = np.nan
         history = good_trajectories.record(
-            history, observation, -observation, reward, ended
+            history, observation, -observation, reward=reward, ended=ended
         )
-        replay = self_imitation.insert(replay, history, num_steps, GAMMA)
+        replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
         for env in range(num_envs):
             for t in range(num_steps):
                 running[env].append((observation[t, env, 0], reward[t, env]))

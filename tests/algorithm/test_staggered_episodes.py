@@ -104,23 +104,27 @@ def test_an_episode_that_ends_by_itself_before_it_is_cut_is_whole():
     assert (np.asarray(batch.episode_length[-1])[early] == 4).all()
 
 
-@pytest.mark.parametrize("agent", ["ppo+gasil", "ppo+sil"])
+@pytest.mark.parametrize(
+    "agent",
+    [
+        gasil_jax.PPOGASIL(buffer_steps=30, discriminator_hidden_sizes=(4,)),
+        gasil_jax.PPOSIL(sil_buffer_steps=300, sil_minibatch_size=8),
+    ],
+    ids=lambda agent: agent.name,
+)
 def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
     """Each would prefer it: its return is higher than that of a whole episode."""
     env = make()
     config = gasil_jax.Config(
-        agent=agent,
         total_steps=3 * 64,
         num_envs=8,
         batch_steps=64,
         num_epochs=1,
         hidden_sizes=(4,),
-        discriminator_hidden_sizes=(4,),
-        sil_buffer_steps=300,
-        sil_minibatch_size=8,
-        hyperparameters=gasil_jax.Hyperparameters(gamma=1.0, buffer_steps=30),
+        gamma=1.0,
     )
-    iterate = jax.jit(lambda state: gasil_jax.iterate(env, config, state))
+    algorithm = gasil_jax.Algorithm(agent, config=config)
+    iterate = jax.jit(lambda state: gasil_jax.iterate(env, algorithm, state))
 
     def train(state):
         rows = []
@@ -129,24 +133,24 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
             rows.append(metrics)
         return state, jax.tree.map(lambda *x: np.stack(x), *rows)
 
-    first = gasil_jax.init(env, config, jax.random.key(0))
+    first = gasil_jax.init(env, algorithm, jax.random.key(0))
     state, metrics = train(first)
     assert np.nansum(metrics["episodes"]) > 0
     ended = np.asarray(metrics["episodes"]) > 0
     assert (np.asarray(metrics["episode_length"])[ended] == LIMIT).all()
     assert (np.asarray(metrics["episode_return"])[ended] == -LIMIT).all()
-    size = int(state.good_trajectories.size)
-    assert size == 30
-    np.testing.assert_array_equal(state.good_trajectories.return_[:size], -LIMIT)
-    if agent == "ppo+sil":
+    if agent.name == "ppo+gasil":
+        assert int(state.agent.buffer.size) == 30
+        np.testing.assert_array_equal(state.agent.buffer.return_, -LIMIT)
+    else:
         # A whole episode's steps have the returns -1 to -LIMIT, each as often.
-        replay = state.imitation
+        replay = state.agent
         returns = -np.asarray(replay.return_)[np.asarray(replay.priority) > 0]
         counts = np.bincount(returns.astype(int), minlength=LIMIT + 1)[1:]
         assert (counts == counts[0]).all() and counts[0] > 0
         assert counts[0] == np.nansum(metrics["episodes"])
     # All began together: more whole episodes, none cut.
-    together = config.replace(stagger_episodes=False)
+    together = algorithm.replace(stagger_episodes=False)
     ages = gasil_jax.init(env, together, jax.random.key(0)).environments.starting_age
     assert not ages.any() and first.environments.starting_age.any()
     environments = first.environments.replace(starting_age=ages)

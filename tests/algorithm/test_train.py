@@ -1,5 +1,6 @@
 """The training loop on the point mass."""
 
+import dataclasses
 import functools
 
 import brax.envs
@@ -12,33 +13,43 @@ import pytest
 import gasil_jax
 from gasil_jax import learner, rollout
 from gasil_jax import train as training
-from gasil_jax.imitation import AGENTS, none
 
-SMALL = gasil_jax.Config(
+CONFIG = gasil_jax.Config(
     total_steps=512,
     num_envs=4,
     batch_steps=256,
     minibatch_size=64,
     num_epochs=2,
     hidden_sizes=(16,),
-    discriminator_hidden_sizes=(16,),
-    sil_buffer_steps=500,
-    sil_minibatch_size=64,
-    hyperparameters=gasil_jax.Hyperparameters(
-        discriminator_updates=2, buffer_steps=100
-    ),
 )
+IMITATION = {
+    "discriminator_hidden_sizes": (16,),
+    "discriminator_updates": 2,
+    "buffer_steps": 100,
+}
+AGENTS = (
+    gasil_jax.PPO(),
+    gasil_jax.PPOBonus(),
+    gasil_jax.PPOBC(buffer_steps=100),
+    gasil_jax.PPOSIL(sil_buffer_steps=500, sil_minibatch_size=64),
+    gasil_jax.GASIL(**IMITATION),
+    gasil_jax.PPOGASIL(**IMITATION),
+    gasil_jax.PPOGASILAdaptive(**IMITATION),
+)
+#: A small algorithm of each agent, by the agent's name.
+SMALL = {agent.name: gasil_jax.Algorithm(agent, config=CONFIG) for agent in AGENTS}
+PPO, PPO_GASIL = SMALL["ppo"], SMALL["ppo+gasil"]
 
 
 def test_it_trains_an_environment_of_brax():
-    env = gasil_jax.make_env("brax:fast")
+    env = gasil_jax.make_env("brax:fast", max_episode_steps=50)
     assert env.observation_size == env.unwrapped.observation_size
-    config = SMALL.replace(agent="ppo", total_steps=1024, max_episode_steps=50)
-    state, metrics = jax.jit(gasil_jax.make_train(env, config))(jax.random.key(0))
+    algorithm = SMALL["ppo+bc"].replace(total_steps=1024)
+    state, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
     assert np.all(np.isfinite(metrics["policy_loss"]))
     # No episode ends by itself, and none is longer than the limit.
     assert set(np.asarray(metrics["episode_length"])) == {50.0}
-    assert int(state.good_trajectories.size) > 0
+    assert int(state.agent.size) > 0
 
 
 def test_an_environment_with_the_physics_of_brax_can_be_traced():
@@ -73,7 +84,6 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"agent": "ppo+gasill"}, r"'ppo\+gasil'"),
         ({"num_envs": 0}, "num_envs is 0"),
         ({"num_envs": True}, "num_envs is True"),
         ({"hidden_sizes": [64, 64]}, "hidden_sizes is .* must be a tuple"),
@@ -81,76 +91,90 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
         ({"normalize_rewards": 1}, "normalize_rewards is 1: it must be True or"),
         ({"minibatch_size": 60}, "nearest that does is"),
         ({"num_envs": 3}, "num_envs is 3"),
-        ({"expert": "a.npz"}, r"expert is 'a.npz': agent 'ppo.*' uses no exp"),
-        ({"hyperparameters": gasil_jax.Hyperparameters(alpha=-1.0)}, "alpha is -1.0"),
-        ({"hyperparameters": gasil_jax.Hyperparameters(gamma=1.5)}, "gamma is 1.5"),
-        (
-            {"hyperparameters": gasil_jax.Hyperparameters(alpha=np.float32(-1))},
-            "alpha is -1.0",
-        ),
-        ({"hyperparameters": gasil_jax.Hyperparameters(alpha="x")}, "alpha is 'x'"),
+        ({"expert": "a.npz"}, r"expert is a setting of gail, not of ppo\+gasil"),
+        ({"reward_clip": 1.0}, "reward_clip has no effect: normalize_rewards is off"),
+        ({"alhpa": 0.1}, "setting 'alhpa' is unknown: did you mean 'alpha'"),
+        ({"alpha": -1.0}, "alpha is -1.0"),
+        ({"gamma": 1.5}, "gamma is 1.5"),
+        ({"alpha": np.float32(-1)}, "alpha is -1.0"),
+        ({"alpha": "x"}, "alpha is 'x'"),
     ],
 )
-def test_a_bad_configuration_is_refused(change, message):
+def test_a_bad_setting_is_refused(change, message):
     env = gasil_jax.make_env("point_mass")
     with pytest.raises(ValueError, match=message):
-        gasil_jax.make_train(env, SMALL.replace(**change))
+        gasil_jax.make_train(env, PPO_GASIL.replace(**change))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"agent": "ppo+gasil"}, "agent is 'ppo.gasil': it must be an instance of a"),
+        ({"agent": gasil_jax.PPO}, "agent is <class .*: it must be an instance of a"),
+        ({"rewards": gasil_jax.Normalize()}, "rewards is .*: it must be a tuple of"),
+        ({"config": PPO_GASIL}, "config is .*: it must be a gasil_jax.Config"),
+    ],
+)
+def test_a_part_of_another_kind_is_refused(change, message):
+    env = gasil_jax.make_env("point_mass")
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.make_train(env, dataclasses.replace(PPO_GASIL, **change))
+
+
+def test_an_agent_that_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match=r"agent 'ppo\+gasill' .* 'ppo\+gasil'"):
+        gasil_jax.algorithm("ppo+gasill")
 
 
 @pytest.mark.parametrize(
     ("hyperparameters", "message"),
     [
-        ({"learning_rate": 1e-3}, "hyperparameters is {.*: it must be Hyperparameters"),
-        (gasil_jax.Hyperparameters(gamma=1.5), "gamma is 1.5"),
-        (gasil_jax.Hyperparameters(learning_rate=-jnp.ones(())), "rate is -1.0"),
-        (
-            gasil_jax.Hyperparameters(alpha=np.ones(3)),
-            r"alpha has shape \(3,\): .*vmap",
-        ),
-        (gasil_jax.Hyperparameters(), "discriminator_updates is 5: .* the config's, 2"),
-        (gasil_jax.Hyperparameters(discriminator_updates=jnp.float32(1.5)), "is 1.5"),
+        (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),
+        (np.ones(3), r"hyperparameters is array\(.*: it must be numbers by name"),
+        ({"gamma": 1.5}, "gamma is 1.5"),
+        ({"learning_rate": -jnp.ones(())}, "rate is -1.0"),
+        ({"alpha": np.ones(3)}, r"alpha has shape \(3,\): .*vmap"),
+        ({"discriminator_updates": 1}, "discriminator_updates is not traced"),
+        ({"imitation_weight": 0.5}, r"of ppo\+gasil-adaptive, not of ppo\+gasil"),
     ],
 )
 def test_hyperparameters_that_are_not_allowed_are_refused(hyperparameters, message):
-    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), SMALL)
+    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), PPO_GASIL)
     with pytest.raises(ValueError, match=message):
         jax.eval_shape(lambda key: train(key, hyperparameters), jax.random.key(0))
 
 
 def test_the_shape_of_a_traced_hyperparameter_is_checked():
-    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), SMALL)
+    train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), PPO_GASIL)
     # jit traces all its arguments; under vmap each run has one number.
-    many = gasil_jax.Hyperparameters(alpha=jnp.ones(3))
+    many = {"alpha": jnp.ones(3)}
     with pytest.raises(ValueError, match="alpha has shape"):
         jax.eval_shape(train, jax.random.key(0), many)
-    axes = jax.tree.map(lambda x: 0 if jnp.ndim(x) else None, many)
-    trained = jax.vmap(train, in_axes=(None, axes))
-    assert (
-        jax.eval_shape(trained, jax.random.key(0), many)[1]["env_steps"].shape[0] == 3
-    )
+    trained = jax.vmap(train, in_axes=(None, 0))
+    _, metrics = jax.eval_shape(trained, jax.random.key(0), many)
+    assert metrics["env_steps"].shape[0] == 3
 
 
 def test_an_environment_of_gymnasium_is_refused():
     with pytest.raises(
         ValueError, match=r"has no observation_size: .* Brax's interface"
     ):
-        gasil_jax.make_train(gymnasium.make("CartPole-v1"), SMALL)
+        gasil_jax.make_train(gymnasium.make("CartPole-v1"), PPO_GASIL)
 
 
 def test_a_name_is_not_an_environment():
     with pytest.raises(ValueError, match=r"env is 'hopper', .*make_env"):
-        gasil_jax.make_train("hopper", SMALL)
+        gasil_jax.make_train("hopper", PPO_GASIL)
 
 
 def test_a_state_may_begin_outside_of_jit_and_be_donated():
     """With noise the environment's state holds keys."""
     env = gasil_jax.make_env("point_mass", obs_noise=0.1)
-    config = SMALL.replace(agent="ppo")
     key = jax.random.key(0)
-    iterate = lambda state: gasil_jax.iterate(env, config, state)[0]
+    iterate = lambda state: gasil_jax.iterate(env, PPO, state)[0]
     step = jax.jit(iterate, donate_argnums=0)
-    result = step(gasil_jax.init(env, config, key))
-    expected = step(jax.jit(lambda key: gasil_jax.init(env, config, key))(key))
+    result = step(gasil_jax.init(env, PPO, key))
+    expected = step(jax.jit(lambda key: gasil_jax.init(env, PPO, key))(key))
     # Compiled, the first state may be rounded in another way.
     close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-7)
     jax.tree.map(close, result.actor_critic, expected.actor_critic)
@@ -160,53 +184,67 @@ def test_double_precision_is_refused():
     env = gasil_jax.make_env("point_mass")
     with jax.enable_x64(True):
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
-            gasil_jax.make_train(env, SMALL)
+            gasil_jax.make_train(env, PPO_GASIL)
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
-            gasil_jax.init(env, SMALL, jax.random.key(0))
+            gasil_jax.init(env, PPO_GASIL, jax.random.key(0))
 
 
-def test_a_loop_of_ones_own_begins_with_a_config_that_is_allowed():
+def test_a_loop_of_ones_own_begins_with_settings_that_are_allowed():
     """Else minibatches would hold the batch's last step many times."""
     env = gasil_jax.make_env("point_mass")
     with pytest.raises(ValueError, match="num_envs is 3, which does not divide"):
-        gasil_jax.init(env, SMALL.replace(num_envs=3), jax.random.key(0))
+        gasil_jax.init(env, PPO_GASIL.replace(num_envs=3), jax.random.key(0))
 
 
 def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
     env = gasil_jax.make_env("point_mass")
-    state = gasil_jax.init(env, SMALL, jax.random.key(0))
-    traced = lambda state, **changes: jax.eval_shape(
-        lambda state: gasil_jax.iterate(env, SMALL.replace(**changes), state), state
+    state = gasil_jax.init(env, PPO_GASIL, jax.random.key(0))
+    traced = lambda state, algorithm=PPO_GASIL: jax.eval_shape(
+        lambda state: gasil_jax.iterate(env, algorithm, state), state
     )
     own = lambda **changes: state.replace(
-        hyperparameters=state.hyperparameters.replace(**changes)
+        hyperparameters={**state.hyperparameters, **changes}
     )
     # A weight for each environment would weight the rewards of each.
     with pytest.raises(ValueError, match=r"alpha has shape \(\d+,\): .*vmap"):
-        traced(own(alpha=jnp.ones(SMALL.num_envs)))
+        traced(own(alpha=jnp.ones(CONFIG.num_envs)))
     with pytest.raises(ValueError, match=r"alpha is -1.0: it must be 0 or more"):
-        gasil_jax.iterate(env, SMALL, own(alpha=-1.0))
+        gasil_jax.iterate(env, PPO_GASIL, own(alpha=-1.0))
+    with pytest.raises(ValueError, match=r"sil_coefficient is a setting of ppo\+sil"):
+        traced(own(sil_coefficient=0.1))
     pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), state, state)
     with pytest.raises(ValueError, match=r"batch of 2 states: .*jax.vmap this"):
         traced(pair)
     # Minibatches would hold the batch's last step many times.
-    changes = {"num_envs": 2 * SMALL.num_envs}, {"batch_steps": 2 * SMALL.batch_steps}
-    for change in changes:
-        with pytest.raises(ValueError, match=r"environments: this config needs .* of"):
-            traced(state, **change)
-    # The state decides what the rewards are, not the config.
+    more = {"num_envs": 2 * CONFIG.num_envs}
+    with pytest.raises(ValueError, match=r"history.* is .*\[4, .* needs .*\[8, "):
+        traced(state, PPO_GASIL.replace(**more))
+    plain = gasil_jax.init(env, PPO, jax.random.key(0))
+    with pytest.raises(ValueError, match=r"num_envs is .*\[4\]: .* needs .*\[8\]"):
+        traced(plain, PPO.replace(**more))
+    with pytest.raises(ValueError, match=r"history.*, 128.* needs .*, 256"):
+        traced(state, PPO_GASIL.replace(batch_steps=2 * CONFIG.batch_steps))
+    with pytest.raises(ValueError, match=r"state.agent.* is missing: .* needs float"):
+        traced(plain, SMALL["ppo+bc"])
+    with pytest.raises(
+        ValueError, match=r"state.hyperparameters\['alpha'\] is missing"
+    ):
+        traced(plain, SMALL["ppo+bonus"])
+    with pytest.raises(ValueError, match=r"buffer.* is float32\[100.* needs .*\[99"):
+        traced(state, PPO_GASIL.replace(buffer_steps=99))
+    # The state has what the models of rewards have learned.
     for name in ("normalize_rewards", "decompose_rewards"):
-        with pytest.raises(ValueError, match=f"{name} is True, but the state .* False"):
-            traced(state, **{name: True}, decomposition_history_episodes=1)
+        with pytest.raises(ValueError, match="is missing: this algorithm needs"):
+            traced(state, PPO_GASIL.replace(**{name: True}))
     # What training may go on with.
-    traced(own(alpha=0.3), total_steps=10 * SMALL.total_steps)
+    traced(own(alpha=0.3), PPO_GASIL.replace(total_steps=10 * CONFIG.total_steps))
 
 
 @pytest.mark.parametrize("agent", ["ppo+sil", "ppo+gasil", "ppo+gasil-adaptive"])
 def test_no_random_key_is_used_twice(agent):
-    env, config = gasil_jax.make_env("point_mass"), SMALL.replace(agent=agent)
+    env = gasil_jax.make_env("point_mass")
     with jax.debug_key_reuse(True):
-        train = jax.jit(gasil_jax.make_train(env, config))
+        train = jax.jit(gasil_jax.make_train(env, SMALL[agent]))
         jax.eval_shape(train, jax.random.key(0))
 
 
@@ -228,13 +266,14 @@ def test_metrics_of_one_name_are_refused():
         training.merge_metrics("ppo", {"a": jnp.int32(1)}, {"a": jnp.float32(2)})
 
 
-def test_an_agents_metric_may_not_take_anothers_name(monkeypatch):
-    def reward(state, context, key):
+class Bad(gasil_jax.Agent):
+    def update_and_reward(self, state, context, key):
         return state, context.rollout.reward, {"episode_return": 0.5}
 
-    monkeypatch.setitem(AGENTS, "bad", none.PPO._replace(update_and_reward=reward))
-    train = gasil_jax.make_train(
-        gasil_jax.make_env("point_mass"), gasil_jax.Config(agent="bad")
-    )
-    with pytest.raises(ValueError, match=r"metrics of agent 'bad'.*episode_return"):
+
+def test_an_agents_metric_may_not_take_anothers_name():
+    env = gasil_jax.make_env("point_mass")
+    train = gasil_jax.make_train(env, gasil_jax.Algorithm(Bad()))
+    bad = r"metrics of agent 'test_train:Bad'.*episode_return"
+    with pytest.raises(ValueError, match=bad):
         jax.eval_shape(train, jax.random.key(0))

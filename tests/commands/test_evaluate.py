@@ -46,15 +46,15 @@ def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
     with pytest.raises(ValueError, match="holds another state"):
         checkpoint.restore(tmp_path / "state", other)
     with pytest.raises(ValueError, match="holds another state"):
-        checkpoint.restore(tmp_path / "state", other.replace(imitation=()))
+        checkpoint.restore(tmp_path / "state", other.replace(agent=()))
 
 
 def test_scores_are_those_of_a_plain_loop(trained_point_mass):
-    env, config, states = trained_point_mass
+    env, algorithm, states = trained_point_mass
     state = gasil_jax.member(states, 1)
     key = jax.random.key(3)
     scores = jax.jit(
-        lambda s: evaluation.evaluate(env, config, s, key, num_episodes=3)
+        lambda s: evaluation.evaluate(env, algorithm, s, key, num_episodes=3)
     )(state)
     act = numpy_policy.make(policy.weights(state, env))
     step = jax.jit(env.step)
@@ -69,10 +69,10 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
 
 
 def test_stochastic_scores_vary_more(trained_point_mass):
-    env, config, states = trained_point_mass
+    env, algorithm, states = trained_point_mass
     score = lambda deterministic: evaluation.evaluate(
         env,
-        config,
+        algorithm,
         gasil_jax.member(states, 0),
         jax.random.key(0),
         num_episodes=50,
@@ -131,7 +131,7 @@ def test_a_wrong_command_line_is_one_line(arguments, message, capsys):
 
 def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
     """As in training; `done` need not be set beside `truncation`."""
-    env, config, states = trained_point_mass
+    env, algorithm, states = trained_point_mass
 
     class CutOff(Wrapper):
         def reset(self, rng):
@@ -148,7 +148,7 @@ def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
 
     scores = evaluation.evaluate(
         CutOff(env),
-        config,
+        algorithm,
         gasil_jax.member(states, 0),
         jax.random.key(0),
         num_episodes=3,

@@ -6,8 +6,9 @@ import sys
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_training import FLAGS
 
-from gasil_jax import export_minari, good_trajectories
+from gasil_jax import export_minari, good_trajectories, run
 from gasil_jax.host import checkpoint
 from gasil_jax.imitation import expert
 from gasil_jax.sweeps import saved_states
@@ -20,12 +21,12 @@ LENGTHS, RETURNS = (400, 350, 250), (9.0, 4.5, -1.0)
 def buffer(lengths, returns, capacity, observation_size, action_size):
     """One that holds episodes of these lengths and returns, of random steps."""
     rng, size = np.random.default_rng(0), sum(lengths)
-    filled = lambda values, empty: np.append(values, [empty] * (capacity - size))
+    filled = lambda values: np.append(values, [0] * (capacity - size))
     return good_trajectories.GoodTrajectories(
         observation=jnp.float32(rng.normal(size=(capacity, observation_size))),
         action=jnp.float32(rng.normal(size=(capacity, action_size))),
-        return_=jnp.float32(filled(np.repeat(returns, lengths), -np.inf)),
-        time=jnp.int32(filled(np.concatenate([np.arange(n) for n in lengths]), 0)),
+        return_=jnp.float32(filled(np.repeat(returns, lengths))),
+        time=jnp.int32(filled(np.concatenate([np.arange(n) for n in lengths]))),
         size=jnp.int32(size),
     )
 
@@ -35,11 +36,12 @@ def filled(untrained_hopper, tmp_path, monkeypatch):
     """A run whose buffer is full, its last episode cut, and the steps in it."""
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     out = shutil.copytree(untrained_hopper, tmp_path / "run")
-    env, config, _, states = saved_states.load(out)
+    env, algorithm, _, states = saved_states.load(out)
     sizes = (env.observation_size, env.action_size)
-    kept = buffer(LENGTHS, RETURNS, config.hyperparameters.buffer_steps, *sizes)
+    kept = buffer(LENGTHS, RETURNS, algorithm.agent.buffer_steps, *sizes)
     lead = {name: jnp.asarray(value)[None] for name, value in vars(kept).items()}
-    states = states.replace(good_trajectories=kept.replace(**lead))
+    agent = states.agent.replace(buffer=kept.replace(**lead))
+    states = states.replace(agent=agent)
     checkpoint.write(out / "checkpoints", 1, states, {"score": 1.0})
     return out, kept
 
@@ -73,10 +75,10 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     load = saved_states.load
 
     def of_a_swept_point(folder, which, point, seed):
-        env, config, seeds, states = load(folder)
-        floats = states.hyperparameters
-        floats = floats.replace(gamma=0.9 * jnp.ones_like(floats.gamma))
-        return env, config, seeds, states.replace(hyperparameters=floats)
+        env, algorithm, seeds, states = load(folder)
+        numbers = states.hyperparameters
+        numbers = {**numbers, "gamma": 0.9 * jnp.ones_like(numbers["gamma"])}
+        return env, algorithm, seeds, states.replace(hyperparameters=numbers)
 
     monkeypatch.setattr(saved_states, "load", of_a_swept_point)
     monkeypatch.setattr(
@@ -86,8 +88,8 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     assert "discounted by 0.9 a step" in metadata["description"]
 
     def without_discount(*arguments):
-        env, config, seeds, states = load(*arguments)
-        return env, config.replace(buffer_discounts=False), seeds, states
+        env, algorithm, seeds, states = load(*arguments)
+        return env, algorithm.replace(buffer_discounts=False), seeds, states
 
     monkeypatch.setattr(saved_states, "load", without_discount)
     assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
@@ -95,17 +97,14 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
 
 
 def test_the_last_episode_of_a_buffer_is_kept_if_it_is_whole():
-    lengths = lambda kept, limit, max_steps=100: [
-        len(episode.action)
-        for episode in export_minari.episodes(kept, limit, max_steps)
+    lengths = lambda kept, limit: [
+        len(episode.action) for episode in export_minari.episodes(kept, limit)
     ]
     full = buffer((30, 20, 50), (3.0, 2.0, 1.0), 100, 4, 2)
     assert lengths(full, 1000) == [30, 20]
     assert lengths(full, 50) == [30, 20, 50]
     partly = buffer((30, 20), (3.0, 2.0), 100, 4, 2)
     assert lengths(partly, 1000) == [30, 20]
-    assert lengths(partly, 1000, 50.0) == [30]
-    assert lengths(partly, 1000, 51.0) == [30, 20]
     assert lengths(good_trajectories.init(100, 4, 2), 1000) == []
 
 
@@ -125,6 +124,15 @@ def test_bad_input_is_one_line_and_status_2(filled, untrained_hopper, capsys):
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
     assert [*minari.list_local_datasets()] == ["there-v0"]
+
+
+def test_a_run_of_an_agent_without_a_buffer_is_refused(tmp_path, capsys):
+    out = str(tmp_path / "run")
+    assert run.main([*FLAGS, "--agent", "ppo", "--out", out]) == 0
+    capsys.readouterr()
+    assert export_minari.main([out, "--name", "new-v0"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith("of agent 'ppo': it has no buffer of good trajectories")
 
 
 def test_a_failure_leaves_nothing(filled, monkeypatch, capsys):

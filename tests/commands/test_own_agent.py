@@ -1,15 +1,18 @@
-"""Agents of one's own, given as MODULE:NAME, and the numbers that they declare."""
+"""Agents of one's own, given as MODULE:CLASS, and the numbers that they declare."""
 
+import dataclasses
+import importlib
 import json
 import re
 
+import jax
 import numpy as np
 import pytest
-from small_training import FLAGS
+from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
-from gasil_jax import evaluate, merge, render, run, sweep
-from gasil_jax.config import Hyperparameters, validate
+from gasil_jax import algorithms, evaluate, merge, render, run, sweep
+from gasil_jax.host import run_folder
 
 MODULE = '''
 import sys
@@ -17,120 +20,176 @@ import sys
 import jax.numpy as jnp
 
 import gasil_jax
-from gasil_jax.config import number
-from gasil_jax.imitation.interface import Imitation, leave_policy
-from gasil_jax.imitation.none import no_state
+from gasil_jax.config import number, schedule
 
 
-class Own(gasil_jax.Hyperparameters):
+class Own(gasil_jax.Agent):
+    """PPO on a share of the reward.
+
+    Attributes:
+      my_weight: share of the reward.
+    """
+
     my_weight: float = number(0.5, 0.0, 1.0)
-    """Share of the reward."""
+
+    def update_and_reward(self, state, context, key):
+        reward = self.my_weight * context.rollout.reward
+        return state, reward, {"my_weight": self.my_weight}
 
 
-class Taken(gasil_jax.Hyperparameters):
-    alpha: float = number(0.5, 0.0, 1.0)
+class Derived(gasil_jax.PPOGASIL):
+    my_bonus: float = number(0.5, 0.0)
+
+    def update_and_reward(self, state, context, key):
+        state, reward, metrics = super().update_and_reward(state, context, key)
+        return state, reward + self.my_bonus, metrics
 
 
-class Column(gasil_jax.Hyperparameters):
+class Plain:
+    pass
+
+
+class Named(Own):
+    name = "mine"
+
+
+class Taken(gasil_jax.Agent):
+    gamma: float = number(0.5, 0.0, 1.0)
+
+
+class OfRewards(gasil_jax.Agent):
+    reward_clip: float = number(0.5, 0.0, 1.0)
+
+
+class Column(gasil_jax.Agent):
     diverged: float = number(0.5, 0.0, 1.0)
 
 
-class AnOption(gasil_jax.Hyperparameters):
+class AnOption(gasil_jax.Agent):
     seeds: float = number(0.5, 0.0, 1.0)
 
 
-class Bare(gasil_jax.Hyperparameters):
+class Bare(gasil_jax.Agent):
     bare: float = 0.5
 
 
-def reward(state, context, key):
-    return state, context.hyperparameters.my_weight * context.rollout.reward, {
-        "my_weight": context.hyperparameters.my_weight
-    }
+class OutOfRange(gasil_jax.Agent):
+    my_weight: float = number(2.0, 0.0, 1.0)
 
 
-def rewards(state, context, key):
-    return state, context.rollout.reward, {"my_rewards": context.rollout.reward}
+class Misspelt(Own):
+    my_wieght_schedule: tuple = schedule()
 
 
-def unfinished(state, context, key):
-    return state, context.nothing, {}
+class Unmade(Own):
+    def __post_init__(self):
+        raise RuntimeError("not today")
 
 
-def start(key, config, observation_size, action_size):
-    return {"count": jnp.float32(0)}
+class Many(Own):
+    def update_and_reward(self, state, context, key):
+        return state, context.rollout.reward, {"my_rewards": context.rollout.reward}
 
 
-def grows(state, context, key):
-    return {"count": jnp.zeros(3)}, context.rollout.reward, {}
+class Unfinished(Own):
+    def update_and_reward(self, state, context, key):
+        return state, context.nothing, {}
 
 
-def exits(state, context, key):
-    sys.exit()
+class Counts(Own):
+    def init(self, key, sizes):
+        return {"count": jnp.int32(0)}
 
 
-def interrupts(state, context, key):
-    raise KeyboardInterrupt
+class Grows(Counts):
+    def update_and_reward(self, state, context, key):
+        return {"count": jnp.zeros(3, int)}, context.rollout.reward, {}
 
 
-def refuses(config, observation_size, action_size):
-    sys.exit(7)
+class Turns(Counts):
+    def update_and_reward(self, state, context, key):
+        return {"count": state["count"] + 0.5}, context.rollout.reward, {}
 
 
-def is_wrong(config, observation_size, action_size):
-    return config.alhpa
+class Forgets(Counts):
+    def remember(self, state, context):
+        pass
 
 
-def shrinks(state, context, key):
-    return {"count": state["count"].sum()}, context.rollout.reward, {}
+class Shrinks(Own):
+    def init(self, key, sizes):
+        return {"count": jnp.zeros(3)}
+
+    def update_and_reward(self, state, context, key):
+        return {"count": state["count"].sum()}, context.rollout.reward, {}
 
 
-def forgets(state, policy, context, key):
-    return state, (), {}
+class Exits(Own):
+    def update_and_reward(self, state, context, key):
+        sys.exit()
 
 
-OWN = Imitation(no_state, reward, leave_policy, fields=(), hyperparameters=Own)
-TAKEN = OWN._replace(hyperparameters=Taken)
-COLUMN = OWN._replace(hyperparameters=Column)
-AN_OPTION = OWN._replace(hyperparameters=AnOption)
-BARE = OWN._replace(hyperparameters=Bare)
-MISSPELT = OWN._replace(fields=("alhpa",))
-MANY = OWN._replace(update_and_reward=rewards)
-UNFINISHED = OWN._replace(update_and_reward=unfinished)
-GROWS = OWN._replace(init=start, update_and_reward=grows)
-SHRINKS = OWN._replace(
-    init=lambda *_: {"count": jnp.zeros(3)}, update_and_reward=shrinks
-)
-EXITS = OWN._replace(update_and_reward=exits)
-INTERRUPTS = OWN._replace(update_and_reward=interrupts)
-REFUSES = OWN._replace(check=refuses)
-IS_WRONG = OWN._replace(check=is_wrong)
-TURNS = OWN._replace(
-    init=lambda *_: {"count": jnp.int32(0)},
-    update_and_reward=lambda state, context, key: (
-        {"count": state["count"] + 0.5}, context.rollout.reward, {}
-    ),
-)
-FORGETS = OWN._replace(update_policy=forgets)
-SILENT = OWN._replace(update_policy=lambda state, policy, *_: (state, policy, None))
-NO_CLASS = OWN._replace(hyperparameters={"my_weight": 0.5})
-TWO = OWN._replace(update_and_reward=lambda state, context, key: (state, {}))
-FOUR = OWN._replace(update_policy=lambda state, policy, *_: (state, policy, {}, {}))
-ONE = OWN._replace(mix=lambda state, advantages, context: advantages[..., 0])
-SUMMED = OWN._replace(
-    update_and_reward=lambda state, context, key: (
-        state, context.rollout.reward.sum(axis=0), {}
-    )
-)
-UNMIXED = OWN._replace(mix=lambda state, advantages, context: (advantages, {}))
-STREAMS = OWN._replace(num_streams=2)
-NAMED = OWN._replace(
-    mix=lambda state, advantages, context: (
-        advantages[..., 0], {"explained_variance": 0.5}
-    )
-)
+class Refuses(Own):
+    def check(self, sizes):
+        sys.exit(7)
+
+
+class IsWrong(Own):
+    def check(self, sizes):
+        return sizes.alhpa
+
+
+class LosesNetworks(Own):
+    def update_policy(self, state, actor_critic, context, key):
+        return state, (), {}
+
+
+class Silent(Own):
+    def update_policy(self, state, actor_critic, context, key):
+        return state, actor_critic, None
+
+
+class Two(Own):
+    def update_and_reward(self, state, context, key):
+        return state, {}
+
+
+class Four(Own):
+    def update_policy(self, state, actor_critic, context, key):
+        return state, actor_critic, {}, {}
+
+
+class One(Own):
+    def mix(self, state, advantages, context):
+        return advantages[..., 0]
+
+
+class Summed(Own):
+    def update_and_reward(self, state, context, key):
+        return state, context.rollout.reward.sum(axis=0), {}
+
+
+class Unmixed(Own):
+    def mix(self, state, advantages, context):
+        return advantages, {}
+
+
+class Streams(Own):
+    num_streams = 2
+
+
+class SameMetric(Own):
+    def mix(self, state, advantages, context):
+        return advantages[..., 0], {"explained_variance": 0.5}
+
+
+def helper(state):
+    return state
+
+
+INSTANCE = Own()
 '''
-SMALL = (*FLAGS, "--agent", "my_agents:OWN", "--devices", "1")
+SMALL = (*FLAGS, "--agent", "my_agents:Own", "--devices", "1")
 
 
 @pytest.fixture(autouse=True)
@@ -139,6 +198,7 @@ def my_agents(tmp_path, monkeypatch):
     (tmp_path / "leaves.py").write_text("raise SystemExit(3)")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
+    return importlib.import_module("my_agents")
 
 
 def column(path, name):
@@ -150,8 +210,8 @@ def test_every_command_takes_it(tmp_path, capsys):
     out = tmp_path / "run"
     assert run.main([*SMALL, "--my-weight", "0.25", "--out", str(out)]) == 0
     assert column(out / "metrics.csv", "my_weight") == {0.25}
-    config = json.loads((out / "config.json").read_text())["config"]
-    assert config["hyperparameters"]["my_weight"] == 0.25
+    described = json.loads((out / "config.json").read_text())["algorithm"]
+    assert described["agent"] == "my_agents:Own" and described["my_weight"] == 0.25
     again = ["--env", "point_mass", "--out", str(out), "--resume"]
     assert run.main([*again, "--total-steps", "384"]) == 0
     assert column(out / "metrics.csv", "my_weight") == {0.25}
@@ -171,47 +231,72 @@ def test_every_command_takes_it(tmp_path, capsys):
         sweep.Options, [*SMALL, "--points-file", "points.json"], "gasil_jax.sweep"
     )
     _, (program,) = sweep.plan(options)
-    assert [x.my_weight for x in program.hyperparameters] == [0.2, 0.5]
+    assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]
+
+
+def test_it_may_be_derived_from_another_agent(tmp_path):
+    small = (*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "my_agents:Derived")
+    own = ("--my-bonus", "0.25", "--alpha", "0.3", "--buffer-steps", "70")
+    assert run.main([*small, *own, "--no-stagger-episodes", "--out", "run"]) == 0
+    described = json.loads((tmp_path / "run" / "config.json").read_text())["algorithm"]
+    assert described["agent"] == "my_agents:Derived"
+    for name, value in (("my_bonus", 0.25), ("alpha", 0.3), ("buffer_steps", 70)):
+        assert described[name] == value
+    assert column(tmp_path / "run" / "metrics.csv", "good_steps") == {0, 70}
+    assert evaluate.main(["run", "--episodes", "1"]) == 0
+
+
+def test_the_help_explains_its_settings(capsys):
+    with pytest.raises(SystemExit):
+        run.main(["--help", "--agent", "my_agents:Own"])
+    assert re.search(
+        r"--my-weight FLOAT\W+share of the reward", capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize(
     ("agent", "why"),
     [
-        ("nowhere:OWN", "'nowhere:OWN' can't be imported: No module named 'nowhere'"),
-        ("my_agents:NO", "can't be imported: module 'my_agents' has no attribute 'NO'"),
-        ("my_agents:reward", "is of type function: it must be an Imitation"),
-        ("my_agents:TAKEN", "'alpha', a name that is taken"),
-        ("my_agents:AN_OPTION", "'seeds', a name that is taken by an option"),
-        ("my_agents:COLUMN", "'diverged', a name that is taken"),
-        ("my_agents:BARE", "'bare' without a range: .* gasil_jax.config.number"),
-        ("my_agents:MISSPELT", "says that it uses 'alhpa': it must be the name"),
-        ("my_agents:NO_CLASS", "{'my_weight': 0.5}: they must be a class"),
-        ("my_agents:MANY", "'my_rewards' .* has shape .*: it must be one number"),
-        ("my_agents:TWO", "reward .* returns 2 values: .* 3, state, rewards, metrics"),
-        ("my_agents:FOUR", "update_policy .* returns 4 values: .* 3, state, actor_"),
-        ("my_agents:ONE", "mix of agent .* returns 1 value: .* 2, advantage, metrics"),
-        ("my_agents:SUMMED", r"returns rewards of shape \(4,\): it must be \(32, 4\)"),
-        ("my_agents:UNMIXED", r"mix .* advantage of shape \(32, 4, 1\): .* \(32, 4\)"),
-        ("my_agents:STREAMS", "has 2 reward streams: it must have a function mix that"),
-        ("my_agents:NAMED", "names that other metrics have: explained_variance"),
+        ("nowhere:Own", "'nowhere:Own' can't be imported: No module named 'nowhere'"),
+        ("my_agents:No", "can't be imported: module 'my_agents' has no attribute 'No'"),
+        ("my_agents:helper", "is of type function: it must be a class that is derived"),
+        ("my_agents:Plain", "is of type type: it must be a class that is derived from"),
+        ("my_agents:INSTANCE", "is of type Own: it must be a class that is derived"),
+        ("my_agents:Named", "'my_agents:Named' has the name 'mine': it must have the"),
+        ("my_agents:Taken", "'gamma', a name that is taken"),
+        ("my_agents:OfRewards", "'reward_clip', a name that is taken"),
+        ("my_agents:AnOption", "'seeds', a name that is taken by an option"),
+        ("my_agents:Column", "'diverged', a name that is taken"),
+        ("my_agents:Bare", "'bare' without a range: .* gasil_jax.config.number"),
+        ("my_agents:OutOfRange", "my_weight is 2.0: it must be 0 or more and at most"),
+        ("my_agents:Misspelt", "'my_wieght_schedule', but no number 'my_wieght'"),
+        ("my_agents:Unmade", r"can't be made: RuntimeError: not today \(.*my_agents"),
+        ("my_agents:Many", "'my_rewards' .* has shape .*: it must be one number"),
+        ("my_agents:Two", "reward .* returns 2 values: .* 3, state, rewards, metrics"),
+        ("my_agents:Four", "update_policy .* returns 4 values: .* 3, state, actor_"),
+        ("my_agents:One", "mix of agent .* returns 1 value: .* 2, advantage, metrics"),
+        ("my_agents:Summed", r"returns rewards of shape \(4,\): it must be \(32, 4\)"),
+        ("my_agents:Unmixed", r"mix .* advantage of shape \(32, 4, 1\): .* \(32, 4\)"),
+        ("my_agents:Streams", "has 2 reward streams: it must have a function mix that"),
+        ("my_agents:SameMetric", "names that other metrics have: explained_variance"),
         (
-            "my_agents:UNFINISHED",
+            "my_agents:Unfinished",
             r"can't be traced: AttributeError: .*my_agents.py, li",
         ),
         (
-            "my_agents:GROWS",
-            r"update_and_reward .*\['count'\] is float32\[3\]: .* float32\[\], as",
+            "my_agents:Grows",
+            r"update_and_reward .*\['count'\] is int32\[3\]: .* int32\[\], as",
         ),
-        ("my_agents:SHRINKS", r"state\['count'\] is float32\[\]: .* float32\[3\], as"),
-        ("my_agents:TURNS", r"state\['count'\] is float32\[\]: .* int32\[\], as"),
-        ("my_agents:FORGETS", r"update_policy of .* returned actor_critic.* missing:"),
-        ("my_agents:SILENT", "update_policy .* returns metrics None: .* be a dict"),
-        ("my_agents:EXITS", r"EXITS' can't be traced: SystemExit \(.*my_agents"),
-        ("my_agents:INTERRUPTS", r"be traced: KeyboardInterrupt \(.*my_agents"),
-        ("my_agents:REFUSES", "check of agent .* fails: SystemExit: 7"),
-        ("my_agents:IS_WRONG", "check of agent .* fails: AttributeError: .*alhpa"),
-        ("leaves:OWN", "'leaves:OWN' can't be imported: SystemExit: 3"),
-        ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:NAME$"),
+        ("my_agents:Shrinks", r"state\['count'\] is float32\[\]: .* float32\[3\], as"),
+        ("my_agents:Turns", r"state\['count'\] is float32\[\]: .* int32\[\], as"),
+        ("my_agents:Forgets", r"remember of .* state\['count'\] is missing: .* int32"),
+        ("my_agents:LosesNetworks", r"update_policy of .* actor_critic.* missing:"),
+        ("my_agents:Silent", "update_policy .* returns metrics None: .* be a dict"),
+        ("my_agents:Exits", r"Exits' can't be traced: SystemExit \(.*my_agents"),
+        ("my_agents:Refuses", "check of agent .* fails: SystemExit: 7"),
+        ("my_agents:IsWrong", "check of agent .* fails: AttributeError: .*alhpa"),
+        ("leaves:Own", "'leaves:Own' can't be imported: SystemExit: 3"),
+        ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:CLASS$"),
     ],
 )
 def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
@@ -231,10 +316,11 @@ def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
         (run, "--my-weight much", "my_weight is 'much': it must be a number"),
         (run, "--my-wieght 0.2", "--my-weight"),
         (run, "--agent ppo --my-weight 0.2", "option --my-weight is unknown"),
+        (run, "--alpha 0.2", "alpha is a setting of ppo+bonus, gasil, ppo+gasil, gail"),
         (sweep, "--grid my_weight=0.1,2", "my_weight is 2.0: it must be 0 or more"),
         (sweep, "--grid my_wieght=0.1", "did you mean 'my_weight'?"),
         (sweep, "--agent ppo --grid my_weight=0.1", "'my_weight' can't vary"),
-        (sweep, "--grid alpha=0.1", "agent 'my_agents:OWN' does not use it"),
+        (sweep, "--grid alpha=0.1", "alpha is a setting of ppo+bonus, gasil, ppo+gas"),
     ],
 )
 def test_its_numbers_are_checked(tmp_path, capsys, program, arguments, why):
@@ -244,53 +330,42 @@ def test_its_numbers_are_checked(tmp_path, capsys, program, arguments, why):
     assert not (tmp_path / "run").exists()
 
 
-def test_a_run_without_its_module_says_so(tmp_path, capsys, monkeypatch):
-    from gasil_jax.host import run_folder
-
-    config = gasil_jax.Config(agent="my_agents:OWN")
+def test_a_run_without_its_module_says_so(my_agents, tmp_path, capsys):
     described = {"env": "point_mass", "seeds": 1, "first_seed": 0, "settings": {}}
-    text = json.dumps(described | {"config": {"agent": "gone:OWN"}})
+    text = json.dumps(described | {"algorithm": {"agent": "gone:Own"}})
     (tmp_path / "config.json").write_text(text)
     assert evaluate.main([str(tmp_path)]) == 2
-    message = "error: agent 'gone:OWN' can't be imported: No module named 'gone'\n"
+    message = "error: agent 'gone:Own' can't be imported: No module named 'gone'\n"
     assert capsys.readouterr().err == message
-    run_folder.write_description(tmp_path, described | {"config": config})
-    assert run_folder.read(tmp_path)["config"] == config
+    algorithm = gasil_jax.Algorithm(my_agents.Own(my_weight=0.25))
+    run_folder.write_description(tmp_path, described | {"algorithm": algorithm})
+    assert run_folder.read(tmp_path)["algorithm"] == algorithm
 
 
-def test_a_config_has_the_numbers_of_its_agent():
-    config = gasil_jax.Config(agent="my_agents:OWN")
-    assert config.hyperparameters.my_weight == 0.5
-    changed = config.replace(my_weight=0.1, gamma=0.9)
-    assert changed.hyperparameters.my_weight == 0.1
-    assert {config, changed, config.replace(my_weight=0.1, gamma=0.9)} == {
-        config,
+def test_an_algorithm_has_the_numbers_of_its_agent(my_agents):
+    algorithm = gasil_jax.Algorithm(my_agents.Own())
+    assert algorithm.agent.my_weight == algorithm.hyperparameters["my_weight"] == 0.5
+    changed = algorithm.replace(my_weight=0.1, gamma=0.9)
+    assert changed.agent.my_weight == 0.1 and changed.config.gamma == 0.9
+    assert {algorithm, changed, algorithm.replace(my_weight=0.1, gamma=0.9)} == {
+        algorithm,
         changed,
     }
-    validate(changed)
-    assert gasil_jax.preset("hopper", "my_agents:OWN").hyperparameters.my_weight == 0.5
-    # Those of another agent are dropped, the others kept.
-    other = changed.replace(agent="ppo").hyperparameters
-    assert type(other) is Hyperparameters and other.gamma == 0.9
-    back = gasil_jax.Config(agent="my_agents:OWN", hyperparameters=other)
-    assert back.hyperparameters.my_weight == 0.5
+    algorithms.check(changed)
+    assert gasil_jax.preset("hopper", my_agents.Own).agent.my_weight == 0.5
+    # With another agent it has the others.
+    other = dataclasses.replace(changed, agent=gasil_jax.PPO())
+    assert "my_weight" not in other.settings and other.settings["gamma"] == 0.9
     with pytest.raises(ValueError, match=r"'my_wieght'.*did you mean 'my_weight'"):
-        config.replace(my_wieght=0.1)
+        algorithm.replace(my_wieght=0.1)
     with pytest.raises(ValueError, match="my_weight is -1"):
-        validate(config.replace(my_weight=-1))
-    with pytest.raises(ValueError, match="can't be imported"):
-        validate(gasil_jax.Config(agent="my_agents:NO"))
-    with pytest.raises(ValueError, match="can't be imported"):
-        gasil_jax.Config(agent="my_agents:NO").replace(my_weight=0.1)
+        algorithms.check(algorithm.replace(my_weight=-1))
 
 
-def test_numbers_that_are_not_given_have_their_defaults():
-    import jax
-
-    config = gasil_jax.Config(
-        agent="my_agents:OWN", batch_steps=64, num_envs=4, hidden_sizes=(4,)
-    )
+def test_numbers_that_are_not_given_have_their_defaults(my_agents):
+    config = gasil_jax.Config(batch_steps=64, num_envs=4, hidden_sizes=(4,))
+    algorithm = gasil_jax.Algorithm(my_agents.Own(), config=config)
     env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
-    state = gasil_jax.init(env, config, key, Hyperparameters(gamma=0.9))
-    np.testing.assert_allclose(state.hyperparameters.my_weight, 0.5)
-    np.testing.assert_allclose(state.hyperparameters.gamma, 0.9)
+    state = gasil_jax.init(env, algorithm, key, {"gamma": 0.9})
+    np.testing.assert_allclose(state.hyperparameters["my_weight"], 0.5)
+    np.testing.assert_allclose(state.hyperparameters["gamma"], 0.9)

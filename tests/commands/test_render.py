@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 import pytest
 from PIL import Image
-from small_training import FLAGS
+from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 from gasil_envs import locomotion
 from gasil_jax import policy, render, run
@@ -28,7 +28,8 @@ from gasil_jax.sweeps import saved_states
 @pytest.fixture(scope="module")
 def point_mass(tmp_path_factory):
     out = tmp_path_factory.mktemp("render") / "run"
-    assert run.main([*FLAGS, "--seeds", "2", "--out", str(out)]) == 0
+    small = (*FLAGS, *DISCRIMINATOR_FLAGS, "--seeds", "2")
+    assert run.main([*small, "--out", str(out)]) == 0
     return out
 
 

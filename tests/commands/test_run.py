@@ -1,7 +1,6 @@
 """The command line: a run from end to end, and refusals before anything compiles."""
 
 import csv
-import dataclasses
 import io
 import itertools
 import json
@@ -14,7 +13,7 @@ import types
 
 import brax.envs
 import pytest
-from small_training import FLAGS
+from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
 from gasil_envs import locomotion, own_code
@@ -23,7 +22,8 @@ from gasil_jax.run import main
 from gasil_jax.sweeps import assembly
 
 SMALL = (
-    *(*FLAGS, "--seeds", "3", "--first-seed", "5", "--total-steps", "1e3"),
+    *(*FLAGS, *DISCRIMINATOR_FLAGS, "--seeds", "3", "--first-seed", "5"),
+    *("--total-steps", "1e3"),
     *("--batch-steps", "256", "--num-epochs", "2", "--buffer-steps", "300"),
     *("--alpha", "0.5", "--alpha-schedule", "0", "0.5", "500", "1"),
 )
@@ -47,23 +47,26 @@ def finished(tmp_path_factory):
     return result, folder / "out"
 
 
-def test_the_help_explains_every_option_in_whole_lines(monkeypatch, capsys):
+@pytest.mark.parametrize("agent", gasil_jax.agents())
+def test_the_help_explains_every_option_in_whole_lines(agent, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
-        main(["--help"])
+        main(["--help", "--agent", agent])
     shown = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     # There may be a frame.
     lines = [line.replace("│", " ").rstrip() for line in shown.splitlines()]
     is_text = lambda line: line.startswith(" " * 7)
     for line, following in itertools.pairwise(lines):
+        # Where all flags are short, the text begins beside them.
+        has_text = is_text(line) or re.match(r" +--[a-z].*\S  +\S", line)
         if re.match(" +--[a-z]", line):
-            assert is_text(following), line
-        elif is_text(line) and is_text(following):
+            assert has_text or is_text(following), line
+        if has_text and is_text(following):
             # The next word did not fit into 80 columns, two of them blank.
             assert len(line) + 1 + len(following.split()[0]) > 78, line
-    for field in dataclasses.fields(gasil_jax.Config):
-        if field.name != "hyperparameters":
-            assert f" --{field.name.replace('_', '-')}" in shown
+    rewards = {"decompose_rewards": True, "normalize_rewards": True}
+    for name in gasil_jax.algorithm(agent, **rewards).settings:
+        assert f" --{name.replace('_', '-')}" in shown
 
 
 def test_a_run_from_end_to_end(finished):
@@ -73,7 +76,8 @@ def test_a_run_from_end_to_end(finished):
 
     config = json.loads((out / "config.json").read_text())
     assert config["env"] == "point_mass" and config["first_seed"] == 5
-    assert config["config"]["hyperparameters"]["alpha"] == 0.5
+    assert config["algorithm"]["agent"] == "ppo+gasil"
+    assert config["algorithm"]["alpha"] == 0.5
 
     rows = list(csv.DictReader((out / "metrics.csv").open()))
     assert {row["seed"] for row in rows} == {"5", "6", "7"}
@@ -135,6 +139,15 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env zoo", "env 'zoo' is unknown: it must be one of point_mass, hopper"),
         ("--env zoo", "humanoid, brax:NAME, MODULE:NAME"),
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
+        (
+            "--env hopper --agent ppo --alpha 0.7",
+            "option --alpha is unknown: alpha is a setting of ppo+bonus, gasil, "
+            "ppo+gasil, gail, not of ppo",
+        ),
+        (
+            "--env hopper --agent ppo+sil --no-buffer-discounts",
+            "option --no-buffer-discounts is unknown: buffer_discounts is a setting of",
+        ),
         ("--env hopper --seeds 0", "seeds is 0: it must be from 1 to"),
         ("--env hopper --seeds 1e30", "must be from 1 to 1,048,576"),
         ("--env hopper --batch-steps 1000000007", "nearest that does is 1"),
@@ -185,9 +198,15 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env json:loads", "arguments: missing a required argument: 's'"),
         ("--env os:getcwd", "'os:getcwd' is no environment: it has no reset"),
         ("--env os:getcwd --physics mujoco", "os:getcwd has its own"),
-        ("--env point_mass --max-episode-steps 51", "environment's own limit is 50"),
+        (
+            "--env point_mass --max-episode-steps 51",
+            "from 1 to 50, the environment's own limit",
+        ),
         ("", "option --env is missing: see --help"),
-        ("--env hopper walker2d", "'walker2d' belongs to no option: see --help"),
+        (
+            "--env hopper walker2d",
+            "'walker2d' is not an option or its value: see --help",
+        ),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
@@ -275,7 +294,7 @@ def test_ctrl_c_passes_through_what_checks_the_users_code():
 def test_a_run_in_which_no_episode_can_end_is_told(capsys):
     env = gasil_jax.make_env("point_mass")
     # 3 iterations of 16 steps in each environment; an episode has 50.
-    short = gasil_jax.Config(total_steps=40, num_envs=1, batch_steps=16)
+    short = gasil_jax.algorithm("ppo", total_steps=40, num_envs=1, batch_steps=16)
     assembly.note_if_no_episode_ends(env, [short.replace(total_steps=50), short])
     (line,) = capsys.readouterr().err.splitlines()
     assert "no return is known: each of 1 environments takes 48 steps" in line
@@ -300,8 +319,8 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
         ("--solver mjx", ["solver is mjx, which has no effect"]),
         ("--integrator euler", ["integrator is euler, which has no effect"]),
         (
-            "--agent ppo --alpha 0.7",
-            ["alpha is 0.7, which has no effect: agent 'ppo' does"],
+            "--no-normalize-rewards --reward-clip 3",
+            ["reward_clip is 3.0, which has no effect: normalize_rewards is off"],
         ),
         ("--seeds 2 --devices 8", ["devices is 8, of which 2 are used"]),
         ("--seeds 2 --devices 2 --alpha 0.7", []),
@@ -312,7 +331,7 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
         ),
         ("--decomposition-updates 9 --decompose-rewards", []),
         ("--agent gasil --decompose-rewards", ["'gasil' does not use the env"]),
-        ("--agent ppo --alpha-schedule 1e5 0 2e5 1", ["alpha_schedule is ((1000"]),
+        ("--decomposition-hidden-sizes 8 9", ["hidden_sizes is (8, 9), which has no"]),
     ],
 )
 def test_an_option_without_effect_is_told(arguments, messages, capsys):

@@ -285,7 +285,6 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
             "built: OSError: no licence .*2",
         ),
         ("def Env():\n    import sys\n    sys.exit()", r"built: SystemExit \(.*line 3"),
-        ("raise KeyboardInterrupt", r"imported: KeyboardInterrupt \(.*line 1"),
         (
             _OWN.replace("return State", "raise SystemExit(4); State"),
             r"can't be traced: SystemExit: 4 \(.*line 7",

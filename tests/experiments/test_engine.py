@@ -16,7 +16,6 @@ from experiments.curves import Curve, Figure
 from experiments.engine import Program, Setup
 from experiments.figures import FIGURES
 from experiments.store import RESULTS, Run, Store
-from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
 from gasil_jax.host.interruption import Interrupted
@@ -24,11 +23,11 @@ from gasil_jax.host.periodic_evaluation import evaluation_key
 from gasil_jax.sweeps.shards import Shard
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
-SMALL |= {"discriminator_hidden_sizes": (8,), "total_steps": 1024}
+SMALL |= {"total_steps": 1024}
 
 
 def run(seed=0, **changes):
-    return Run("point_mass", Config(agent="ppo").replace(**{**SMALL, **changes}), seed)
+    return Run("point_mass", gasil_jax.algorithm("ppo", **{**SMALL, **changes}), seed)
 
 
 RUNS = [run(0), run(1), run(0, learning_rate=1e-4)]
@@ -67,14 +66,36 @@ def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
     assert Program(same.runs, Setup(evaluate_episodes=0)).folder not in folders
 
 
-def test_runs_with_other_counts_share_a_program_on_request():
-    few, many = run(buffer_steps=64), run(discriminator_updates=7)
-    assert len(engine.programs([few, many], Setup())) == 2
-    (shared,) = engine.programs([few, many], Setup(share_counts=True))
-    largest = shared.config.hyperparameters
-    assert largest.discriminator_updates == 7
-    assert largest.buffer_steps == many.config.hyperparameters.buffer_steps > 64
-    assert set(shared.runs) == {few, many}
+@pytest.mark.parametrize(
+    ("agent", "numbers", "others"),
+    [
+        (
+            "ppo+gasil",
+            {"alpha": 0.5, "discriminator_learning_rate": 1e-3},
+            {"buffer_steps": 64, "bonus": "airl", "alpha_schedule": ((1e3, 0.0),)},
+        ),
+        (
+            "ppo",
+            {"decomposition_learning_rate": 1e-4, "reward_clip": 5.0},
+            {"decomposition_updates": 7, "normalize_rewards": False},
+        ),
+    ],
+)
+def test_an_agents_and_a_models_numbers_are_no_program_of_their_own(
+    agent, numbers, others
+):
+    models = {"decompose_rewards": True, "normalize_rewards": True}
+    first = Run("point_mass", gasil_jax.algorithm(agent, **SMALL, **models), 0)
+    changed = lambda name, value: dataclasses.replace(
+        first, algorithm=first.algorithm.replace(**{name: value})
+    )
+    alike = {changed(name, value) for name, value in numbers.items()}
+    apart = {changed(name, value) for name, value in others.items()}
+    programs = engine.programs([first, *alike, *apart], Setup())
+    assert {frozenset(program.runs) for program in programs} == {
+        frozenset({first, *alike}),
+        *(frozenset({one}) for one in apart),
+    }
 
 
 def test_shards_are_all_runs_once_and_none_moves_when_others_join():
@@ -94,7 +115,7 @@ def test_a_record_is_what_make_train_gives(trained):
     assert set(records) == set(RUNS)
     env = gasil_jax.make_env("point_mass")
     for each, record in records.items():
-        train = jax.jit(gasil_jax.make_train(env, each.config))
+        train = jax.jit(gasil_jax.make_train(env, each.algorithm))
         state, metrics = train(jax.random.key(each.seed))
         assert record.env_steps.tolist() == [256, 512, 768, 1024]
         for name in ("episode_return", "episode_length"):
@@ -104,7 +125,7 @@ def test_a_record_is_what_make_train_gives(trained):
         # A program of four iterations is evaluated after each of them.
         assert record.evaluation_steps.tolist() == [256, 512, 768, 1024]
         key = evaluation_key(each.seed, 4)
-        scores = evaluate(env, each.config, state, key, num_episodes=2)
+        scores = evaluate(env, each.algorithm, state, key, num_episodes=2)
         expected = scores["episode_return"].mean()
         assert record.evaluation_return[-1] == pytest.approx(expected, rel=2e-3)
 
@@ -246,7 +267,7 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
 def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
     figure = __main__._small(FIGURES["delayed_rewards"], ["hopper-delayed"])
     decomposed = {
-        name: curve.runs(Store(tmp_path))[0].config.decompose_rewards
+        name: curve.runs(Store(tmp_path))[0].algorithm.settings["decompose_rewards"]
         for _, name, curve in figure.curves()
     }
     assert decomposed["ppo (decomposed)"] and not decomposed["ppo"]

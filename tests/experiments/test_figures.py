@@ -6,13 +6,14 @@ import math
 import numpy as np
 import pytest
 
+import gasil_jax
 from experiments import search
 from experiments.curves import Arm, Curve, Figure, grid
 from experiments.figures import FIGURES
 from experiments.search import DELAY, PAIR, Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
-from gasil_jax.config import Config, validate
+from gasil_jax.algorithms import check
 
 STORE = Store(RESULTS / "runs")
 
@@ -20,8 +21,8 @@ STORE = Store(RESULTS / "runs")
 @pytest.mark.parametrize("name", FIGURES)
 def test_every_run_of_a_figure_is_valid(name):
     runs = FIGURES[name].requested(STORE)
-    for config in {run.config for run in runs}:
-        validate(config)
+    for algorithm in {run.algorithm for run in runs}:
+        check(algorithm)
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -48,7 +49,7 @@ def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
         (first,) = curve.search.runs(search.draw(curve.agent)[:1])
         runs = curve.runs(store)
         assert [run.seed for run in runs] == list(range(20))
-        assert runs[0].config == first[0].config
+        assert runs[0].algorithm == first[0].algorithm
 
 
 def test_noise_is_trained_with_what_was_chosen_without():
@@ -61,11 +62,11 @@ def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
     monkeypatch.setattr(Search, "chosen", lambda *_: {"alpha": 0.2, "gamma": 0.99})
     curves = FIGURES["humanoid"].panels["humanoid"]
     scheduled, fixed = (
-        curves[name].runs(STORE)[0].config
+        curves[name].runs(STORE)[0].algorithm
         for name in ("ppo+gasil-from-2M", "ppo+gasil")
     )
-    assert scheduled.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
-    assert (fixed.hyperparameters.alpha, fixed.total_steps) == (0.2, 3_000_000)
+    assert scheduled.agent.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
+    assert (fixed.agent.alpha, fixed.config.total_steps) == (0.2, 3_000_000)
     assert scheduled.replace(alpha=0.2, alpha_schedule=()) == fixed
     bare = dataclasses.replace(curves["ppo"], base="tuned", changes={})
     assert isinstance(bare, Curve) and bare.point(STORE) == {}
@@ -99,10 +100,10 @@ def test_an_ablation_is_a_row():
         assert [run.seed for run in runs] == [0, 1, 2, 3, 4]
         assert {run.reward_delay for run in runs} == {DELAY}
         agent = "ppo" if name == "ppo" else "ppo+gasil"
-        expected = Config(agent=agent, total_steps=1_000_000).replace(**SHARED)
+        expected = gasil_jax.algorithm(agent, total_steps=1_000_000, **SHARED)
         if name == "weak":
             expected = expected.replace(alpha=0.01, num_envs=8)
-        assert runs[0].config == expected
+        assert runs[0].algorithm == expected
     others = [key[1:] for key in figure.compared() if key[0] == "ant-delayed"]
     assert others == [("ppo+gasil", "ppo"), ("ppo+gasil", "weak")]
 
@@ -111,8 +112,8 @@ def test_a_figure_over_delays_is_a_row():
     assert list(DELAYS.panels) == ["hopper", "swimmer"]
     for _, name, curve in DELAYS.curves():
         (run, *_) = curve.runs(STORE)
-        assert name == f"{run.config.agent}-{run.reward_delay}"
-        assert run.config.num_envs == 64
+        assert name == f"{run.algorithm.agent.name}-{run.reward_delay}"
+        assert run.algorithm.config.num_envs == 64
     # Agents are compared where the delay is the same.
     others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
     assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]
@@ -130,13 +131,13 @@ def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path
             initial_deviation=1 / math.sqrt(size),
             gae_lambda=1 - math.sqrt(size) / 40,
         )
-        configs = [
-            curve.runs(Store(tmp_path))[0].config
+        algorithms = [
+            curve.runs(Store(tmp_path))[0].algorithm
             for name, curve in panels[f"{env}-delayed"].items()
             if name != "ppo"
         ]
-        assert scaled.decompose_rewards
-        assert configs == [
+        assert scaled.settings["decompose_rewards"]
+        assert algorithms == [
             scaled,
             by_root,
             by_root.replace(gae_lambda=0.95),

@@ -69,12 +69,12 @@ def test_moments_of_the_point_mass_are_drawn(tmp_path, monkeypatch):
 
 def test_the_states_at_moments_are_those_of_training():
     env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config(
-        agent="ppo", total_steps=8 * 256, batch_steps=256, num_envs=4, num_epochs=1
+    algorithm = gasil_jax.algorithm(
+        "ppo", total_steps=8 * 256, batch_steps=256, num_envs=4, num_epochs=1
     )
-    states = point_mass_moments.states_at(env, config, (0.0, 0.5, 1.0))
+    states = point_mass_moments.states_at(env, algorithm, (0.0, 0.5, 1.0))
     assert [int(state.iteration) for state in states] == [1, 4, 8]
-    final, _ = gasil_jax.make_train(env, config)(jax.random.key(0))
+    final, _ = gasil_jax.make_train(env, algorithm)(jax.random.key(0))
     one, other = (
         x.actor_critic.policy.params["params"]["log_std"] for x in (states[-1], final)
     )

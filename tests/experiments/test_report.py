@@ -110,13 +110,13 @@ def test_the_probability_of_improvement_is_of_pairs_of_seeds():
         ("b", "y"): np.array([-1.0, 8.0]),
     }
     # 2 of 4 pairs and half of another on one task, and all 4 on the other.
-    assert comparisons.improvement(data, "ab", "x", "y").startswith("0.81 [")
-    assert comparisons.improvement(data, "ab", "y", "x").startswith("0.19 [")
-    assert comparisons.improvement(data, "b", "x", "y") == "1.00 [1.00, 1.00]"
+    assert comparisons.improvement(data, "ab", "x", other="y").startswith("0.81 [")
+    assert comparisons.improvement(data, "ab", "y", other="x").startswith("0.19 [")
+    assert comparisons.improvement(data, "b", "x", other="y") == "1.00 [1.00, 1.00]"
     # A seed that ended no episode has less than any other, on either side.
     none = {**data, ("b", "y"): np.array([np.nan, np.nan])}
-    assert comparisons.improvement(none, "b", "x", "y") == "1.00 [1.00, 1.00]"
-    assert comparisons.improvement(none, "b", "y", "x") == "0.00 [0.00, 0.00]"
+    assert comparisons.improvement(none, "b", "x", other="y") == "1.00 [1.00, 1.00]"
+    assert comparisons.improvement(none, "b", "y", other="x") == "0.00 [0.00, 0.00]"
 
 
 def test_every_task_counts_alike_in_the_aggregate(tmp_path):
@@ -161,8 +161,8 @@ FIGURE = Figure(
     "Claim.",
     {
         panel: {
-            name: Curve(env, "ppo", seeds=6, changes={"alpha": alpha})
-            for name, alpha in (("ours", 0.5), ("other", 0.6))
+            name: Curve(env, "ppo", seeds=6, changes={"gamma": gamma})
+            for name, gamma in (("ours", 0.5), ("other", 0.6))
         }
         for panel, env in (("one", "hopper"), ("two", "swimmer"))
     },
@@ -281,8 +281,8 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
 
 @pytest.mark.parametrize("count", [3, 9])
 def test_every_arm_has_a_color(page, tmp_path, count):
-    arms = [Arm(f"arm {i}", "ppo", {"alpha": 0.5}) for i in range(count)]
-    panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"alpha": 0.6})
+    arms = [Arm(f"arm {i}", "ppo", {"gamma": 0.5}) for i in range(count)]
+    panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"gamma": 0.6})
     figure = Figure("Arms", "", panels, favourite="ppo")
     drawn = Page("matrix", page.searched, figure=figure).picture()
     colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]

@@ -70,8 +70,9 @@ def test_the_best_of_all_points_is_chosen(tmp_path):
     assert point == drawn[-2] == one.leading(store)
     assert best.tolist() == [10.0, 10.0, *[60.0] * 4]
     for run in one.runs(further)[-1]:
-        assert run.config.normalize_rewards and run.config.num_envs == 32
-        assert not run.config.decompose_rewards and run.reward_delay == 20
+        settings = run.algorithm.settings
+        assert settings["normalize_rewards"] and settings["num_envs"] == 32
+        assert not settings["decompose_rewards"] and run.reward_delay == 20
 
 
 def test_a_point_that_ended_no_episode_is_not_chosen(tmp_path):
@@ -86,7 +87,7 @@ def test_delayed_rewards_are_decomposed_for_two_curves():
         (delay, name)
         for _, delay in CELLS
         for name, one in search.searches("hopper", delay).items()
-        if one.config({}).decompose_rewards
+        if one.algorithm({}).settings["decompose_rewards"]
     }
     assert decomposed == {(20, "ppo+gasil-adaptive"), (20, "ppo (decomposed)")}
 
@@ -121,14 +122,14 @@ def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
 
 def test_which_values_suit_a_task_is_told(tmp_path):
     store, points = Store(tmp_path), search.draw("ppo")
-    assert search.mean_ranks("gamma", "ant", 20, store) == {}
+    assert search.mean_ranks("gamma", "ant", 20, store=store) == {}
     fill(store, Search("ant", "ppo", 20), points, [1e4 * x["gamma"] for x in points])
     # PPO on decomposed rewards has the same points, the other way round.
     decomposed = Search("ant", "ppo", 20, decompose_rewards=True)
     fill(store, decomposed, points, [-x["gamma"] for x in points])
-    low, high = search.mean_ranks("gamma", "ant", 20, store).values()
+    low, high = search.mean_ranks("gamma", "ant", 20, store=store).values()
     assert low == pytest.approx(high) == pytest.approx(0.5)
-    assert search.mean_ranks("alpha", "ant", 20, store) == {}
+    assert search.mean_ranks("alpha", "ant", 20, store=store) == {}
     row = next(
         x for x in Page("matrix", store).ranks("gamma").splitlines() if "| ant" in x
     )
@@ -185,12 +186,12 @@ def test_the_papers_protocol_has_the_appendix_s_values():
     one = search.PaperSearch("hopper", "ppo+gasil", 20)
     for runs in one.runs(one.points(Store(RESULTS / "runs"))):
         assert [run.seed for run in runs] == [1000, 1001]
-        config, numbers = runs[0].config, runs[0].config.hyperparameters
+        algorithm, config = runs[0].algorithm, runs[0].algorithm.config
         assert (config.num_envs, config.num_steps) == (1, 2048)
-        assert config.normalize_rewards and not config.stagger_episodes
+        assert algorithm.settings["normalize_rewards"] and not config.stagger_episodes
         assert (config.num_epochs, config.minibatch_size) == (10, 64)
-        assert (numbers.gamma, numbers.gae_lambda) == (0.99, 0.95)
-        assert numbers.initial_deviation == 1.0 and numbers.entropy_coefficient == 0.0
+        assert (config.gamma, config.gae_lambda) == (0.99, 0.95)
+        assert config.initial_deviation == 1.0 and config.entropy_coefficient == 0.0
 
 
 def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):

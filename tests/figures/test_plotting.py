@@ -50,7 +50,9 @@ def test_each_environment_has_titled_panels(figures, tmp_path):
 
 def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
     run = made_up("hopper", "ppo", 5, 3000.0)
-    plotting.learning_curve(tmp_path / "x.png", run.env_steps, run.returns, "hopper")
+    plotting.learning_curve(
+        tmp_path / "x.png", run.env_steps, run.returns, title="hopper"
+    )
     (figure,) = figures
     *seeds, middle = figure.axes[0].get_lines()
     assert len(seeds) == 5
@@ -59,7 +61,7 @@ def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
     assert "over 5 seeds" in figure.get_supxlabel()
     # Nothing to draw is no error.
     nothing = np.full((2, 50), np.nan)
-    plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, "hopper")
+    plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, title="hopper")
 
 
 def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
@@ -69,7 +71,9 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     values["gamma"] = tuple(np.linspace(0.9, 0.99, 9))
     returns = np.arange(9.0)
     shares = {name: statistics.importance(x, returns) for name, x in values.items()}
-    plotting.marginals(tmp_path / "x.png", values, returns, shares, best=8, left_out=2)
+    plotting.marginals(
+        tmp_path / "x.png", values, returns, importance=shares, best=8, left_out=2
+    )
     (figure,) = figures
     alpha, rule, gamma = figure.axes
     assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
@@ -94,7 +98,7 @@ def test_too_few_points_have_no_importance(figures, tmp_path):
         tmp_path / "x.png",
         {"alpha": (0.0, 0.02, 1.0)},
         np.arange(3.0),
-        {"alpha": None},
+        importance={"alpha": None},
         best=None,
         left_out=0,
     )
@@ -108,7 +112,7 @@ def test_too_few_points_have_no_importance(figures, tmp_path):
 def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
     points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0)]
     names, returns = tables._labels(points), np.array([[1.0, 2.0], [3.0, 4.0]])
-    plotting.final_returns(tmp_path / "x.png", names, returns, 1)
+    plotting.final_returns(tmp_path / "x.png", names, returns, best=1)
     labels = figures[0].axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == ["alpha=0.1", "alpha=1"]
     assert [label.get_weight() for label in labels] == ["normal", "bold"]
@@ -119,5 +123,5 @@ def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", pixels)
     names = [f"alpha={i}" for i in range(1300)]
-    plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), None)
+    plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), best=None)
     assert kept[0] < 2**16

@@ -15,7 +15,7 @@ import numpy as np
 import orbax.checkpoint
 import pytest
 from brax.envs import State
-from small_training import CONFIG, FLAGS
+from small_training import FLAGS, SETTINGS
 from test_resume import finish, start, wait_for
 
 import gasil_jax
@@ -28,7 +28,7 @@ from gasil_jax.host import (
 )
 from gasil_jax.sweeps import saved_states
 
-PPO = CONFIG.replace(agent="ppo")
+PPO = gasil_jax.algorithm("ppo", **SETTINGS)
 SMALL = (*FLAGS, "--agent", "ppo")
 #: Characters that mean something to a shell, to patterns, to URLs, or nothing at all.
 NAMES = ("sweep[lr=1e-3]", "a*?{b}", "line\nline", "$x%20#", " é ", "--x")
@@ -92,7 +92,7 @@ def test_runs_sweeps_shards_and_fit_take_folders_of_any_name(env, tmp_path):
     out = point()
     assert run.main([*SMALL, f"--out={out}"]) == 0
     states = saved_states.load(out)[-1]
-    assert_same(gasil_jax.fit(env, states_config(out), folder=point()).states, states)
+    assert_same(gasil_jax.fit(env, algorithm_of(out), folder=point()).states, states)
 
     out = point()
     arguments = [*SMALL, f"--out={out}", "--grid", "gamma=0.9,0.99", "--shard"]
@@ -100,11 +100,11 @@ def test_runs_sweeps_shards_and_fit_take_folders_of_any_name(env, tmp_path):
         assert sweep.main([*arguments, shard]) == 0
     assert merge.main([str(out)]) == 0
     state = saved_states.load(out / "shards" / "2-of-2", point=1)[-1]
-    np.testing.assert_array_equal(state.iteration, [CONFIG.num_iterations])
+    np.testing.assert_array_equal(state.iteration, [PPO.config.num_iterations])
 
 
-def states_config(out):
-    return run_folder.read(out)["config"]
+def algorithm_of(out):
+    return run_folder.read(out)["algorithm"]
 
 
 def test_a_name_that_the_terminal_cannot_show_is_printed(monkeypatch):
@@ -193,7 +193,8 @@ def test_a_disk_without_locks_and_flushes_keeps_everything(
     monkeypatch.setattr(os, "fsync", fail)
     out = tmp_path / "out"
     assert run.main([*SMALL, "--out", str(out)]) == 0
-    assert checkpoint.latest(out / "checkpoints")[0].iteration == CONFIG.num_iterations
+    newest, _ = checkpoint.latest(out / "checkpoints")
+    assert newest.iteration == PPO.config.num_iterations
     for name in ("policy.npz", "summary.json"):
         assert (out / name).exists()
 
@@ -249,7 +250,7 @@ def test_the_policies_are_written_even_if_the_last_checkpoint_is_not(
     action = gasil_jax.load_policy(out)(np.zeros(env.observation_size))
 
     with pytest.raises(checkpoint.WriteError, match="Function not implemented"):
-        gasil_jax.fit(env, states_config(out), folder=tmp_path / "fit")
+        gasil_jax.fit(env, algorithm_of(out), folder=tmp_path / "fit")
     same = gasil_jax.load_policy(tmp_path / "fit")(np.zeros(env.observation_size))
     np.testing.assert_array_equal(action, same)
 
@@ -314,11 +315,10 @@ def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
                 copy = shutil.copy if name else shutil.copytree
                 copy(tmp_path / "moved", out / name)
 
-    config = PPO.replace(total_steps=100 * 128)
     with pytest.raises(output_file.WriteError) as told:
         gasil_jax.fit(
             env,
-            config,
+            PPO.replace(total_steps=100 * 128),
             folder=out,
             evaluate_every=128,
             evaluate_episodes=1,

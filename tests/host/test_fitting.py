@@ -17,9 +17,10 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, metrics_files
 from gasil_jax.host.interruption import Interrupted
 
-# Iterations, the longest of a chunk, and the config of both ways to train.
+# Iterations, the longest of a chunk, and the algorithm of both ways to train.
 ITERATIONS, CHUNK = 100, 2
-CONFIG = small_training.CONFIG.replace(agent="ppo", total_steps=ITERATIONS * 128)
+PPO = gasil_jax.algorithm("ppo", **small_training.SETTINGS)
+PPO = PPO.replace(total_steps=ITERATIONS * 128)
 FLAGS = (
     *(*small_training.FLAGS, "--agent", "ppo", "--preset", "paper"),
     "--no-normalize-rewards",
@@ -57,7 +58,7 @@ def same(result, folder):
 
 def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
     seen = []
-    result = gasil_jax.fit(env, CONFIG, seeds=2, callback=seen.append, **EVALUATED)
+    result = gasil_jax.fit(env, PPO, seeds=2, callback=seen.append, **EVALUATED)
     same(result, commanded)
     assert result.metrics["policy_loss"].shape == (2, ITERATIONS)
     assert result.evaluations["mean"].shape == (2, 3)
@@ -85,7 +86,7 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
         return progress.iteration >= 50
 
     arguments = {"seeds": [0, 1], "folder": out, "checkpoint_every": 20 * 128}
-    first = gasil_jax.fit(env, CONFIG, callback=callback, **arguments, **EVALUATED)
+    first = gasil_jax.fit(env, PPO, callback=callback, **arguments, **EVALUATED)
     assert first.metrics["policy_loss"].shape == (2, 50)
     assert first.evaluations["mean"].shape == (2, 1)
     assert [int(x.iteration[1]) for x in states][-2:] == [48, 50]
@@ -97,19 +98,19 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     assert checkpoint.latest(out / "checkpoints")[0].iteration == 50
 
     with pytest.raises(ValueError, match=r"folder is .*: give resume=True"):
-        gasil_jax.fit(env, CONFIG, **arguments)
-    with pytest.raises(ValueError, match=r"alpha was 0.1, is 0.2: only total_steps"):
-        gasil_jax.fit(env, CONFIG.replace(alpha=0.2), resume=True, **arguments)
+        gasil_jax.fit(env, PPO, **arguments)
+    with pytest.raises(ValueError, match=r"gamma was 0.99, is 0.9: only total_steps"):
+        gasil_jax.fit(env, PPO.replace(gamma=0.9), resume=True, **arguments)
     with pytest.raises(ValueError, match="evaluate_every was 5120, is None"):
-        gasil_jax.fit(env, CONFIG, resume=True, **arguments)
+        gasil_jax.fit(env, PPO, resume=True, **arguments)
     # A program that is interrupted continues like one that was stopped.
     interrupt = lambda progress: os.kill(os.getpid(), signal.SIGTERM)
     with pytest.raises(Interrupted) as interrupted:
         gasil_jax.fit(
-            env, CONFIG, resume=True, callback=interrupt, **arguments, **EVALUATED
+            env, PPO, resume=True, callback=interrupt, **arguments, **EVALUATED
         )
     assert "resume=True" in interrupted.value.__notes__[0]
-    same(gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED), commanded)
+    same(gasil_jax.fit(env, PPO, resume=True, **arguments, **EVALUATED), commanded)
     policies = [np.load(folder / "policy.npz") for folder in (out, commanded)]
     for name in policies[1]:
         np.testing.assert_array_equal(*(arrays[name] for arrays in policies))
@@ -117,7 +118,7 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     # Without its checkpoints it would begin anew, and replace the policy.
     shutil.rmtree(out / "checkpoints")
     with pytest.raises(ValueError, match="holds the results of training that has end"):
-        gasil_jax.fit(env, CONFIG, resume=True, **arguments, **EVALUATED)
+        gasil_jax.fit(env, PPO, resume=True, **arguments, **EVALUATED)
     np.testing.assert_array_equal(
         np.load(out / "policy.npz")["mean"], policies[1]["mean"]
     )
@@ -136,7 +137,7 @@ def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
     def fit(**arguments):
         # It stops after a chunk.
         once = lambda progress: True
-        return gasil_jax.fit(env, CONFIG, folder=tmp_path, callback=once, **arguments)
+        return gasil_jax.fit(env, PPO, folder=tmp_path, callback=once, **arguments)
 
     before = fit().metrics["policy_loss"].shape[1]
     (root / "00000099.partial" / "state").mkdir(parents=True)
@@ -176,7 +177,7 @@ def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
         ({"evaluate_episodes": 1.5}, "evaluate_episodes is 1.5"),
         ({"checkpoint_every": 128}, "checkpoint_every is 128: it needs a folder"),
         ({"resume": True}, "resume is True: it needs a folder"),
-        ({"config": CONFIG.replace(alpha=-1)}, "alpha is -1"),
+        ({"algorithm": PPO.replace(gamma=-1)}, "gamma is -1"),
         ({"folder": "/proc/none"}, "folder is /proc/none"),
         ({"folder": "full"}, "folder is .* not empty"),
         (BEGUN | {"evaluate_every": None}, "evaluate_every was 128, is None"),
@@ -193,4 +194,4 @@ def test_what_is_wrong_is_refused_by_name(env, changes, why, tmp_path, monkeypat
     described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
     (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
-        gasil_jax.fit(env, **{"config": CONFIG, **changes})
+        gasil_jax.fit(env, **{"algorithm": PPO, **changes})

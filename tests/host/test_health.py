@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import test_members
 from brax.envs import State
-from small_training import CONFIG, FLAGS
+from small_training import DISCRIMINATOR, FLAGS, SETTINGS
 
 import gasil_jax
 from gasil_envs import wrappers
@@ -67,12 +67,10 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
     # One step of the second seed is counted, and its episode is over with it.
     np.testing.assert_array_equal(metrics["faulty_steps"].sum(axis=1), [0, 1, 0])
     assert metrics["skipped_updates"].sum() == 0
-    learned = (after.actor_critic.params, after.imitation, after.normalizer)
+    # The agent's state has the good trajectories or the replay.
+    learned = (after.actor_critic.params, after.agent, after.normalizer)
     for leaf in as_arrays(learned):
         assert np.isfinite(leaf).all()
-    filled = int(after.good_trajectories.size[1])
-    for leaf in (after.good_trajectories.observation, after.good_trajectories.return_):
-        assert np.isfinite(leaf[1, :filled]).all()
     # Its return is unknown.
     assert np.isnan(after.history.reward).sum(axis=(1, 2)).tolist() == [0, 1, 0]
     assert_others_are_equal(after, clean)
@@ -82,9 +80,9 @@ def test_a_nan_in_one_environment_of_one_seed(agent):
 @pytest.mark.xdist_group("members ppo+gasil")
 def test_an_update_that_is_not_finite_is_skipped_and_flagged():
     def wild(states):
-        rate = states.hyperparameters.learning_rate.at[1].set(jnp.inf)
-        hyperparameters = states.hyperparameters.replace(learning_rate=rate)
-        return states.replace(hyperparameters=hyperparameters)
+        numbers = states.hyperparameters
+        rate = numbers["learning_rate"].at[1].set(jnp.inf)
+        return states.replace(hyperparameters={**numbers, "learning_rate": rate})
 
     _, first, _ = test_members.compiled("ppo+gasil")
     after, metrics = train("ppo+gasil", wild, 2)
@@ -136,15 +134,15 @@ class Fragile:
 
 def test_a_first_observation_is_looked_at_too():
     """It must not reach the buffer, nor the return of an evaluation."""
-    small = CONFIG.replace(agent="ppo+gasil", total_steps=8 * 128)
+    small = gasil_jax.algorithm("ppo+gasil", **SETTINGS, **DISCRIMINATOR)
+    small = small.replace(total_steps=8 * 128)
     env = wrappers.EpisodeLimit(Fragile(bad_starts=True), 20)
     train = jax.jit(gasil_jax.make_train(env, small))
     state, metrics = train(jax.random.key(0))
     assert metrics["faulty_steps"].sum() > 0
     assert metrics["skipped_updates"].sum() == 0
-    filled = int(state.good_trajectories.size)
-    assert filled > 0
-    assert np.isfinite(state.good_trajectories.observation[:filled]).all()
+    assert state.agent.buffer.size > 0
+    assert np.isfinite(state.agent.buffer.observation).all()
     assert abs(state.normalizer.mean - 100.0).max() < 2.0
     scores = jax.jit(
         lambda key: evaluation.evaluate(env, small, state, key, num_episodes=20)
@@ -157,8 +155,9 @@ def test_a_first_observation_is_looked_at_too():
 
 @pytest.mark.parametrize("limit", [20, 15])
 def test_a_reward_that_is_held_back_is_looked_at_too(limit):
-    env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), 20), 10)
-    small = CONFIG.replace(agent="ppo", total_steps=4 * 128, max_episode_steps=limit)
+    env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), limit), 10)
+    small = gasil_jax.algorithm("ppo", **SETTINGS)
+    small = small.replace(total_steps=4 * 128)
     _, metrics = jax.jit(gasil_jax.make_train(env, small))(jax.random.key(0))
     assert metrics["faulty_steps"].sum() > 0
     assert metrics["skipped_updates"].sum() == 0

@@ -21,12 +21,12 @@ from hypothesis import strategies as st
 
 import gasil_jax
 from gasil_envs import wrappers
-from gasil_jax import evaluate, evaluation, merge, npz, run, sweep
-from gasil_jax.config import validate
+from gasil_jax import algorithms, evaluate, evaluation, merge, npz, run, sweep
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
 from gasil_jax.host.environments import Settings, check
-from gasil_jax.imitation import expert
+from gasil_jax.imitation import AGENTS, expert
+from gasil_jax.rewards import REWARD_MODELS
 
 
 def names(kind):
@@ -34,24 +34,28 @@ def names(kind):
     return [
         f.name
         for f in dataclasses.fields(kind)
-        if not isinstance(f.default, str)
-        and f.name not in ("expert", "hyperparameters")
+        if not isinstance(f.default, str) and f.name != "expert"
     ]
 
 
-OPTIONS = [
-    *names(gasil_jax.Config),
-    *names(gasil_jax.Hyperparameters),
-    *names(Settings),
-    "seeds",
-    "first_seed",
-    "devices",
-    "checkpoint_every",
-    "keep_checkpoints",
-    "evaluate_every",
-    "evaluate_episodes",
-]
-SMALL = gasil_jax.Config(num_envs=4, batch_steps=64, minibatch_size=16)
+#: Each option, with an agent that has it.
+OPTIONS = {name: agent for agent, kind in AGENTS.items() for name in names(kind)}
+OPTIONS |= dict.fromkeys(
+    [
+        *names(gasil_jax.Config),
+        *(name for model in REWARD_MODELS for name in (model.switch, *names(model))),
+        *names(Settings),
+        "seeds",
+        "first_seed",
+        "devices",
+        "checkpoint_every",
+        "keep_checkpoints",
+        "evaluate_every",
+        "evaluate_episodes",
+    ],
+    "ppo",
+)
+SMALL = gasil_jax.algorithm(num_envs=4, batch_steps=64, minibatch_size=16)
 NEVER_VALID = st.one_of(
     st.sampled_from(["-1", "-0.5", "nan", "inf", "-inf", "", "true", "1e999", "0x10"]),
     st.text(
@@ -63,14 +67,15 @@ NEVER_VALID = st.one_of(
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
-@given(name=st.sampled_from(OPTIONS), value=NEVER_VALID)
+@given(name=st.sampled_from([*OPTIONS]), value=NEVER_VALID)
 def test_a_value_that_is_never_valid_is_refused(name, value):
     out, err = io.StringIO(), io.StringIO()
     argument = f"--{name.replace('_', '-')}={value}"
+    task = ("--env", "hopper", "--agent", OPTIONS[name])
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             # A folder that can't be made stops the run should all else be accepted.
-            status = run.main(["--env", "hopper", argument, "--out", "/proc/no/run"])
+            status = run.main([*task, argument, "--out", "/proc/no/run"])
         except SystemExit as exit_:
             pytest.fail(f"{argument} exits with {exit_.code}")
     assert status == 2, argument
@@ -103,51 +108,54 @@ ANY_FLOAT = st.one_of(
 
 
 @st.composite
-def configurations(draw):
-    """Draw small configs, about one in seven valid."""
-    floats = {"buffer_steps": draw(st.integers(1, 60))} | {
-        field.name: draw(ANY_FLOAT)
-        for field in dataclasses.fields(gasil_jax.Hyperparameters)
-        if draw(st.integers(0, 9)) == 0
-    }
+def small_algorithms(draw):
+    """Draw small algorithms, about one in four valid."""
+    # GAIL needs an expert.
+    agent = draw(st.sampled_from([x for x in gasil_jax.agents() if x != "gail"]))
+    algorithm = gasil_jax.algorithm(agent, normalize_rewards=draw(st.booleans()))
     factor = draw(st.integers(1, 4))
     num_envs = draw(st.sampled_from([1, 2, 3]))
-    return gasil_jax.Config(
-        agent=draw(st.sampled_from([*gasil_jax.agents()[:5], "gasill"])),
-        total_steps=draw(st.integers(1, 100)),
-        num_envs=num_envs,
-        batch_steps=draw(st.sampled_from([num_envs * factor * 4, 7])),
-        minibatch_size=draw(st.sampled_from([1, 4, num_envs])),
-        num_epochs=draw(st.integers(1, 2)),
-        hidden_sizes=tuple(draw(st.lists(st.integers(1, 5), max_size=2))),
-        discriminator_hidden_sizes=tuple(draw(st.lists(st.integers(0, 5), max_size=1))),
-        discriminator_minibatch_size=draw(st.integers(1, 70)),
-        sil_buffer_steps=draw(st.integers(1, 60)),
-        sil_minibatch_size=draw(st.integers(1, 70)),
-        max_episode_steps=draw(st.sampled_from([None, 1, 5])),
-        alpha_schedule=draw(
+    drawn = {
+        "total_steps": draw(st.integers(1, 100)),
+        "num_envs": num_envs,
+        "batch_steps": draw(st.sampled_from([num_envs * factor * 4, 7])),
+        "minibatch_size": draw(st.sampled_from([1, 4, num_envs])),
+        "num_epochs": draw(st.integers(1, 2)),
+        "hidden_sizes": tuple(draw(st.lists(st.integers(1, 5), max_size=2))),
+        "discriminator_hidden_sizes": tuple(
+            draw(st.lists(st.integers(0, 5), max_size=1))
+        ),
+        "discriminator_minibatch_size": draw(st.integers(1, 70)),
+        "buffer_steps": draw(st.integers(1, 60)),
+        "sil_buffer_steps": draw(st.integers(1, 60)),
+        "sil_minibatch_size": draw(st.integers(1, 70)),
+        "alpha_schedule": draw(
             st.sampled_from([(), ((0.0, 0.0), (9.0, 1.0)), ((5, -1),)])
         ),
-        hyperparameters=gasil_jax.Hyperparameters(**floats),
-    )
+    } | {
+        name: draw(ANY_FLOAT)
+        for name in algorithm.hyperparameters
+        if draw(st.integers(0, 9)) == 0
+    }
+    own = algorithm.settings
+    return algorithm.replace(**{name: x for name, x in drawn.items() if name in own})
 
 
-def accepted(config):
+def accepted(algorithm):
     try:
-        validate(config)
+        algorithms.check(algorithm)
     except ValueError as error:
-        fields = [f.name for f in dataclasses.fields(gasil_jax.Config)]
-        fields += [f.name for f in dataclasses.fields(gasil_jax.Hyperparameters)]
-        assert any(re.search(rf"\b{name}\b", str(error)) for name in fields), error
+        names = [*algorithm.settings]
+        assert any(re.search(rf"\b{name}\b", str(error)) for name in names), error
         assert "\n" not in str(error)
         return False
     return True
 
 
 @settings(max_examples=500, deadline=None, derandomize=True)
-@given(config=configurations())
-def test_a_refused_configuration_names_its_field(config):
-    accepted(config)
+@given(algorithm=small_algorithms())
+def test_a_refused_algorithm_names_the_setting(algorithm):
+    accepted(algorithm)
 
 
 def schedules_at_fault():
@@ -160,25 +168,55 @@ WRONG = [
     *[("gamma", x) for x in (None, [1], True, np.True_, 1j, math.nan, 2**2000, {})],
     *[("learning_rate", x) for x in (1e-60, 1e-40, -1e300, 10**400, np.zeros((2, 2)))],
     ("num_envs", np.zeros((2, 2))),
-    *[("agent", x) for x in (3, None, [], "")],
     *[("hidden_sizes", x) for x in (3, (2**62,), [3], ("a",), (None,), (True,))],
     *[
         (name, x)
-        for name in ("num_envs", "total_steps", "buffer_steps", "max_episode_steps")
+        for name in ("num_envs", "total_steps", "buffer_steps")
         for x in (2**62, 2**2000, True, 1.0, "3", [], 0, math.nan)
     ],
     *[("alpha_schedule", x) for x in schedules_at_fault()],
     ("alpha", 1e300),
     ("expert", 3),
     ("normalize_rewards", 1),
-    ("hyperparameters", 3),
 ]
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_a_value_of_any_type_is_refused_by_name(name, value):
+    agent = "gail" if name == "expert" else "ppo+gasil"
     with pytest.raises(ValueError, match=name) as refusal:
-        validate(gasil_jax.Config().replace(**{name: value}))
+        algorithms.check(gasil_jax.algorithm(agent).replace(**{name: value}))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *[("agent", x) for x in (3, None, "", "ppo", gasil_jax.PPO)],
+        *[("rewards", x) for x in (3, None, [], (3,), (gasil_jax.Normalize,))],
+        *[("config", x) for x in (3, None, gasil_jax.Config)],
+    ],
+)
+def test_a_part_of_any_type_is_refused_by_name(name, value):
+    parts = {"agent": gasil_jax.PPO(), name: value}
+    with pytest.raises(ValueError, match=f"^{name} is ") as refusal:
+        algorithms.check(gasil_jax.Algorithm(**parts))
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize("value", [0, 3, [], "alpha"])
+def test_hyperparameters_of_any_type_are_refused(value):
+    env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
+    with pytest.raises(
+        ValueError, match=r"hyperparameters is .*: it must be numbers b"
+    ):
+        gasil_jax.init(env, SMALL, key, value)
+
+
+@pytest.mark.parametrize("agent", [3, None, [], "", "gasill"])
+def test_an_agent_of_any_type_is_refused_by_name(agent):
+    with pytest.raises(ValueError, match=r"^agent '.*' is unknown: ") as refusal:
+        gasil_jax.algorithm(agent)
     assert "\n" not in str(refusal.value)
 
 
@@ -186,8 +224,8 @@ def test_a_value_of_any_type_is_refused_by_name(name, value):
 def test_a_whole_number_beyond_all_floats_is_refused(name, capsys):
     for sign in ("", "-"):
         value = f"--{name.replace('_', '-')}={sign}{400 * '9'}"
-        arguments = ["--env", "point_mass", value, "--out", "/proc/no/run"]
-        assert run.main(arguments) == 2
+        task = ("--env", "point_mass", "--agent", OPTIONS[name])
+        assert run.main([*task, value, "--out", "/proc/no/run"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert name in line.replace("-", "_")
 
@@ -229,12 +267,12 @@ def test_a_count_that_is_none_is_refused_by_name(value):
 def test_a_name_that_is_no_setting_is_refused_with_the_nearest(name, nearest):
     message = f"setting '{name}' is unknown: did you mean '{nearest}'"
     with pytest.raises(ValueError, match=message):
-        gasil_jax.Config().replace(**{name: 3})
+        gasil_jax.algorithm().replace(**{name: 3})
 
 
 def test_what_is_no_single_random_key_is_refused():
     env = gasil_jax.make_env("point_mass")
-    train = gasil_jax.make_train(env, gasil_jax.Config())
+    train = gasil_jax.make_train(env, gasil_jax.algorithm())
     for seed in (0, 0.5, None):
         with pytest.raises(ValueError, match=rf"key is {seed}: it must be like jax"):
             train(seed)
@@ -245,8 +283,9 @@ def test_what_is_no_single_random_key_is_refused():
 
 def test_traced_values_pass_unlooked_at():
     def check(gamma):
-        config = gasil_jax.Config().replace(gamma=gamma, alpha_schedule=lambda s: gamma)
-        validate(config)
+        algorithms.check(
+            gasil_jax.algorithm(gamma=gamma, alpha_schedule=lambda s: gamma)
+        )
         return gamma
 
     jax.eval_shape(check, -1.0)
@@ -258,14 +297,14 @@ def test_traced_values_pass_unlooked_at():
     derandomize=True,
     suppress_health_check=[HealthCheck.filter_too_much, HealthCheck.too_slow],
 )
-@given(config=configurations().filter(accepted))
-def test_an_accepted_configuration_completes_an_iteration(config):
+@given(algorithm=small_algorithms().filter(accepted))
+def test_an_accepted_algorithm_completes_an_iteration(algorithm):
     env = gasil_jax.make_env("point_mass", reward_delay=2)
-    step = jax.jit(lambda state: gasil_jax.iterate(env, config, state))
-    init = jax.jit(lambda key: gasil_jax.init(env, config, key))
+    step = jax.jit(lambda state: gasil_jax.iterate(env, algorithm, state))
+    init = jax.jit(lambda key: gasil_jax.init(env, algorithm, key))
     state, _ = step(init(jax.random.key(0)))
     assert int(state.iteration) == 1
-    for leaf in jax.tree.leaves((state.actor_critic, state.imitation)):
+    for leaf in jax.tree.leaves((state.actor_critic, state.agent)):
         assert np.isfinite(leaf).all()
 
 
@@ -287,8 +326,8 @@ def test_an_environment_that_resets_itself_is_refused():
     brax = BraxWrapper(training.AutoResetWrapper(env))
     for wrapped, name in ((wrappers.AutoReset(env), "AutoReset"), (brax, "AutoReset")):
         with pytest.raises(ValueError, match=f"env is wrapped in {name}"):
-            gasil_jax.make_train(wrapped, gasil_jax.Config())
-    gasil_jax.make_train(BraxWrapper(env), gasil_jax.Config())
+            gasil_jax.make_train(wrapped, gasil_jax.algorithm())
+    gasil_jax.make_train(BraxWrapper(env), gasil_jax.algorithm())
 
 
 class Short:
@@ -317,7 +356,7 @@ class Short:
 )
 def test_what_is_no_environment_is_refused(env, message):
     with pytest.raises(ValueError, match=re.escape(message)) as refusal:
-        gasil_jax.make_train(env, gasil_jax.Config())
+        gasil_jax.make_train(env, gasil_jax.algorithm())
     assert "\n" not in str(refusal.value)
 
 
@@ -417,8 +456,12 @@ GOOD = {
     "seeds": 1,
     "first_seed": 0,
     "settings": {},
-    "config": {"hyperparameters": {}},
+    "algorithm": {"agent": "ppo+gasil"},
 }
+
+
+def with_algorithm(**values):
+    return json.dumps(GOOD | {"algorithm": GOOD["algorithm"] | values})
 
 
 @pytest.mark.parametrize(
@@ -430,12 +473,19 @@ GOOD = {
         "\x80\x04N.",
         json.dumps(GOOD | {"seeds": "two"}),
         json.dumps(GOOD | {"settings": {"gravity": 3}}),
-        json.dumps(GOOD | {"config": {"hyperparameters": {"alpa": 1}}}),
-        json.dumps(GOOD | {"config": {"hyperparameters": {}, "agnt": "ppo"}}),
-        json.dumps(GOOD | {"config": {"hyperparameters": {"alpha": "high"}}}),
-        json.dumps(GOOD | {"config": {"hyperparameters": {"alpha": -1}}}),
-        json.dumps(GOOD | {"config": {"hidden_sizes": {"a": 1}}}),
-        json.dumps(GOOD | {"config": {"alpha_schedule": 3}}),
+        json.dumps(GOOD | {"algorithm": []}),
+        json.dumps(GOOD | {"algorithm": {}}),
+        json.dumps(GOOD | {"algorithm": {"agnt": "ppo"}}),
+        with_algorithm(agent=3),
+        with_algorithm(agent="gasill"),
+        with_algorithm(alpa=1),
+        with_algorithm(imitation_weight=0.5),
+        with_algorithm(alpha="high"),
+        with_algorithm(alpha=-1),
+        with_algorithm(hidden_sizes={"a": 1}),
+        with_algorithm(alpha_schedule=3),
+        with_algorithm(normalize_rewards=1),
+        with_algorithm(reward_clip=5.0),
         json.dumps(GOOD | {"settings": {"obs_noise": "loud"}}),
         json.dumps(GOOD | {"settings": []}),
         json.dumps(GOOD | {"env": None}),
@@ -489,7 +539,7 @@ def test_a_run_folder_of_another_state_is_refused(tmp_path, capsys):
     ],
 )
 def test_a_foreign_sweep_folder_is_refused(point, summary, message, tmp_path, capsys):
-    described = GOOD | {"points": [point], "share_counts": False, "shard": None}
+    described = GOOD | {"points": [point], "shard": None}
     (tmp_path / "config.json").write_text(json.dumps(described))
     (tmp_path / "summary.json").write_text(json.dumps(summary))
     assert evaluate.main([str(tmp_path)]) == 2

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_training import CONFIG
+from small_training import DISCRIMINATOR, SETTINGS
 
 import gasil_jax
 from gasil_jax.host.members import make_members
@@ -20,16 +20,15 @@ def compiled(agent):
     that use it are of the group "members AGENT", so that it is compiled once.
     """
     env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
-    config = CONFIG.replace(
-        agent=agent,
+    # An episode that is cut short has no return.
+    algorithm = gasil_jax.algorithm(agent, **SETTINGS, stagger_episodes=False)
+    sizes = {**DISCRIMINATOR, "buffer_steps": 100}
+    sizes |= {"sil_buffer_steps": 200, "sil_minibatch_size": 32}
+    algorithm = algorithm.replace(
         total_steps=4 * 128,
-        buffer_steps=100,
-        sil_buffer_steps=200,
-        sil_minibatch_size=32,
-        # An episode that is cut short has no return.
-        stagger_episodes=False,
+        **{name: x for name, x in sizes.items() if name in algorithm.settings},
     )
-    members = make_members(env, config, [3, 4, 5], devices=jax.devices()[:2])
+    members = make_members(env, algorithm, [3, 4, 5], devices=jax.devices()[:2])
     states, advance = members.compile()
     return members, jax.tree.map(jnp.asarray, members.trim(states)), advance
 
@@ -66,7 +65,7 @@ def test_a_seeds_result_is_its_own():
     """It does not depend on the seeds beside it or on the number of devices."""
     members, states, advance = compiled("ppo+gasil")
     metrics, params = trained(members, advance, members.to_devices(states))
-    alone = make_members(members.env, members.config, [4], devices=jax.devices()[:1])
+    alone = make_members(members.env, members.algorithm, [4], devices=jax.devices()[:1])
     states, advance = alone.compile()
     own = trained(alone, advance, states)
     # A batch of another size is summed in another order, and learning lets that grow.
@@ -78,11 +77,11 @@ def test_a_seeds_result_is_its_own():
 
 def test_it_is_its_own_where_the_environment_calls_the_host():
     env = gasil_jax.make_env("halfcheetah", physics="mujoco")
-    config = CONFIG.replace(agent="ppo")
+    algorithm = gasil_jax.algorithm("ppo", **SETTINGS)
     results = []
     # Three members on two devices: one is padding.
     for devices, seeds in ((1, [6]), (2, [5, 6, 7])):
-        members = make_members(env, config, seeds, devices=jax.devices()[:devices])
+        members = make_members(env, algorithm, seeds, devices=jax.devices()[:devices])
         states, advance = members.compile()
         results.append(trained(members, advance, states)[1])
     alone, two = results

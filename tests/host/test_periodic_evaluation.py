@@ -12,7 +12,7 @@ import signal
 import jax
 import numpy as np
 import pytest
-from small_training import CONFIG, FLAGS
+from small_training import FLAGS, SETTINGS
 
 import gasil_jax
 from gasil_jax import plot, run, sweep
@@ -32,8 +32,8 @@ SEEDS = (5, 6, 7)
 # Three members on two devices: one is padding.
 SMALL = (
     *(*FLAGS, "--agent", "ppo", "--seeds", "3", "--first-seed", "5", "--devices", "2"),
-    *("--total-steps", str(ITERATIONS * 128), "--buffer-steps", "300"),
-    *("--reward-delay", "7", "--learning-rate", "0.01"),
+    *("--total-steps", str(ITERATIONS * 128), "--reward-delay", "7"),
+    *("--learning-rate", "0.01"),
     *("--checkpoint-every", str(8 * 128), "--keep-checkpoints", "99"),
 )
 # Rounded up to five iterations.
@@ -115,11 +115,11 @@ def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
 
 def test_the_scores_are_those_of_evaluate(evaluated):
     out, _ = evaluated
-    env, config, seeds, states = saved_states.load(out)
+    env, algorithm, seeds, states = saved_states.load(out)
     for index, (seed, row) in enumerate(zip(seeds, rows(out)[-3:], strict=True)):
         scores = evaluate_directly(
             env,
-            config,
+            algorithm,
             gasil_jax.member(states, index),
             evaluation_key(seed, ITERATIONS),
             num_episodes=EPISODES,
@@ -234,7 +234,7 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
         tmp_path / "y.png",
         curves.env_steps,
         curves.returns,
-        "title",
+        title="title",
         evaluations=curves.evaluations,
     )
     scores = curves.evaluations["mean"]
@@ -251,8 +251,8 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
 def scored(tmp_path, seeds, devices, times=1):
     """Return the mean, lowest and highest return of each seed's amplified policy."""
     env = gasil_jax.make_env("point_mass", reward_delay=7)
-    config = CONFIG.replace(agent="ppo")
-    members = make_members(env, config, seeds, devices=jax.devices()[:devices])
+    algorithm = gasil_jax.algorithm("ppo", **SETTINGS)
+    members = make_members(env, algorithm, seeds, devices=jax.devices()[:devices])
     states = members.init()
     # The first policies hardly move.
     params = jax.tree.map(lambda x: 30 * x, states.actor_critic)

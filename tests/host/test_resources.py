@@ -25,12 +25,12 @@ from gasil_jax.host.members import make_members
 )
 def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     env = gasil_jax.make_env("point_mass")
-    config = gasil_jax.Config(agent=agent, **changes)
-    members = make_members(env, config, range(3), devices=jax.devices()[:1])
+    algorithm = gasil_jax.algorithm(agent, **changes)
+    members = make_members(env, algorithm, range(3), devices=jax.devices()[:1])
     states = jax.eval_shape(members.init)
     account = members.advance.lower(states, np.int32(0)).compile().memory_analysis()
     total = account.temp_size_in_bytes + account.argument_size_in_bytes
-    assert 0.5 < 3 * resources.need(env, config).memory / total < 2.0
+    assert 0.5 < 3 * resources.need(env, algorithm).memory / total < 2.0
 
 
 def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
@@ -49,9 +49,11 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
     assert not (tmp_path / "out").exists()
 
     # Those of all points stay on the disk.
-    state = resources.need(gasil_jax.make_env("point_mass"), gasil_jax.Config()).state
+    state = resources.need(
+        gasil_jax.make_env("point_mass"), gasil_jax.algorithm()
+    ).state
     monkeypatch.setattr(resources, "_free_disk", lambda folder: 9 * state)
-    env, members = gasil_jax.make_env("point_mass"), (gasil_jax.Config(), 2)
+    env, members = gasil_jax.make_env("point_mass"), (gasil_jax.algorithm(), 2)
     resources.check_disk(env, [members], tmp_path, 3)
     with pytest.raises(ValueError, match="3 checkpoints of 4 seeds"):
         resources.check_disk(env, [members, members], tmp_path, 3)
@@ -60,23 +62,31 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
 @pytest.mark.parametrize(
     ("agent", "changes", "part"),
     [
-        ("ppo", {"buffer_steps": 10**8}, "good trajectories, with buffer_steps 1000"),
+        (
+            *("ppo+bc", {"buffer_steps": 10**8}),
+            "the state of agent 'ppo+bc', with buffer_steps 100000000",
+        ),
         ("ppo", {"batch_steps": 2**24}, "batches, with batch_steps 16777216"),
-        ("ppo+sil", {"sil_buffer_steps": 10**8}, "the state of agent 'ppo+sil'"),
+        (
+            *("ppo+sil", {"sil_buffer_steps": 10**8}),
+            "the state of agent 'ppo+sil', with sil_buffer_steps 100000000",
+        ),
     ],
 )
 def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
-    config = gasil_jax.Config(agent=agent).replace(**changes)
+    algorithm = gasil_jax.algorithm(agent, **changes)
     with pytest.raises(ValueError, match=f"most is for {re.escape(part)}"):
         env = gasil_jax.make_env("point_mass")
-        resources.check_memory(env, config, 1, jax.devices()[:1])
+        resources.check_memory(env, algorithm, 1, jax.devices()[:1])
 
 
 def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
-    state = resources.need(gasil_jax.make_env("point_mass"), gasil_jax.Config()).state
+    state = resources.need(
+        gasil_jax.make_env("point_mass"), gasil_jax.algorithm()
+    ).state
     monkeypatch.setattr(resources, "_free_disk", lambda folder: state)
-    env, members = gasil_jax.make_env("point_mass"), [(gasil_jax.Config(), 1)]
+    env, members = gasil_jax.make_env("point_mass"), [(gasil_jax.algorithm(), 1)]
     with pytest.raises(ValueError, match="3 checkpoints of 1 seeds"):
         resources.check_disk(env, members, tmp_path, 3)
     for iteration in ("10", "20", "30"):
@@ -149,7 +159,7 @@ def test_members_have_equal_shares_of_the_devices_that_are_used(monkeypatch):
         monkeypatch.setattr(
             resources, "need", lambda *_: resources.Need(0, size, "networks")
         ),
-        resources.check_memory(None, gasil_jax.Config(), count, devices),
+        resources.check_memory(None, gasil_jax.algorithm(), count, devices),
     )
     fits(80_000, 8)
     fits(40_000, 16)

@@ -28,9 +28,9 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.members import Members
 
 ITERATIONS = 400
-# PPO's state, which has the buffer too, compiles soonest; every agent's: below.
+# Of the states with a buffer PPO+BC's compiles soonest; every agent's: below.
 SMALL = (
-    *(*FLAGS, "--agent", "ppo", "--seeds", "3", "--devices", "2"),
+    *(*FLAGS, "--agent", "ppo+bc", "--seeds", "3", "--devices", "2"),
     *("--total-steps", str(ITERATIONS * 128), "--buffer-steps", "300"),
     *("--reward-delay", "7", "--obs-noise", "0.1"),
 )
@@ -189,7 +189,7 @@ def copy(whole, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--alpha 0.7", "alpha was 0.1, is 0.7"),
+        ("--behavior-cloning-coefficient 0.7", "coefficient was 0.1, is 0.7"),
         ("--obs-noise 0.2 --num-epochs 3", "num_epochs was 1, is 3"),
         ("--seeds 4", "seeds was 3, is 4"),
         ("--total-steps 100", "total_steps was 51200, is 100"),
@@ -211,7 +211,7 @@ def test_settings_that_changed_before_the_lock_are_refused(whole, tmp_path):
     options = run_options.parse(run.Options, arguments, "gasil_jax.run", begun)
     path = out / "config.json"
     changed = json.loads(path.read_text())
-    changed["config"]["total_steps"] *= 2
+    changed["algorithm"]["total_steps"] *= 2
     path.write_text(json.dumps(changed))
     with pytest.raises(InputError, match="total_steps was 102400, is 51200"):
         with run_options.open_folder(options, "gasil_jax.run"):
@@ -546,5 +546,6 @@ def test_every_agent_continues_bit_for_bit(agent, tmp_path):
     metrics, _, leaves = rest[0]
     assert metrics["skipped_updates"].sum() == 0
     assert np.isfinite(metrics["policy_loss"]).all()
-    assert (metrics["good_steps"] == 100).all()
+    if "buffer_steps" in members.algorithm.settings:
+        assert (metrics["good_steps"] == 100).all()
     assert len(leaves) > 20

@@ -1,6 +1,5 @@
 """Shards of a sweep hold each member once, and merge into the same tables."""
 
-import dataclasses
 import json
 import shutil
 import signal
@@ -12,10 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+import gasil_jax
 from gasil_jax import merge, sweep
-from gasil_jax.config import Config
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, metrics_files, run_folder, run_options
+from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.sweeps import assembly, launch, shards, tables, trained_programs
 
@@ -28,7 +27,7 @@ from gasil_jax.sweeps import assembly, launch, shards, tables, trained_programs
 )
 def test_shards_hold_each_member_once(updates, num_seeds, count):
     points = [{"discriminator_updates": n, "alpha": 0.1} for n in updates]
-    whole = shards.programs(Config(), points, range(num_seeds))
+    whole = shards.programs(gasil_jax.algorithm(), points, range(num_seeds))
     total = len(points) * num_seeds
     every = [shards.Shard(number, count) for number in range(1, count + 1)]
     if count > total:
@@ -39,44 +38,46 @@ def test_shards_hold_each_member_once(updates, num_seeds, count):
     sizes = [sum(len(program.members) for program in part) for part in parts]
     assert max(sizes) - min(sizes) <= 1
     seen = [program for part in parts for program in part]
-    members = [(p.number, p.config, member) for p in seen for member in p.members]
-    assert members == [(p.number, p.config, m) for p in whole for m in p.members]
+    members = [(p.number, p.algorithm, member) for p in seen for member in p.members]
+    assert members == [(p.number, p.algorithm, m) for p in whole for m in p.members]
     # No more is compiled than cutting must cost.
     assert len(seen) <= len(whole) + count - 1
 
 
-def test_counts_share_a_program_where_that_is_asked_for():
+def test_points_that_differ_in_traced_numbers_alone_share_a_program():
     points = [
-        {"discriminator_updates": 5, "buffer_steps": 1000, "alpha": 1.0},
+        {"discriminator_updates": 5, "alpha": 1.0},
         {"discriminator_updates": 20, "alpha": 0.1},
+        {"discriminator_updates": 5, "gamma": 0.9},
         {"num_epochs": 3},
     ]
-    config = Config().replace(buffer_steps=500)
-    shared = shards.programs(config, points, [7], share_counts=True)
-    assert [program.members for program in shared] == [((0, 7), (1, 7)), ((2, 7),)]
-    for program in shared:
-        assert program.config.hyperparameters.discriminator_updates == 20
-        assert program.config.hyperparameters.buffer_steps == 1000
-    counts = [
-        (x.discriminator_updates, x.buffer_steps, x.alpha)
-        for program in shared
-        for x in program.hyperparameters
+    algorithm = gasil_jax.algorithm(alpha=0.3)
+    first, *others = shards.programs(algorithm, points, [7, 8])
+    assert first.members == ((0, 7), (0, 8), (2, 7), (2, 8))
+    numbers = [(x["alpha"], x["gamma"]) for x in first.hyperparameters]
+    assert numbers == [(1.0, 0.99)] * 2 + [(0.3, 0.9)] * 2
+    assert first.algorithm == algorithm.replace(discriminator_updates=5)
+    assert [x.members for x in others] == [((1, 7), (1, 8)), ((3, 7), (3, 8))]
+    assert [x.algorithm for x in others] == [
+        algorithm.replace(discriminator_updates=20),
+        algorithm.replace(num_epochs=3),
     ]
-    assert counts == [(5, 1000, 1.0), (20, 500, 0.1), (5, 500, 0.1)]
-    (second,) = shards.cut_evenly(shared[:1], shards.Shard(2, 2))
-    assert second.members == ((1, 7),)
-    assert second.hyperparameters == shared[0].hyperparameters[1:]
+    (second,) = shards.cut_evenly([first], shards.Shard(2, 2))
+    assert second.members == ((2, 7), (2, 8))
+    assert second.hyperparameters == first.hyperparameters[2:]
 
 
 GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
-SMALL = ("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100")
-SMALL += ("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3")
+SMALL = (
+    *("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100"),
+    *("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3", "--gamma", "0.99"),
+)
 
 
 def train(folder, shard=None, *arguments):
     """Write the files of a trained sweep, with metrics that tell members apart."""
     part = ("--shard", shard) if shard else ()
-    options = command_line.parse(
+    options = run_options.parse(
         sweep.Options, [*SMALL, "--grid", *GRID, *arguments, *part], "x"
     )
     folder = folder if shard is None else shards.parse(shard).folder(folder)
@@ -169,7 +170,7 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     shutil.rmtree(second)
     trained, _ = train(out, "2/3")
     assert "several folders need --out" in refused(first.folder, second)
-    assert "1/3 is there twice" in refused(out, copy(first.folder), "--out", tmp_path)
+    assert "1/3 is given twice" in refused(out, copy(first.folder), "--out", tmp_path)
     # Begun and killed; then cut short while it was copied.
     program_folder = trained.programs[0].folder(second)
     training = program_folder / "training.json"
@@ -191,25 +192,29 @@ def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "results.csv").touch()
     assert "holds other files" in refused(out, "--out", tmp_path / "thesis")
-    described = json.loads((first.folder / "config.json").read_text())
-    alone = {field.name for field in dataclasses.fields(run_options.Options)}
-    of_a_run = {name: x for name, x in described.items() if name in alone}
     (tmp_path / "run").mkdir()
-    (tmp_path / "run" / "config.json").write_text(json.dumps(of_a_run))
+    of_a_run = run_options.parse(run_options.Options, SMALL, "x")
+    run_options.write_config(of_a_run, tmp_path / "run")
     assert "holds other files" in refused(out, "--out", tmp_path / "run")
     assert not (out / "results.csv").exists()
-    # On each host the expert's file may be another one.
-    kept = (second / "config.json").read_text()
-    for folder, digest in ((first.folder, "a"), (second, "b")):
-        content = json.loads((folder / "config.json").read_text())
-        content[run_folder.EXPERT_HASH] = digest
-        (folder / "config.json").write_text(json.dumps(content))
-    assert "whose trajectories are not those" in refused(out)
-    (first.folder / "config.json").write_text(json.dumps(described))
-    (second / "config.json").write_text(kept)
     assert merge.main([str(out)]) == 0
     train(out, "1/2")
     assert "shards of 2 and of 3" in refused(out)
+
+
+def test_shards_with_different_experts_are_not_merged(tmp_path, capsys):
+    """On each host the expert's file may be another one."""
+    path, out = tmp_path / "expert.npz", tmp_path / "out"
+    for number, steps in ((1, 5), (2, 6)):
+        np.savez(path, observation=np.ones((steps, 4)), action=np.ones((steps, 2)))
+        train(out, f"{number}/2", "--agent", "gail", "--expert", str(path))
+    assert merge.main([str(out)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"expert is '{path}', whose trajectories are not those" in line
+    assert not (out / "results.csv").exists()
+    shutil.rmtree(out / "shards" / "1-of-2")
+    train(out, "1/2", "--agent", "gail", "--expert", str(path))
+    assert merge.main([str(out)]) == 0
 
 
 def swapped(rows):
@@ -360,7 +365,7 @@ def test_shards_need_no_file_of_points_once_one_has_begun(
     assert sweep.main([*more, str(path), "--shard", "2/2"]) == 128 + signal.SIGTERM
     (job,) = jobs_to_train
     assert job.program.members == ((1, 0), (1, 1), (1, 2))
-    assert job.program.config.num_epochs == 3
+    assert job.program.algorithm.config.num_epochs == 3
     assert sweep.main([*more, str(path), *launcher]) == 2
     assert "not finished: shards 1/2, 2/2" in capsys.readouterr().err
     assert len(launched) == 1
@@ -370,9 +375,9 @@ def test_the_first_shard_has_no_expert_to_compare(tmp_path, monkeypatch, jobs_to
     hashed = []
     original = run_folder.expert_hash
 
-    def expert_hash(config):
-        hashed.append(config)
-        return original(config)
+    def expert_hash(algorithm):
+        hashed.append(algorithm)
+        return original(algorithm)
 
     monkeypatch.setattr(run_folder, "expert_hash", expert_hash)
     more = [*SMALL, "--grid", *GRID, "--out", str(tmp_path), "--shard"]

@@ -9,13 +9,13 @@ import types
 import jax
 import numpy as np
 import pytest
-from small_training import FLAGS
+from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
+import gasil_jax
 from gasil_jax import evaluate, merge, run, sweep
-from gasil_jax.config import Config
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.host import command_line, run_folder, run_options
+from gasil_jax.host import run_folder, run_options
 from gasil_jax.host.members import Members
 from gasil_jax.sweeps import assembly, saved_states, shards, tables
 from gasil_jax.sweeps import points as sweep_points
@@ -24,6 +24,7 @@ from gasil_jax.sweeps.points import PAPER_RANGES
 SMALL = (
     *(*FLAGS, "--preset", "paper", "--total-steps", "512", "--batch-steps", "256"),
     *("--minibatch-size", "64", "--num-epochs", "2", "--buffer-steps", "300"),
+    *DISCRIMINATOR_FLAGS,
 )
 
 
@@ -42,7 +43,7 @@ _MANY = (
 
 def points_of(*arguments):
     given = ["--env", "point_mass", *arguments]
-    options = command_line.parse(sweep.Options, given, "x")
+    options = run_options.parse(sweep.Options, given, "x")
     return sweep.plan(options)[0]
 
 
@@ -57,12 +58,12 @@ def test_a_grid_is_every_combination():
         {"alpha": 1.0, "discriminator_updates": 1},
         {"alpha": 1.0, "discriminator_updates": 5},
     ]
-    programs = shards.programs(Config(), points, [7, 8])
+    programs = shards.programs(gasil_jax.algorithm(), points, [7, 8])
     assert [program.members for program in programs] == [
         ((0, 7), (0, 8), (2, 7), (2, 8)),
         ((1, 7), (1, 8), (3, 7), (3, 8)),
     ]
-    assert [p.config.hyperparameters.discriminator_updates for p in programs] == [1, 5]
+    assert [x.algorithm.agent.discriminator_updates for x in programs] == [1, 5]
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
@@ -96,19 +97,19 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
         members=lambda: {(0, 5): metrics(1.0), (1, 5): metrics(2.0)},
         evaluations=lambda: {},
         trainings=lambda: [training],
-        programs=shards.programs(Config(), points, [5], share_counts=True),
+        programs=shards.programs(gasil_jax.algorithm(), points, [5]),
     )
     drawn = []
 
-    def marginals(path, *arguments, **_):
+    def marginals(path, values, returns, *, importance, **_):
         path.touch()
-        drawn.append((path, *arguments))
+        drawn.append((values, returns, importance))
 
     monkeypatch.setattr(plotting, "marginals", marginals)
     summary = tables.write(tmp_path, tables.read(points, [5], [trained]))
     assert summary["best_by_mean"] == 1
     # A point that does not name a value has the sweep's own.
-    ((_, values, returns, importance),) = drawn
+    ((values, returns, importance),) = drawn
     assert values == {
         "alpha": [1.0, 0.1],
         "buffer_steps": [500, 1000],
@@ -149,13 +150,19 @@ def test_points_from_a_file(tmp_path):
         ("--grid alhpa=1", "did you mean 'alpha'"),
         (
             "--agent ppo --grid alpha=1",
-            "agent 'ppo' does not use it. Allowed are learn",
+            "gail, not of ppo. What can vary: batch_steps",
         ),
-        ("--agent ppo+sil --grid buffer_steps=9", "'ppo+sil' does not use it"),
+        (
+            "--agent ppo+sil --grid buffer_steps=9",
+            "buffer_steps is a setting of ppo+bc, gasil, ppo+gasil, ppo+gasil-adaptive,"
+            " not of ppo+sil",
+        ),
         (
             "--grid decomposition_learning_rate=1e-3,1e-4",
-            "decomposition_learning_rate can't vary: decompose_rewards is off",
+            "decomposition_learning_rate has no effect: decompose_rewards is off",
         ),
+        ("--grid num_envs=1,2", "'num_envs' can't vary: it must be one of batch_steps"),
+        ("--grid foo=1", "'foo' can't vary: it must be one of batch_steps"),
         ("--agent ppo --random 5", "random is 5: it must be at most 4"),
         ("--grid alpha=1,big", "it must be numbers, like alpha=0.1,0.2"),
         ("--grid buffer_steps=1.5", "whole numbers, like buffer_steps=10,20"),
@@ -210,8 +217,8 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
         row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
     }
     assert result == pytest.approx(expected, rel=1e-3, abs=1e-3)
-    _, config, seeds, states = saved_states.load(out, point=1)
-    assert config.hyperparameters.discriminator_updates == 3 and seeds == [0, 1]
+    _, algorithm, seeds, states = saved_states.load(out, point=1)
+    assert algorithm.agent.discriminator_updates == 3 and seeds == [0, 1]
     _, _, _, by_itself = saved_states.load(alone)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
@@ -221,7 +228,7 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     with pytest.raises(ValueError, match="it must be 'last'"):
         saved_states.load(out, "best", point=1)
     best = saved_states.load(out)[1]
-    assert best.hyperparameters.discriminator_updates == (1, 3)[summary["best_by_mean"]]
+    assert best.agent.discriminator_updates == (1, 3)[summary["best_by_mean"]]
     assert evaluate.main([str(out), "--point", "4"]) == 2
     assert "has points 0 to 3" in capsys.readouterr().err
     curves = np.load(out / "curves.npz")
@@ -229,18 +236,6 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert all(curves[name].shape == (4, 2, 2) for name in curves)
     assert summary["env_steps_per_second"] > 0
     assert summary["device_count"] == jax.local_device_count()
-
-    # One program for both numbers of updates.
-    shared = tmp_path / "shared"
-    where = ("--share-counts", "--out", str(shared))
-    assert sweep.main([*SMALL, "--seeds", "2", *grid, *where]) == 0
-    assert [path.name for path in (shared / "programs").iterdir()] == ["0"]
-    in_one = np.load(shared / "curves.npz")
-    for name in ("episode_return", "bonus", "discriminator_loss", "good_steps"):
-        # The last point has diverged: what is left of it is rounding.
-        np.testing.assert_allclose(
-            in_one[name][:2], curves[name][:2], rtol=1e-3, err_msg=name
-        )
 
     # A half of the points has a program for itself, of the same shapes.
     parts = tmp_path / "parts"
@@ -279,7 +274,7 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(
     out = tmp_path / "sweep"
     out.mkdir()
     begun = [*SMALL, "--out", str(out), "--points-file", str(first)]
-    options = command_line.parse(sweep.Options, begun, "x")
+    options = run_options.parse(sweep.Options, begun, "x")
     run_options.write_config(options, out, points=points)
 
     arguments = [*SMALL, "--out", str(out), "--resume", "--points-file"]
@@ -290,7 +285,7 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(
     planned, read = [], []
 
     def prepare(options, programs, unfinished):
-        planned.append([program.hyperparameters[0].alpha for program in programs])
+        planned.append([program.hyperparameters[0]["alpha"] for program in programs])
         raise InputError("enough")
 
     original = run_folder.read
@@ -319,7 +314,7 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
         """Send SIGTERM in a program's chunk that ends there or later."""
 
         def interrupted(self, advance, states, first, count):
-            number = self.config.hyperparameters.discriminator_updates - 1
+            number = self.algorithm.agent.discriminator_updates - 1
             if number == program and first + count >= at_least:
                 os.kill(os.getpid(), signal.SIGTERM)
             return train(self, advance, states, first, count)

@@ -8,7 +8,7 @@ payout / length, it takes gradient steps on
 
     (mean_window g - (payout / length - m) / s)^2.
 
-A window that is longer than `Config.decomposition_window_steps` is represented by as
+A window that is longer than `decomposition_window_steps` is represented by as
 many of its steps, drawn at random, as in randomized return decomposition (Ren et al.
 2022, arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
 
@@ -30,14 +30,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import good_trajectories, learner, normalization
-from gasil_jax.config import Config, Hyperparameters
+from gasil_jax.config import count, number, widths
+from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import History
 from gasil_jax.learner import Learner
 from gasil_jax.networks import StepReward
 from gasil_jax.normalization import Normalizer
-from gasil_jax.rollout import Rollout
-
-Metrics = dict[str, jax.Array]
+from gasil_jax.rewards.interface import RewardModel
 
 # Largest count of float32 numbers in a part of a minibatch: 2 MB, which fits a CPU's
 # cache.
@@ -82,37 +81,6 @@ class Windows(NamedTuple):
     length: jax.Array
 
 
-def _network(config: Config) -> Any:
-    # Typed as Any because Flax declares that `apply` may also return variables.
-    return StepReward(config.decomposition_hidden_sizes)
-
-
-def init(
-    key: jax.Array, config: Config, history: History, action_size: int
-) -> Decomposition:
-    """Return the state before the first window.
-
-    Args:
-      key: random key for the network's parameters; consumed.
-      config: sizes of the network.
-      history: the empty history, for its sizes.
-      action_size: dimension of an action.
-    """
-    num_envs, steps, observation_size = history.observation.shape
-    observation = jnp.zeros(observation_size)
-    params = _network(config).init(
-        key, observation, jnp.zeros(action_size), observation
-    )
-    return Decomposition(
-        network=learner.init(params, learner.adam()),
-        rates=normalization.init(1),
-        reward=jnp.zeros((num_envs, steps), jnp.float32),
-        open_reward=jnp.zeros(num_envs, jnp.float32),
-        open_steps=jnp.zeros(num_envs, jnp.float32),
-        recorded_steps=jnp.int32(0),
-    )
-
-
 def ends_window(reward: jax.Array, ended: jax.Array) -> jax.Array:
     """Return whether a window ends with a step, bool, the shape of both arguments."""
     return (reward != 0) | ended
@@ -144,15 +112,15 @@ def windows(history: History, recorded_steps: jax.Array) -> Windows:
 
 
 def window_sums(
-    reward: jax.Array, ends: jax.Array, open_reward: jax.Array, open_steps: jax.Array
+    reward: jax.Array, ends: jax.Array, running: tuple[jax.Array, jax.Array]
 ) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
     """Return each running window's sum and length up to every step of a batch.
 
     Args:
       reward: float32 (T, N).
       ends: bool (T, N), whether a window ends with this step.
-      open_reward: float32 (N,), sum of the windows that run when the batch begins.
-      open_steps: float32 (N,), their number of steps.
+      running: sum and number of steps of the windows that run when the batch begins,
+        float32 (N,) each.
 
     Returns:
       Sum and length up to and with this step, float32 (T, N) each, and both, (N,) each,
@@ -166,9 +134,7 @@ def window_sums(
         reset = lambda x: jnp.where(ends, 0.0, x)
         return (reset(total), reset(length)), (total, length)
 
-    running, (total, length) = jax.lax.scan(
-        step, (open_reward, open_steps), (reward, ends)
-    )
+    running, (total, length) = jax.lax.scan(step, running, (reward, ends))
     return total, length, running
 
 
@@ -220,106 +186,6 @@ def goodness_of_fit(
     }
 
 
-def decompose(
-    decomposition: Decomposition,
-    batch: Rollout,
-    history: History,
-    normalizer: Normalizer,
-    key: jax.Array,
-    *,
-    config: Config,
-    hyperparameters: Hyperparameters,
-    action_range: tuple[Any, Any],
-) -> tuple[Decomposition, Rollout, jax.Array, Metrics]:
-    """Train the network on complete windows, and decompose a batch's rewards.
-
-    If the network's update is not finite, it is undone. The rest of the state belongs
-    to the recorded steps and is updated in any case.
-
-    Args:
-      decomposition: the state before the batch.
-      batch: the batch, (T, N, ...), with the environment's rewards.
-      history: the history after `record` of the batch; it keeps next observations.
-      normalizer: the normalizer of observations.
-      key: random key; consumed.
-      config: number and size of the gradient steps.
-      hyperparameters: the step size.
-      action_range: the lowest and the highest action of the environment.
-
-    Returns:
-      The state after the batch; the batch with decomposed rewards; whether the update
-      of the network was finite, bool (); and metrics: the `goodness_of_fit` of the
-      batch's windows of more than one step, predicted before training on them.
-    """
-    network = _network(config)
-    low, high = action_range
-
-    def predict(
-        params: Any, observation: Any, action: jax.Array, next_observation: jax.Array
-    ) -> jax.Array:
-        normalize = lambda x: normalization.normalize(normalizer, x)
-        return network.apply(
-            params,
-            normalize(observation),
-            jnp.clip(action, low, high),
-            normalize(next_observation),
-        )
-
-    def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
-        mean, scale = normalization.moments(rates)
-        output = predict(
-            params, batch.observation, batch.action, batch.next_observation
-        )
-        return mean[0] + scale[0] * output
-
-    # Measure how well the windows that ended in the batch are predicted, then train.
-    ends = ends_window(batch.reward, batch.ended)
-    scored = ends & ~batch.faulty
-    running = (decomposition.open_reward, decomposition.open_steps)
-    before = step_rewards(decomposition.network.params, decomposition.rates)
-    total, length, _ = window_sums(before, ends, *running)
-    rate = batch.reward / length
-    metrics = goodness_of_fit(total / length, rate, scored & (length > 1))
-    rates = normalization.update(
-        decomposition.rates, jnp.where(scored, rate, jnp.nan)[..., None]
-    )
-    num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
-    cursor = (history.cursor - num_steps) % ring
-    recorded_steps = jnp.minimum(decomposition.recorded_steps + num_steps, ring)
-    trained = _train(
-        decomposition.network,
-        history,
-        windows(history, recorded_steps),
-        rates,
-        key,
-        predict=predict,
-        config=config,
-        step_size=hyperparameters.decomposition_learning_rate,
-    )
-    healthy, trained = learner.keep_if_finite(trained, decomposition.network)
-    # What the network does not explain of a payout is shared by the window's steps.
-    reward = step_rewards(trained.params, rates)
-    total, length, running = window_sums(reward, ends, *running)
-    share = jnp.where(scored, (batch.reward - total) / length, 0.0)
-    share = at_window_end(share, ends)
-    # Steps of the history, in earlier batches, of the window that goes on in this one.
-    age = (cursor - 1 - jnp.arange(ring)) % ring
-    is_open = age < decomposition.open_steps[:, None]
-    recorded = decomposition.reward + jnp.where(is_open, share[0][:, None], 0.0)
-    reward = reward + share
-    reward = jnp.where(ends & (length == 1), batch.reward, reward)
-    reward = jnp.where(batch.faulty, 0.0, reward)
-    decomposition = decomposition.replace(
-        network=trained,
-        rates=rates,
-        reward=good_trajectories.write(recorded, reward, cursor),
-        open_reward=running[0],
-        open_steps=running[1],
-        recorded_steps=recorded_steps,
-    )
-    return decomposition, batch.replace(reward=reward), healthy, metrics
-
-
 def _train(
     network: Learner,
     history: History,
@@ -328,8 +194,7 @@ def _train(
     key: jax.Array,
     *,
     predict: Any,
-    config: Config,
-    step_size: jax.Array | float,
+    settings: "Decompose",
 ) -> Learner:
     """Take gradient steps on windows drawn from the history.
 
@@ -337,10 +202,10 @@ def _train(
     number of steps is a loop's bound, not a mask, so a vmapped batch of such runs saves
     the time too.
     """
-    num_windows = config.decomposition_minibatch_size
-    num_rows = config.decomposition_window_steps
+    num_windows = settings.decomposition_minibatch_size
+    num_rows = settings.decomposition_window_steps
     steps = complete.ends.shape[1]
-    assert history.next_observation is not None  # Ensured by `train.init`.
+    assert history.next_observation is not None  # Ensured by the model's settings.
     rings = (history.observation, history.action, history.next_observation)
     mean, scale = normalization.moments(rates)
     counts = jnp.cumsum(complete.ends.ravel())
@@ -365,10 +230,13 @@ def _train(
         position = (history.cursor + end[:, None] - offset) % steps
         target = (complete.payout[env, end] / length - mean[0]) / scale[0]
         drawn = (env, position, weight, target)
-        gradient = mean_gradient(jax.grad(objective), network.params, drawn, parts)
-        return learner.descend(network, gradient, learner.adam(), step_size)
+        gradient = mean_gradient(
+            jax.grad(objective), network.params, drawn, parts=parts
+        )
+        step_size = settings.decomposition_learning_rate
+        return learner.descend(network, gradient, learner.adam(), step_size=step_size)
 
-    keys = jax.random.split(key, config.decomposition_updates)
+    keys = jax.random.split(key, settings.decomposition_updates)
     is_delayed = jnp.any(complete.ends & (complete.length > 1))
     return jax.lax.fori_loop(0, jnp.where(is_delayed, len(keys), 0), step, network)
 
@@ -386,7 +254,7 @@ def num_parts(num_windows: int, numbers_per_window: int) -> int:
 
 
 def mean_gradient(
-    gradient: Callable[[Any, Any], Any], params: Any, minibatch: Any, parts: int
+    gradient: Callable[[Any, Any], Any], params: Any, minibatch: Any, *, parts: int
 ) -> Any:
     """Return the gradient of a mean over a minibatch, computed part by part.
 
@@ -429,3 +297,148 @@ def sample_window_steps(
     offset = jnp.where(fits, every, drawn.astype(jnp.int32))
     weight = jnp.where(fits, (every < length) / length, 1.0 / num_steps)
     return jnp.clip(offset, 0, length - 1), weight
+
+
+class Decompose(RewardModel):
+    """Learn a reward for each step from the delayed sums; PPO learns from it instead.
+
+    Attributes:
+      decomposition_learning_rate: Adam's step size for the network that decomposes
+        rewards.
+      decomposition_updates: gradient steps in an iteration of the network that
+        decomposes rewards.
+      decomposition_minibatch_size: windows in one gradient step of the network that
+        decomposes rewards. A window is the steps between two payouts.
+      decomposition_window_steps: largest number of steps that represent a window in
+        such a gradient step. Of a longer window, this many are drawn at random.
+      decomposition_history_episodes: length of the history that windows are drawn from,
+        in episodes of full length; a batch is added to it. If rewards come only at the
+        end of an episode, 1 leaves few windows.
+      decomposition_hidden_sizes: widths of the tanh layers of the network that
+        decomposes rewards.
+    """
+
+    switch = "decompose_rewards"
+    keeps_next_observation = True
+
+    decomposition_learning_rate: float = number(1e-3, 0.0, excludes_low=True)
+    decomposition_updates: int = count(20)
+    decomposition_minibatch_size: int = count(64)
+    decomposition_window_steps: int = count(32)
+    decomposition_history_episodes: int = count(1)
+    decomposition_hidden_sizes: tuple[int, ...] = widths(100, 100)
+
+    @property
+    def history_episodes(self) -> int:
+        """Episodes of full length that windows are drawn from."""
+        return self.decomposition_history_episodes
+
+    @property
+    def _network(self) -> Any:
+        # Typed as Any because Flax declares that `apply` may also return variables.
+        return StepReward(self.decomposition_hidden_sizes)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Decomposition:
+        """Return the state before the first window."""
+        observation, action = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
+        params = self._network.init(key, observation, action, observation)
+        return Decomposition(
+            network=learner.init(params, learner.adam()),
+            rates=normalization.init(1),
+            reward=jnp.zeros((sizes.num_envs, sizes.history_steps), jnp.float32),
+            open_reward=jnp.zeros(sizes.num_envs, jnp.float32),
+            open_steps=jnp.zeros(sizes.num_envs, jnp.float32),
+            recorded_steps=jnp.int32(0),
+        )
+
+    def update(
+        self, state: Decomposition, context: Context, key: jax.Array
+    ) -> tuple[Decomposition, Context, jax.Array, Metrics]:
+        """Train the network on complete windows, and decompose a batch's rewards.
+
+        If the network's update is not finite, it is undone. The rest of the state
+        belongs to the recorded steps and is updated in any case.
+
+        Args:
+          state: the state before the batch.
+          context: with the environment's rewards; its history keeps next observations.
+          key: random key; consumed.
+
+        Returns:
+          The state after the batch; the context with decomposed rewards, in the history
+          too; whether the update of the network was finite, bool (); and metrics: the
+          `goodness_of_fit` of the batch's windows of more than one step, predicted
+          before training on them.
+        """
+        network, batch, history = self._network, context.rollout, context.history
+        assert history is not None  # Ensured by `history_episodes`.
+        low, high = context.action_range
+        normalize = lambda x: normalization.normalize(context.normalizer, x)
+
+        def predict(
+            params: Any,
+            observation: Any,
+            action: jax.Array,
+            next_observation: jax.Array,
+        ) -> jax.Array:
+            return network.apply(
+                params,
+                normalize(observation),
+                jnp.clip(action, low, high),
+                normalize(next_observation),
+            )
+
+        def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
+            mean, scale = normalization.moments(rates)
+            output = predict(
+                params, batch.observation, batch.action, batch.next_observation
+            )
+            return mean[0] + scale[0] * output
+
+        # Measure how well the batch's ended windows are predicted, then train.
+        ends = ends_window(batch.reward, batch.ended)
+        scored = ends & ~batch.faulty
+        running = (state.open_reward, state.open_steps)
+        before = step_rewards(state.network.params, state.rates)
+        total, length, _ = window_sums(before, ends, running)
+        rate = batch.reward / length
+        metrics = goodness_of_fit(total / length, rate, scored & (length > 1))
+        rates = normalization.update(
+            state.rates, jnp.where(scored, rate, jnp.nan)[..., None]
+        )
+        num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
+        cursor = (history.cursor - num_steps) % ring
+        recorded_steps = jnp.minimum(state.recorded_steps + num_steps, ring)
+        complete = windows(history, recorded_steps)
+        trained = _train(
+            state.network, history, complete, rates, key, predict=predict, settings=self
+        )
+        healthy, trained = learner.keep_if_finite(trained, state.network)
+        # What the network does not explain of a payout is shared by the window's steps.
+        reward = step_rewards(trained.params, rates)
+        total, length, running = window_sums(reward, ends, running)
+        share = jnp.where(scored, (batch.reward - total) / length, 0.0)
+        share = at_window_end(share, ends)
+        # Steps of the history, in earlier batches, of the window that goes on in this.
+        age = (cursor - 1 - jnp.arange(ring)) % ring
+        is_open = age < state.open_steps[:, None]
+        recorded = state.reward + jnp.where(is_open, share[0][:, None], 0.0)
+        reward = reward + share
+        reward = jnp.where(ends & (length == 1), batch.reward, reward)
+        reward = jnp.where(batch.faulty, 0.0, reward)
+        state = state.replace(
+            network=trained,
+            rates=rates,
+            reward=good_trajectories.write(recorded, reward, cursor),
+            open_reward=running[0],
+            open_steps=running[1],
+            recorded_steps=recorded_steps,
+        )
+        # The NaNs that mark episodes without a valid return must stay.
+        no_return = jnp.isnan(history.reward)
+        decomposed = jnp.where(no_return, jnp.nan, state.reward)
+        context = context.replace(
+            rollout=batch.replace(reward=reward),
+            history=history.replace(reward=decomposed),
+        )
+        return state, context, healthy, metrics

@@ -14,6 +14,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import normalization
+from gasil_jax.config import number
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.rewards.interface import RewardModel
+
+#: Largest absolute value of a normalized reward, in baselines and by default.
+CLIP = 10.0
 
 
 class RewardNormalizer(struct.PyTreeNode):
@@ -88,3 +94,41 @@ def clipped(
     """
     is_clipped = jnp.abs(reward) > clip * scale(normalizer)
     return jnp.sum(is_clipped) / jnp.sum(reward != 0.0)
+
+
+class Normalize(RewardModel):
+    """Divide rewards by the standard deviation of their running discounted sum.
+
+    As in OpenAI baselines' ppo2. Alpha is then in that unit, not in the environment's.
+    It has no effect on agents that do not use the environment's reward.
+
+    Attributes:
+      reward_clip: largest absolute value of a normalized reward. If an episode is
+        rewarded only at its end, the default clips most rewards to the same number:
+        use 1e9, which clips none.
+    """
+
+    switch = "normalize_rewards"
+    reward_clip: float = number(CLIP, 0.0, excludes_low=True)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> RewardNormalizer:
+        """Return a normalizer without rewards."""
+        return init(sizes.num_envs)
+
+    def update(
+        self, state: RewardNormalizer, context: Context, key: jax.Array
+    ) -> tuple[RewardNormalizer, Context, jax.Array, Metrics]:
+        """Add a batch's rewards to the running sums, and normalize them."""
+        batch = context.rollout
+        state = update(state, batch.reward, batch.ended, context.config.gamma)
+        divisor = scale(state)
+        metrics = {
+            "reward_scale": divisor,
+            "clipped_rewards": clipped(state, batch.reward, self.reward_clip),
+        }
+        reward = normalize(state, batch.reward, self.reward_clip)
+        context = context.replace(
+            rollout=batch.replace(reward=reward),
+            reward_scale=context.reward_scale * divisor,
+        )
+        return state, context, jnp.bool_(True), metrics

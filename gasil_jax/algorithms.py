@@ -1,0 +1,186 @@
+"""All that decides how a run learns: an agent, reward models, and the config of PPO."""
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from gasil_jax.config import (
+    SCHEDULE_SUFFIX,
+    Config,
+    check_declared,
+    names,
+    refusal,
+    traced_names,
+    validate,
+    validate_config,
+)
+from gasil_jax.errors import unknown
+from gasil_jax.imitation import AGENTS, Agent, agents_with
+from gasil_jax.rewards import REWARD_MODELS, RewardModel
+
+
+@dataclasses.dataclass(frozen=True)
+class Algorithm:
+    """An agent, the models of the rewards that it learns from, and the config of PPO.
+
+    All settings of these parts have different names, so `replace` takes them by name:
+    ``algorithm.replace(alpha=0.2, num_envs=8)``. A model of rewards is added or left
+    out by its switch, as in ``replace(decompose_rewards=True)``.
+
+    Attributes:
+      agent: the agent.
+      rewards: models of rewards, the first one nearest to the environment.
+      config: the settings of the training loop and of PPO.
+    """
+
+    agent: Agent
+    rewards: tuple[RewardModel, ...] = ()
+    config: Config = dataclasses.field(default_factory=Config)
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """Every part that has settings."""
+        return (self.config, self.agent, *self.rewards)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Every setting by name, and the switches of the models of rewards."""
+        have = {model.switch for model in self.rewards}
+        switches = sorted(have.union(model.switch for model in REWARD_MODELS))
+        return {
+            **{name: getattr(x, name) for x in self.parts for name in names(x)},
+            **{name: name in have for name in switches},
+        }
+
+    @property
+    def hyperparameters(self) -> dict[str, Any]:
+        """The numbers that may be traced, by name, with their values here."""
+        return {
+            name: getattr(part, name)
+            for part in self.parts
+            for name in traced_names(part)
+        }
+
+    def replace(self, **changes: Any) -> "Algorithm":
+        """Return a copy with changed settings, which are named as in `settings`.
+
+        Raises:
+          ValueError: if a name is no setting of any part.
+        """
+        changed = self
+        for model in REWARD_MODELS:
+            if model.switch in changes:
+                changed = changed._with(model, changes.pop(model.switch))
+        parts = []
+        for part in changed.parts:
+            own = {x: changes.pop(x) for x in names(part) if x in changes}
+            parts.append(part.replace(**own) if own else part)
+        for name in changes:
+            raise ValueError(changed.why_not(name))
+        config, agent, *models = parts
+        return Algorithm(agent, tuple(models), config)
+
+    def _with(self, model: type[RewardModel], is_on: Any) -> "Algorithm":
+        """Return a copy with or without a model, in the order of `REWARD_MODELS`."""
+        if not isinstance(is_on, bool):
+            raise refusal(model.switch, is_on, "True or False")
+        others = [x for x in self.rewards if not isinstance(x, model)]
+        if (len(others) < len(self.rewards)) == is_on:
+            return self
+        if is_on:
+            later = REWARD_MODELS[REWARD_MODELS.index(model) :]
+            before = [x for x in others if not isinstance(x, later)]
+            others = [*before, model(), *others[len(before) :]]
+        return dataclasses.replace(self, rewards=tuple(others))
+
+    def why_not(self, name: str) -> str:
+        """Return why a name is no setting of this algorithm, as an error message."""
+        for model in REWARD_MODELS:
+            if name in names(model):
+                return f"{name} has no effect: {model.switch} is off"
+        if agents := agents_with(name):
+            return (
+                f"{name} is a setting of {', '.join(agents)}, not of {self.agent.name}"
+            )
+        return unknown("setting", name, tuple(self.settings))
+
+
+def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
+    """Return an algorithm by names: ``algorithm("ppo+bc", num_envs=8)``.
+
+    Args:
+      agent: name of one of the package's agents.
+      **settings: settings of the agent, of PPO and of models of rewards, by name. Those
+        that are not given have their defaults.
+
+    Raises:
+      ValueError: if a name is unknown.
+    """
+    if not isinstance(agent, str) or agent not in AGENTS:
+        raise ValueError(unknown("agent", str(agent), tuple(AGENTS)))
+    return Algorithm(AGENTS[agent]()).replace(**settings)
+
+
+def check(algorithm: Algorithm) -> None:
+    """Check that every setting of an algorithm is allowed, alone and with the others.
+
+    Raises:
+      ValueError: if one is not; the message names the value and what is allowed.
+    """
+    if not isinstance(algorithm, Algorithm):
+        raise refusal("algorithm", algorithm, "a gasil_jax.Algorithm")
+    agent, rewards = algorithm.agent, algorithm.rewards
+    if not isinstance(agent, Agent):
+        raise refusal("agent", agent, "an instance of a class from gasil_jax.Agent")
+    if not isinstance(rewards, tuple) or not all(
+        isinstance(model, RewardModel) for model in rewards
+    ):
+        raise refusal("rewards", rewards, "a tuple of models of rewards")
+    validate_config(algorithm.config)
+    taken = {*_COLUMNS, *names(Config)}
+    taken.update(x for model in REWARD_MODELS for x in (model.switch, *names(model)))
+    for part in (agent, *(x for x in rewards if type(x) not in REWARD_MODELS)):
+        what = f"agent {agent.name!r}" if part is agent else type(part).__name__
+        check_declared(type(part), what)
+        for name in names(part):
+            if name in taken:
+                raise ValueError(
+                    f"{what} has a setting {name!r}, a name that is taken: it must be "
+                    "a new one"
+                )
+            number = name.removesuffix(SCHEDULE_SUFFIX)
+            if number != name and number not in algorithm.hyperparameters:
+                raise ValueError(
+                    f"{what} has a setting {name!r}, but no number {number!r}"
+                )
+        taken.update(names(part))
+    for part in (agent, *rewards):
+        validate(part, algorithm.config.total_steps)
+
+
+#: Columns of a sweep's tables, whose names no setting may have.
+_COLUMNS = frozenset(
+    "point seed mean worst_seed diverged diverged_seeds final_return final_length "
+    "final_evaluation agent".split()
+)
+
+
+def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> None:
+    """Check that numbers by name are hyperparameters of an algorithm, and allowed.
+
+    Raises:
+      ValueError: if one is not; the message names the value and what is allowed.
+    """
+    if not isinstance(hyperparameters, Mapping):
+        raise refusal("hyperparameters", hyperparameters, "numbers by name")
+    names_ = algorithm.hyperparameters
+    for name in hyperparameters:
+        if name not in names_:
+            if name in algorithm.settings:
+                raise ValueError(
+                    f"{name} is not traced: it is a setting of the program"
+                )
+            raise ValueError(algorithm.why_not(name))
+    changed = algorithm.replace(**hyperparameters)
+    for part in changed.parts:
+        validate(part, algorithm.config.total_steps)

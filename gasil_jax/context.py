@@ -1,0 +1,58 @@
+"""What agents and reward models get: the sizes of a run, the data of an iteration."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from flax import struct
+
+from gasil_jax.config import Config
+from gasil_jax.good_trajectories import History
+from gasil_jax.normalization import Normalizer
+from gasil_jax.rollout import Rollout
+
+Metrics = dict[str, jax.Array]
+
+
+class Sizes(NamedTuple):
+    """The sizes of a run's arrays.
+
+    Attributes:
+      num_envs: number of environments.
+      observation: dimension of an observation.
+      action: dimension of an action.
+      history_steps: length of each environment's history; 0 if there is none.
+    """
+
+    num_envs: int
+    observation: int
+    action: int
+    history_steps: int = 0
+
+
+class Context(struct.PyTreeNode):
+    """The data of an iteration that agents and reward models may use.
+
+    Attributes:
+      rollout: the batch, (time, env, ...); its rewards are those that the reward models
+        have made of the environment's so far.
+      history: the last steps of each environment, including the batch's, as long as the
+        agent and the reward models ask for; None if none does. Its rewards may be
+        decomposed, but are not normalized.
+      normalizer: the normalizer of observations that the policy used in the batch.
+      reward_scale: float32 (), the number that the rollout's rewards were divided by; 1
+        if they are not normalized.
+      action_range: the lowest and the highest action of the environment.
+      config: the settings of the loop and of PPO, with their numbers in this iteration.
+      policy: (params, normalized observation) -> mean, log standard deviation.
+      value: (params, normalized observation) -> value.
+    """
+
+    rollout: Rollout
+    history: History | None
+    normalizer: Normalizer
+    reward_scale: jax.Array
+    action_range: tuple[Any, Any]
+    config: Config
+    policy: Callable[..., tuple[jax.Array, jax.Array]] = struct.field(pytree_node=False)
+    value: Callable[..., jax.Array] = struct.field(pytree_node=False)

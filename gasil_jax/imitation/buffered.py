@@ -1,0 +1,85 @@
+"""Agents with a good-trajectory buffer: its settings, and what they do with it."""
+
+from typing import Any, ClassVar
+
+import jax
+
+from gasil_jax import good_trajectories
+from gasil_jax.config import count, switch
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.imitation.interface import Agent
+from gasil_jax.rollout import Rollout
+
+
+class BufferedAgent(Agent):
+    """An agent that imitates the steps of the best episodes (paper, section 4.1).
+
+    Its state is the buffer, unless a subclass puts the buffer into another one.
+
+    Attributes:
+      buffer_steps: capacity of the good-trajectory buffer, in steps.
+      buffer_episodes: largest number of episodes in the good-trajectory buffer, besides
+        its capacity in steps; None for no limit.
+      buffer_discounts: whether the good-trajectory buffer ranks episodes by their
+        discounted return, as the paper does; otherwise by the undiscounted one.
+      sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
+        return of their episode and s its standard deviation over the buffer's steps;
+        otherwise uniformly.
+    """
+
+    history_episodes: ClassVar[int] = 1
+
+    buffer_steps: int = count(1000)
+    buffer_episodes: int | None = count(None)
+    buffer_discounts: bool = switch(True)
+    sample_by_return: bool = switch(False)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Any:
+        """Return an empty buffer as the state."""
+        return self.init_buffer(sizes)
+
+    def remember(self, state: Any, context: Context) -> Any:
+        """Insert the episodes that ended in a batch into the buffer."""
+        return self.insert(state, context)
+
+    def good_trajectories(self, state: Any) -> GoodTrajectories:
+        """Return the buffer in a state."""
+        return state
+
+    def init_buffer(self, sizes: Sizes) -> GoodTrajectories:
+        """Return an empty buffer."""
+        return good_trajectories.init(
+            self.buffer_steps, sizes.observation, sizes.action
+        )
+
+    def ranked_by(self, batch: Rollout) -> jax.Array:
+        """Return the returns that the buffer ranks episodes by, (time, env)."""
+        if self.buffer_discounts:
+            return batch.discounted_return
+        return batch.undiscounted_return
+
+    @jax.named_scope("good_trajectories")
+    def insert(self, buffer: GoodTrajectories, context: Context) -> GoodTrajectories:
+        """Return the buffer with the whole episodes that ended in a batch."""
+        batch, history = context.rollout, context.history
+        assert history is not None  # Ensured by `history_episodes`.
+        episodes = good_trajectories.ended_episodes(
+            history, batch.ended, self.ranked_by(batch), length=batch.episode_length
+        )
+        return good_trajectories.insert(
+            buffer, history, episodes, max_episodes=self.buffer_episodes
+        )
+
+    def sample(
+        self, buffer: GoodTrajectories, key: jax.Array, num_samples: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """Draw good observations (samples, obs) and actions (samples, action)."""
+        return good_trajectories.sample(key, buffer, num_samples, self.sample_by_return)
+
+    def buffer_metrics(self, buffer: GoodTrajectories) -> Metrics:
+        """Return the metrics of a buffer."""
+        return {
+            "good_return": good_trajectories.mean_return(buffer),
+            "good_steps": buffer.size,
+        }
