@@ -130,7 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.out is not None:
         output_file.check(options.out, (".csv",))
     policies = load_policies(
-        options.run, options.checkpoint, options.point, options.seed
+        options.run, options.checkpoint, options.point, seed=options.seed
     )
     env, seeds = policies.env, policies.seeds
     if options.gymnasium and not environments.is_locomotion(env):

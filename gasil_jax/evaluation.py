@@ -20,8 +20,8 @@ def evaluate(
     env: Any,
     algorithm: Algorithm,
     state: train.TrainState,
-    key: jax.Array,
     *,
+    key: jax.Array,
     num_episodes: int,
     deterministic: bool = True,
 ) -> dict[str, jax.Array]:

@@ -174,7 +174,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command_line.parse(Options, arguments, "gasil_jax.export_minari")
     check_name(options.name)
     env, algorithm, seeds, states = saved_states.load(
-        options.run, options.checkpoint, options.point, options.seed
+        options.run, options.checkpoint, options.point, seed=options.seed
     )
     agent = algorithm.agent
     buffers = jax.device_get(agent.good_trajectories(states.agent))

@@ -270,6 +270,7 @@ def sample(
     key: jax.Array,
     good_trajectories: GoodTrajectories,
     num_samples: int,
+    *,
     by_return: bool = False,
 ) -> tuple[jax.Array, jax.Array]:
     """Draw observations (samples, obs) and actions (samples, action) with replacement.

@@ -73,7 +73,7 @@ class Options:
 
 
 def episode(
-    env: Any, act: Any, key: jax.Array, num_steps: int
+    env: Any, act: Any, key: jax.Array, *, num_steps: int
 ) -> tuple[list[Any], float]:
     """Return the physics states of an episode, from its start on, and its true return.
 
@@ -265,7 +265,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
     env, num_steps, seeds, weights = load_policies(
-        options.run, options.checkpoint, options.point, options.seed
+        options.run, options.checkpoint, options.point, seed=options.seed
     )
     locomotion = environments.is_locomotion(env)
     if not (locomotion or environments.is_point_mass(env)):
@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     act = drawn if options.stochastic else lambda observation, key: drawn(observation)
     steps = min(options.steps, num_steps)
     with announced("render", "compiling and running the episode"):
-        states, total = episode(env, act, jax.random.key(options.key), steps)
+        states, total = episode(env, act, jax.random.key(options.key), num_steps=steps)
     try:
         with (
             announced("render", f"drawing {options.out}"),

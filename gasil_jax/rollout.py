@@ -101,7 +101,7 @@ def _strip_weak_types(tree: Any) -> Any:
 
 
 def init(
-    env: Any, key: jax.Array, num_envs: int, age_limit: int | None = None
+    env: Any, key: jax.Array, num_envs: int, *, age_limit: int | None = None
 ) -> EnvironmentStates:
     """Start an episode in each of `num_envs` environments.
 

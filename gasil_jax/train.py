@@ -244,7 +244,7 @@ def iterate(
     algorithm = schedules.at(algorithm, state.hyperparameters, state.iteration)
     keys = Keys(*jax.random.split(state.key, 6))
     experience = collect(env, algorithm, state, keys)
-    return learn(algorithm, state, experience, keys)
+    return learn(algorithm, state, experience, keys=keys)
 
 
 class Keys(NamedTuple):
@@ -320,7 +320,7 @@ def collect(
 
 
 def learn(
-    algorithm: Algorithm, state: TrainState, experience: Experience, keys: Keys
+    algorithm: Algorithm, state: TrainState, experience: Experience, *, keys: Keys
 ) -> tuple[TrainState, Metrics]:
     """Update the agent and the policy from a batch.
 

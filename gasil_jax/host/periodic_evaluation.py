@@ -85,7 +85,7 @@ class PeriodicEvaluation:
                 members.env,
                 members.algorithm,
                 state,
-                evaluation_key(seed, state.iteration),
+                key=evaluation_key(seed, state.iteration),
                 num_episodes=schedule.num_episodes,
             )
 

@@ -150,7 +150,7 @@ class PPOGASILAdaptive(SelfImitatingAgent):
         )
         batch = context.rollout
         normalizer = reward_normalization.update(
-            state.bonus_normalizer, bonus, batch.ended, context.config.gamma
+            state.bonus_normalizer, bonus, batch.ended, gamma=context.config.gamma
         )
         policy_return, has_episodes = follow_return(
             state.policy_return,

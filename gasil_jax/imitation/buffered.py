@@ -75,7 +75,9 @@ class BufferedAgent(Agent):
         self, buffer: GoodTrajectories, key: jax.Array, num_samples: int
     ) -> tuple[jax.Array, jax.Array]:
         """Draw good observations (samples, obs) and actions (samples, action)."""
-        return good_trajectories.sample(key, buffer, num_samples, self.sample_by_return)
+        return good_trajectories.sample(
+            key, buffer, num_samples, by_return=self.sample_by_return
+        )
 
     def buffer_metrics(self, buffer: GoodTrajectories) -> Metrics:
         """Return the metrics of a buffer."""

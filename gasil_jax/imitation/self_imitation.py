@@ -186,6 +186,7 @@ def loss(
     log_prob: jax.Array,
     value: jax.Array,
     return_: jax.Array,
+    *,
     weight: jax.Array,
     scale: jax.Array | float,
     value_coefficient: jax.Array | float,
@@ -255,9 +256,9 @@ class PPOSIL(Agent):
                 log_prob,
                 value,
                 rows.return_,
-                weight,
-                scale,
-                self.sil_value_coefficient,
+                weight=weight,
+                scale=scale,
+                value_coefficient=self.sil_value_coefficient,
             )
             return self.sil_coefficient * total, (value, fraction)
 

@@ -190,9 +190,9 @@ def _train(
     network: Learner,
     history: History,
     complete: Windows,
+    *,
     rates: Normalizer,
     key: jax.Array,
-    *,
     predict: Any,
     settings: "Decompose",
 ) -> Learner:
@@ -411,7 +411,13 @@ class Decompose(RewardModel):
         recorded_steps = jnp.minimum(state.recorded_steps + num_steps, ring)
         complete = windows(history, recorded_steps)
         trained = _train(
-            state.network, history, complete, rates, key, predict=predict, settings=self
+            state.network,
+            history,
+            complete,
+            rates=rates,
+            key=key,
+            predict=predict,
+            settings=self,
         )
         healthy, trained = learner.keep_if_finite(trained, state.network)
         # What the network does not explain of a payout is shared by the window's steps.

@@ -43,6 +43,7 @@ def update(
     normalizer: RewardNormalizer,
     reward: jax.Array,
     ended: jax.Array,
+    *,
     gamma: jax.Array | float,
 ) -> RewardNormalizer:
     """Return the normalizer updated by a batch of rewards.
@@ -120,7 +121,7 @@ class Normalize(RewardModel):
     ) -> tuple[RewardNormalizer, Context, jax.Array, Metrics]:
         """Add a batch's rewards to the running sums, and normalize them."""
         batch = context.rollout
-        state = update(state, batch.reward, batch.ended, context.config.gamma)
+        state = update(state, batch.reward, batch.ended, gamma=context.config.gamma)
         divisor = scale(state)
         metrics = {
             "reward_scale": divisor,

@@ -117,6 +117,7 @@ def load(
     folder: pathlib.Path,
     which: str = "last",
     point: int | None = None,
+    *,
     seed: int | None = None,
 ) -> tuple[Any, Algorithm, list[int], Any]:
     """Return environment, algorithm, seed numbers and states (seed, ...) of a run.
@@ -188,6 +189,7 @@ def load_policies(
     folder: str | pathlib.Path,
     which: str = "last",
     point: int | None = None,
+    *,
     seed: int | None = None,
 ) -> Policies:
     """Return the policies of a run, or one that comes with the package.
@@ -202,7 +204,7 @@ def load_policies(
       InputError: as `load` does, or if the zoo has no such policy.
     """
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        env, _, seeds, states = load(pathlib.Path(folder), which, point, seed)
+        env, _, seeds, states = load(pathlib.Path(folder), which, point, seed=seed)
         every = jax.device_get(policy.weights(states, env))
         shared = {name: every.pop(name) for name in ("low", "high")}
         weights = [member(every, i) | shared for i in range(len(seeds))]

@@ -28,7 +28,7 @@ def test_batches_give_the_scale_of_all_steps():
             normalizer,
             jnp.asarray(reward[begin:end], jnp.float32),
             jnp.asarray(ended[begin:end]),
-            0.9,
+            gamma=0.9,
         )
         expected = plain_scale(reward[:end], ended[:end], 0.9)
         np.testing.assert_allclose(normalization.scale(normalizer), expected, rtol=1e-4)
@@ -47,7 +47,7 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
             normalization.init(4),
             jnp.asarray(reward),
             jnp.asarray(reward > 0),
-            0.99,
+            gamma=0.99,
         )
         scale = plain_scale(reward, reward > 0, 0.99)
         expected = np.mean(payments / scale > 10.0)
@@ -66,7 +66,9 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
 
 def test_no_reward_stays_none():
     nothing = jnp.zeros((5, 2))
-    normalizer = normalization.update(normalization.init(2), nothing, nothing > 0, 0.99)
+    normalizer = normalization.update(
+        normalization.init(2), nothing, nothing > 0, gamma=0.99
+    )
     assert not np.any(normalization.normalize(normalizer, nothing, 10.0))
 
 

@@ -103,9 +103,15 @@ def test_loss_and_its_gradient_against_numpy():
     count = max(np.sum(advantage > 0), 64)
 
     def total(log_prob, value):
-        arrays = (log_prob, value, return_, weight)
-        arrays = (jnp.asarray(x, jnp.float32) for x in arrays)
-        return self_imitation.loss(*arrays, scale, 0.01)[0]
+        array = lambda x: jnp.asarray(x, jnp.float32)
+        return self_imitation.loss(
+            array(log_prob),
+            array(value),
+            array(return_),
+            weight=array(weight),
+            scale=scale,
+            value_coefficient=0.01,
+        )[0]
 
     by_log_prob, by_value = jax.grad(total, argnums=(0, 1))(
         jnp.asarray(log_prob, jnp.float32), jnp.asarray(value, jnp.float32)

@@ -74,7 +74,10 @@ def test_ages_are_uniform_over_the_episode_and_of_the_seeds_own_key():
 def test_ages_leave_the_starts_as_they_are():
     env = gasil_jax.make_env("point_mass", obs_noise=0.1)
     key = jax.random.key(0)
-    plain, staggered = rollout.init(env, key, 5), rollout.init(env, key, 5, 50)
+    plain, staggered = (
+        rollout.init(env, key, 5),
+        rollout.init(env, key, 5, age_limit=50),
+    )
     np.testing.assert_array_equal(plain.state.obs, staggered.state.obs)
     assert not plain.starting_age.any() and staggered.starting_age.any()
 

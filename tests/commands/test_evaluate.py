@@ -54,7 +54,7 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
     state = gasil_jax.member(states, 1)
     key = jax.random.key(3)
     scores = jax.jit(
-        lambda s: evaluation.evaluate(env, algorithm, s, key, num_episodes=3)
+        lambda s: evaluation.evaluate(env, algorithm, s, key=key, num_episodes=3)
     )(state)
     act = numpy_policy.make(policy.weights(state, env))
     step = jax.jit(env.step)
@@ -74,7 +74,7 @@ def test_stochastic_scores_vary_more(trained_point_mass):
         env,
         algorithm,
         gasil_jax.member(states, 0),
-        jax.random.key(0),
+        key=jax.random.key(0),
         num_episodes=50,
         deterministic=deterministic,
     )["episode_return"]
@@ -150,7 +150,7 @@ def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
         CutOff(env),
         algorithm,
         gasil_jax.member(states, 0),
-        jax.random.key(0),
+        key=jax.random.key(0),
         num_episodes=3,
     )
     assert scores["episode_length"].tolist() == [7, 7, 7]

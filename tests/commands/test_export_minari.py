@@ -87,8 +87,8 @@ def test_the_discount_is_that_of_the_states(filled, monkeypatch):
     assert export_minari.main([str(out), "--name", "hopper/swept-v0"]) == 0
     assert "discounted by 0.9 a step" in metadata["description"]
 
-    def without_discount(*arguments):
-        env, algorithm, seeds, states = load(*arguments)
+    def without_discount(*arguments, **others):
+        env, algorithm, seeds, states = load(*arguments, **others)
         return env, algorithm.replace(buffer_discounts=False), seeds, states
 
     monkeypatch.setattr(saved_states, "load", without_discount)

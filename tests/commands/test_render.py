@@ -111,7 +111,7 @@ def test_a_page_has_the_simulations_bodies(untrained_hopper, tmp_path, capsys):
     env, _, _, states = saved_states.load(untrained_hopper)
     act = policy.from_state(member(states, 0), env)
     mean = lambda observation, key: act(observation)
-    frames, _ = render.episode(env, mean, jax.random.key(0), 3)
+    frames, _ = render.episode(env, mean, jax.random.key(0), num_steps=3)
     model = env.unwrapped.model
     assert shown["opt"]["timestep"] == pytest.approx(env.unwrapped.dt)
     assert set(shown["geoms"]) == {"torso", "thigh", "leg", "foot", "world"}
@@ -189,7 +189,7 @@ def test_an_episode_ends_before_the_physics_fails(point_mass):
             blow_up = lambda x: jax.numpy.where(fails, jax.numpy.nan, x)
             return stepped.replace(obs=blow_up(stepped.obs), reward=blow_up(1.0))
 
-    states, total = render.episode(Failing(), act, jax.random.key(0), 20)
+    states, total = render.episode(Failing(), act, jax.random.key(0), num_steps=20)
     assert len(states) == 4 and total == 3.0
 
 

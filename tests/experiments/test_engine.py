@@ -125,7 +125,7 @@ def test_a_record_is_what_make_train_gives(trained):
         # A program of four iterations is evaluated after each of them.
         assert record.evaluation_steps.tolist() == [256, 512, 768, 1024]
         key = evaluation_key(each.seed, 4)
-        scores = evaluate(env, each.algorithm, state, key, num_episodes=2)
+        scores = evaluate(env, each.algorithm, state, key=key, num_episodes=2)
         expected = scores["episode_return"].mean()
         assert record.evaluation_return[-1] == pytest.approx(expected, rel=2e-3)
 

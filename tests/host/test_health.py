@@ -145,7 +145,7 @@ def test_a_first_observation_is_looked_at_too():
     assert np.isfinite(state.agent.buffer.observation).all()
     assert abs(state.normalizer.mean - 100.0).max() < 2.0
     scores = jax.jit(
-        lambda key: evaluation.evaluate(env, small, state, key, num_episodes=20)
+        lambda key: evaluation.evaluate(env, small, state, key=key, num_episodes=20)
     )(jax.random.key(1))
     assert np.isfinite(scores["episode_return"]).all()
     # Such an episode is over with its first step, as in training.

@@ -74,6 +74,7 @@ def pairs(
     model: mujoco.MjModel,
     geoms: np.ndarray,
     num_tangents: int,
+    *,
     motion_normal: np.ndarray | None,
 ) -> Pairs:
     """Divide contacts, by their geoms (C, 2), into those with a plane and others."""
@@ -189,7 +190,7 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     length = lambda i: np.where(
         model.geom_type[i] == _CAPSULE, model.geom_size[i, 1], 0.0
     ).astype(np.float32)[:, None]
-    near_a, near_b = _nearest_points(a, b, length(first), length(second))
+    near_a, near_b = _nearest_points(a, b, length(first), length_b=length(second))
     radius = model.geom_size[pairs.between, 0].astype(np.float32)[..., None]
     away = materialize(near_b - near_a)
     apart = jnp.sqrt(total(away**2, 1))
@@ -211,7 +212,7 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
 
 
 def _nearest_points(
-    a: Segments, b: Segments, length_a: np.ndarray, length_b: np.ndarray
+    a: Segments, b: Segments, length_a: np.ndarray, *, length_b: np.ndarray
 ) -> tuple[jax.Array, jax.Array]:
     """Return the points of two segments that are nearest to each other, (C, 3, B).
 

@@ -200,7 +200,7 @@ def layout(model: mujoco.MjModel) -> Layout:
     motion_normal = _motion_normal(model, contact.geom.reshape(-1, 2))
     pyramid = _PYRAMID if motion_normal is None else _FLAT_PYRAMID
     groups = [
-        _group(model, contact, dim, edges, motion_normal)
+        _group(model, contact, dim, edges=edges, motion_normal=motion_normal)
         for dim, edges in ((1, ((),)), (3, pyramid))
     ]
     return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
@@ -252,6 +252,7 @@ def _group(
     model: mujoco.MjModel,
     contact: mjx.Contact,
     condim: int,
+    *,
     edges: tuple[tuple[int, ...], ...],
     motion_normal: np.ndarray | None,
 ) -> Group:
@@ -278,7 +279,9 @@ def _group(
         inverse_weight=_constant(inverse_weight),
         impedance=Impedance.of(model, at(contact.solref, 2), at(contact.solimp, 5)),
     )
-    pairs = collision.pairs(model, geom[index], len(edges[0]), motion_normal)
+    pairs = collision.pairs(
+        model, geom[index], len(edges[0]), motion_normal=motion_normal
+    )
     return Group(edges, pairs, constants)
 
 
@@ -314,6 +317,7 @@ def contact_rows(
     edges: tuple[tuple[int, ...], ...],
     contacts: Contacts,
     at: tree.Kinematics,
+    *,
     qvel: jax.Array,
 ) -> newton.ContactRows:
     """Return the rows of a group of contacts at qvel (V, B)."""
@@ -351,6 +355,7 @@ def body_forces(
     edges: tuple[tuple[int, ...], ...],
     contacts: Contacts,
     com: jax.Array,
+    *,
     edge_forces: jax.Array,
 ) -> jax.Array:
     """Return contacts' torque about `com` and force on each body, (N, 6, B).

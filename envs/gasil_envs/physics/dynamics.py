@@ -138,20 +138,22 @@ def forward(
 
     def constrain(contacts: Sequence[constraints.Contacts], for_speed: bool) -> Any:
         rows = [
-            constraints.contact_rows(group.edges, x, at, qvel)
+            constraints.contact_rows(group.edges, x, at, qvel=qvel)
             for group, x in zip(groups, contacts, strict=True)
         ]
         problem = newton.Problem(
             smooth.inertia, force, state.qacc_warmstart, limits, tuple(rows)
         )
-        solution = newton.solve_many(dynamics.iterations, 4, problem, for_speed)
+        solution = newton.solve_many(
+            dynamics.iterations, 4, problem, for_speed=for_speed
+        )
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
         if "cfrc_ext" in dynamics.fields:
             for group, x, edge in zip(
                 groups, contacts, solution.edge_forces, strict=True
             ):
                 of_bodies = of_bodies + constraints.body_forces(
-                    group.edges, x, at.com, edge
+                    group.edges, x, at.com, edge_forces=edge
                 )
         return solution.qacc, solution.constraint_force, of_bodies
 

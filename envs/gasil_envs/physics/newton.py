@@ -331,7 +331,7 @@ def _repeat(
 
 @jax.named_scope("solver")
 def solve_many(
-    iterations: int, line_search: int, problem: Problem, for_speed: bool = True
+    iterations: int, line_search: int, problem: Problem, *, for_speed: bool = True
 ) -> Solution:
     """Solve problems whose arrays have the batch as their last axis."""
     inertia, force = problem.inertia, problem.force

@@ -95,7 +95,11 @@ def _matrix(quaternion: np.ndarray) -> np.ndarray:
 
 
 def _turn(
-    columns: Sequence[jax.Array], axis: np.ndarray, cosine: jax.Array, sine: jax.Array
+    columns: Sequence[jax.Array],
+    axis: np.ndarray,
+    cosine: jax.Array,
+    *,
+    sine: jax.Array,
 ) -> list[jax.Array]:
     """Return a rotation matrix times a rotation about a constant unit axis."""
     along = np.outer(axis, axis)
@@ -160,7 +164,7 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
                 position = position + axis * angle[at]
                 continue
             anchor = position + rotate(turned, model.jnt_pos[joint])
-            turned = _turn(turned, model.jnt_axis[joint], cosine[at], sine[at])
+            turned = _turn(turned, model.jnt_axis[joint], cosine[at], sine=sine[at])
             turned = materialize(turned)
             position = anchor - rotate(turned, model.jnt_pos[joint])
             dofs.append((axis, anchor, zero))
@@ -171,7 +175,7 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
     mass = model.body_mass.astype(np.float32)[:, None]
     com = add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
     xipos, com = materialize((xipos, com))
-    cinert = _inertia(model, columns, xipos - com, mass)
+    cinert = _inertia(model, columns, xipos - com, mass=mass)
     axis, anchor, translation = map(jnp.stack, zip(*dofs, strict=True))
     translation = translation + cross(axis, com - anchor)
     cdof = jnp.concatenate([axis, translation], axis=1)
@@ -183,6 +187,7 @@ def _inertia(
     model: mujoco.MjModel,
     columns: list[list[jax.Array]],
     offset: jax.Array,
+    *,
     mass: np.ndarray,
 ) -> jax.Array:
     """Return the bodies' inertia about a point `offset` away: (N, 10, B)."""
