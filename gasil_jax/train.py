@@ -88,9 +88,22 @@ def init(
     checks.check_key(key)
     own = {} if hyperparameters is None else hyperparameters
     check_numbers(algorithm, own)
+    return first_state(env, algorithm.replace(**own), key)
+
+
+def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
+    """Return what `init` does, of an algorithm that need not be able to train here.
+
+    The expert of a run that has been trained may be gone, for example.
+
+    Args:
+      env: one environment.
+      algorithm: with the run's own numbers, which may be traced.
+      key: random key; consumed.
+    """
     numbers = {
         name: jnp.asarray(value, jnp.float32)
-        for name, value in {**algorithm.hyperparameters, **own}.items()
+        for name, value in algorithm.hyperparameters.items()
     }
     key, policy_key, value_key, env_key, agent_key, rewards_key = jax.random.split(
         key, 6

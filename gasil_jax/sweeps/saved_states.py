@@ -154,9 +154,7 @@ def load(
     with command_line.input_checked():
         env = environments.make_env(description["env"], **settings)
         # The leaves of all members have the same shapes.
-        init = lambda seed: train.init(
-            env, algorithm, jax.random.key(seed), saved.program.hyperparameters[0]
-        )
+        init = lambda seed: train.first_state(env, algorithm, jax.random.key(seed))
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
         states = chosen.restore(like)
     seeds, indices = saved.seeds, np.array(saved.indices)
