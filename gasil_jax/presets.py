@@ -202,6 +202,11 @@ def preset(
         row = scaled(action_size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
+    if lacking is not None and (name, kind.name) == ("scaled", "ppo"):
+        raise ValueError(
+            f"action_size is None: preset 'scaled' needs the dimension of {env}'s "
+            "actions, which is env.action_size"
+        )
     if lacking is not None and name != DEFAULT:
         other = "dense" if reward_delay > 1 else "delayed"
         listed = _listed(_rows(name, reward_delay)) or f"rows for {other} ones"

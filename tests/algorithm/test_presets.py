@@ -78,7 +78,7 @@ def test_an_environment_of_ones_own_is_scaled_by_its_actions():
     # It has two, and fewer have the values of two.
     assert parse("point_mass", "--agent", "ppo", "--preset", "scaled") == row
     assert gasil_jax.preset("my:env", "ppo", "scaled", action_size=1) == row
-    with pytest.raises(ValueError, match=r"has nothing for agent 'ppo' on my:env"):
+    with pytest.raises(ValueError, match="needs the dimension of my:env's actions"):
         gasil_jax.preset("my:env", "ppo", "scaled")
 
 
