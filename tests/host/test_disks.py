@@ -8,6 +8,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -197,6 +198,44 @@ def test_a_disk_without_locks_and_flushes_keeps_everything(
     assert newest.iteration == PPO.config.num_iterations
     for name in ("policy.npz", "summary.json"):
         assert (out / name).exists()
+
+
+def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path):
+    """Each of Orbax's and TensorStore's threads has a traceback of its own."""
+    program = """
+import pathlib, resource, sys
+import numpy as np
+from gasil_jax.host import checkpoint
+
+# No file may grow beyond this: writing fails as on a full disk.
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
+try:
+    checkpoint.write(pathlib.Path(sys.argv[1]), 1, state, {})
+except checkpoint.WriteError as error:
+    print(error, file=sys.stderr)
+"""
+    arguments = [sys.executable, "-c", program, str(tmp_path)]
+    ended = subprocess.run(arguments, capture_output=True, text=True)
+    assert ended.stderr == f"{tmp_path} can't be written: File too large\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    (tmp_path / "state").mkdir()
+    with pytest.raises(ValueError, match="already exists"):
+        checkpoint.save(tmp_path / "state", {"x": np.ones(3)})
+    for text in ("Event loop is closed", "mine"):
+        sys.unraisablehook(mock.Mock(exc_value=RuntimeError(text)))
+    assert [str(unraisable.exc_value) for unraisable in told] == ["mine"]
+
+
+def test_a_full_disk_has_a_hint(tmp_path):
+    with pytest.raises(output_file.WriteError, match="left on device: make room there"):
+        with output_file.errors_named(tmp_path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
