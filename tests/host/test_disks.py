@@ -1,6 +1,7 @@
 """Folders of any name, disks that lack something, and what happens when one is full."""
 
 import errno
+import fcntl
 import io
 import os
 import re
@@ -190,7 +191,7 @@ def test_a_disk_without_locks_and_flushes_keeps_everything(
     def fail(*arguments):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(run_folder.fcntl, "flock", fail)
+    monkeypatch.setattr(fcntl, "flock", fail)
     monkeypatch.setattr(os, "fsync", fail)
     out = tmp_path / "out"
     assert run.main([*SMALL, "--out", str(out)]) == 0
@@ -236,6 +237,26 @@ def test_a_full_disk_has_a_hint(tmp_path):
     with pytest.raises(output_file.WriteError, match="left on device: make room there"):
         with output_file.errors_named(tmp_path):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_system_without_fcntl_trains(tmp_path):
+    program = (
+        "import sys; sys.modules['fcntl'] = None; from gasil_jax import run; "
+        "sys.exit(run.main(sys.argv[1:]))"
+    )
+    arguments = [*SMALL, "--out", str(tmp_path / "out")]
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr
+    notes = re.findall("note: .*locked.*", ended.stderr)
+    assert notes == [
+        f"note: {tmp_path / 'out'} can't be locked (the system has no fcntl): make "
+        "sure that no other process writes to it"
+    ]
+    assert (tmp_path / "out" / "policy.npz").exists()
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
