@@ -15,6 +15,14 @@ from gasil_jax import run
 from gasil_jax.host import checkpoint, driver, interruption, run_folder
 
 
+@pytest.fixture(autouse=True)
+def as_in_a_terminal():
+    """Let Ctrl-C have its effect, which a program in the background does not have."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.parametrize("module", ["gasil_jax.run", "gasil_jax.plot", "experiments"])
 def test_ctrl_c_during_imports_is_one_line(module, tmp_path):
     # What the commands import first, here with Ctrl-C in it; some code passes that by.
