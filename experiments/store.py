@@ -205,8 +205,10 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
             provenance = index["provenances"][arrays["provenance"][i]]
             values = {name: column[i] for name, column in columns.items()}
             records[run] = Record(provenance=provenance, **values)
-    except (ValueError, KeyError, TypeError, IndexError) as error:
-        raise InputError(f"{path} is not a file of runs: {error}") from None
+    # What is wrong in a file decides the type of the error.
+    except Exception as error:
+        why = str(error).partition("\n")[0] or type(error).__name__
+        raise InputError(f"{path} is not a file of runs: {why}") from None
     return records
 
 

@@ -1,6 +1,7 @@
 """Read arrays from an untrusted ``.npz`` file, with NumPy alone."""
 
 import pathlib
+import warnings
 from collections.abc import Callable, Mapping
 
 import numpy as np
@@ -19,8 +20,11 @@ def read(
       ValueError: if the file can't be read; the message is one line.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {name: file[name] for name in file.files if needs(name)}
+        # NumPy leaves a file open that it can't read, and warns of an altered header.
+        with path.open("rb") as opened, warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with np.load(opened, allow_pickle=False) as file:
+                return {name: file[name] for name in file.files if needs(name)}
     # What is wrong in a file decides the type of the error, of which there are dozens.
     except Exception as error:
         reason = str(error).partition("\n")[0] or type(error).__name__

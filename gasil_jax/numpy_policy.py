@@ -71,7 +71,11 @@ def about(name: str | pathlib.Path) -> dict[str, Any]:
             f"name is {name!r}: it must be zoo:NAME, with NAME one of "
             f"{', '.join(zoo())}"
         )
-    stored = json.loads(str(npz.read(_file(name))["about"]))
+    path = _file(name)
+    try:
+        stored = dict(json.loads(str(npz.read(path)["about"])))
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged: about can't be read ({error})") from None
     # Older files lack this entry.
     return {"decompose_rewards": False, **stored}
 
@@ -83,25 +87,31 @@ def _is_a_weight(name: str) -> bool:
 
 def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
     """Return the arrays of a saved policy; raise `ValueError` if it is none."""
-    arrays = npz.read(path, _is_a_weight)
-    number = lambda name, *shape, **finite: npz.numbers(arrays, name, shape, **finite)
+    arrays, checked = npz.read(path, _is_a_weight), {}
+
+    def number(name: str, *shape: int | None, finite: bool = True) -> np.ndarray:
+        checked[name] = npz.numbers(arrays, name, shape, finite=finite)
+        return checked[name]
+
     (count,) = number("seeds", None).shape
     number("final_return", count, finite=False)
     _, width = number("mean", count, None).shape
-    number("scale", count, width)
+    if not (number("scale", count, width).astype(np.float32) > 0).all():
+        raise ValueError("scale has numbers that aren't positive")
     _, num_actions = number("log_std", count, None).shape
-    for name in _SHARED:
-        number(name, num_actions, finite=False)
+    low, high = (number(name, num_actions, finite=False) for name in _SHARED)
+    if not (low < high).all():
+        raise ValueError("low isn't below high")
     last = max(1, sum(name.startswith("kernel_") for name in arrays)) - 1
     for i in range(last + 1):
         outputs = num_actions if i == last else None
         *_, width = number(f"kernel_{i}", count, width, outputs).shape
         number(f"bias_{i}", count, width)
-    return arrays
+    return checked
 
 
 def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndarray]:
-    """Return the arrays of one seed's policy.
+    """Return the arrays of one seed's policy, float32.
 
     Args:
       path: the file ``policy.npz``, the folder of a finished run, or "zoo:NAME".
@@ -129,7 +139,10 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
         listed = ", ".join(map(str, seeds))
         raise ValueError(f"seed is {seed}: {path} has a policy of {listed}")
     index = seeds.index(seed)
-    return {name: value[index] for name, value in arrays.items()} | shared
+    weights = {name: value[index] for name, value in arrays.items()} | shared
+    # JAX takes no numbers of another byte order. Limits may be infinite.
+    with np.errstate(over="ignore"):
+        return {name: value.astype(np.float32) for name, value in weights.items()}
 
 
 def mean_and_log_std(

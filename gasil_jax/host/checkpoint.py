@@ -19,7 +19,9 @@ import logging
 import math
 import os
 import pathlib
+import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, TypedDict
@@ -54,15 +56,49 @@ def _as_arrays(state: Any) -> dict[str, Any]:
 
 
 @contextlib.contextmanager
-def _plainly_named(folder: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yield another path to a folder, in which no character means anything.
+def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
+    """Yield Orbax's checkpointer, and another path to a folder that it understands.
 
-    Orbax takes a path with brackets or stars for a pattern.
+    Orbax takes a path with brackets or stars for a pattern, so no character of the
+    other path means anything. What fails in Orbax's threads is raised once, and not
+    logged.
+
+    Raises:
+      OSError: if the operating system has refused something.
     """
-    with tempfile.TemporaryDirectory() as directory:
-        link = pathlib.Path(directory, "checkpoints")
-        link.symlink_to(folder.absolute().parent, target_is_directory=True)
-        yield link / folder.name
+    logger, before = logging.getLogger("absl"), sys.unraisablehook
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    logging.getLogger("asyncio").addFilter(_is_news)
+
+    def report(unraisable: Any) -> None:
+        # TensorStore reports each array to Orbax's loop, which ends with the first.
+        if "Event loop is closed" not in str(unraisable.exc_value):
+            before(unraisable)
+
+    sys.unraisablehook = report
+    try:
+        with tempfile.TemporaryDirectory() as directory:
+            link = pathlib.Path(directory, "checkpoints")
+            link.symlink_to(folder.absolute().parent, target_is_directory=True)
+            with ocp.StandardCheckpointer() as checkpointer:
+                yield checkpointer, link / folder.name
+    except ValueError as error:
+        # TensorStore's message is long, and names the other path.
+        if number := re.search(r"os_error_code='(\d+)'", str(error)):
+            code = int(number[1])
+            raise OSError(code, os.strerror(code)) from None
+        raise
+    else:
+        # After an error threads that are left still report.
+        sys.unraisablehook = before
+    finally:
+        logger.setLevel(level)
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Return whether a message is not of an array of which Orbax did not wait."""
+    return "os_error_code" not in record.getMessage()
 
 
 def save(folder: pathlib.Path, state: Any) -> None:
@@ -75,15 +111,8 @@ def save(folder: pathlib.Path, state: Any) -> None:
     """
     arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
     arrays = {name: x for name, x in arrays.items() if x.size}
-    # Orbax logs the traceback of each of its threads, besides what it raises.
-    logger = logging.getLogger("absl")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        with _plainly_named(folder) as path, ocp.StandardCheckpointer() as checkpointer:
-            checkpointer.save(path, arrays or {_NOTHING: np.zeros(1, bool)})
-    finally:
-        logger.setLevel(level)
+    with _orbax(folder) as (checkpointer, path):
+        checkpointer.save(path, arrays or {_NOTHING: np.zeros(1, bool)})
     again = _read_arrays(folder)
     for name, array in arrays.items():
         if not np.array_equal(_bytes(again[name]), _bytes(array)):
@@ -97,7 +126,7 @@ def _bytes(array: np.ndarray) -> np.ndarray:
 
 def _read_arrays(folder: pathlib.Path) -> dict[str, Any]:
     """Return the arrays in a folder that `save` wrote, by their path in the state."""
-    with _plainly_named(folder) as path, ocp.StandardCheckpointer() as checkpointer:
+    with _orbax(folder) as (checkpointer, path):
         arrays = checkpointer.restore(path)
     arrays.pop(_NOTHING, None)
     return arrays

@@ -24,7 +24,7 @@ from tyro.constructors import (
 from gasil_envs.own_code import in_a_line
 from gasil_jax.config import Schedule
 from gasil_jax.errors import InputError
-from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.interruption import Interrupted, allow_interrupts
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -289,6 +289,7 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             # A name that the terminal can't show must not fail a finished command.
             out.reconfigure(errors="backslashreplace")
         try:
+            allow_interrupts()
             return main(*args, **kwargs)
         except BrokenPipeError:
             # `head` reads a few lines only. Python would still try to write the rest.
@@ -309,7 +310,12 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             return 128 + interrupted.signal
         # Ctrl-C outside of training, or for the second time during it.
         except KeyboardInterrupt:
-            print("interrupted", file=sys.stderr)
+            print("interrupted", file=sys.stderr, flush=True)
+            if main.__module__ == "__main__":
+                # Python's own end would wait for threads, of which one may compile.
+                with contextlib.suppress(OSError):
+                    sys.stdout.flush()
+                os._exit(128 + signal.SIGINT)
             return 128 + signal.SIGINT
 
     return reporting

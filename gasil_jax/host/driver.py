@@ -30,6 +30,7 @@ from gasil_jax.train import TrainState
 # Largest duration of a chunk. The progress display is updated, and Ctrl-C takes effect,
 # after each chunk.
 _SECONDS_PER_CHUNK = 5.0
+_AFTER_COMPILATION = "stopping after compilation; Ctrl-C again quits now"
 
 _Columns = Mapping[str, np.ndarray]
 
@@ -361,7 +362,8 @@ def drive(
     started = time.monotonic()
     if training.left:
         progress.phase("compiling", steps_of(first))
-        training.compile()
+        with interruption.answering(_AFTER_COMPILATION):
+            training.compile()
     compile_seconds = time.monotonic() - started
 
     progress.phase("training", steps_of(first))

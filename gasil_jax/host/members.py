@@ -6,9 +6,10 @@ alone, not from the members beside it or from the device it runs on.
 
 import dataclasses
 import functools
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,8 @@ from jax.sharding import PartitionSpec as P
 from gasil_jax import checks, train
 from gasil_jax.algorithms import Algorithm, check_numbers
 from gasil_jax.config import Config
+
+T = TypeVar("T")
 
 
 def member(states: Any, index: int) -> Any:
@@ -31,6 +34,20 @@ def member(states: Any, index: int) -> Any:
     if not isinstance(index, jax.Array) and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
+
+
+def _in_thread(function: Callable[[], T]) -> futures.Future[T]:
+    """Call a function in a thread, so that this one can answer to signals."""
+    future: futures.Future[T] = futures.Future()
+
+    def call() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=call).start()
+    return future
 
 
 def init_member(
@@ -177,14 +194,14 @@ class Members:
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
-        with futures.ThreadPoolExecutor(1) as pool:
-            # The first states have a program of their own, which takes seconds too.
-            compiled = pool.submit(
-                lambda: self.advance.lower(shapes, np.int32(0)).compile()
+        compiled = _in_thread(lambda: self.advance.lower(shapes, np.int32(0)).compile())
+        # The first states have a program of their own, which takes seconds too.
+        first = _in_thread(
+            lambda: jax.block_until_ready(
+                self.init() if states is None else self.to_devices(states)
             )
-            states = self.init() if states is None else self.to_devices(states)
-            states = jax.block_until_ready(states)
-            return states, compiled.result()
+        )
+        return first.result(), compiled.result()
 
     def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function of one member's arrays as one of all members' arrays.

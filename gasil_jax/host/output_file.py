@@ -12,6 +12,8 @@ from gasil_jax.errors import InputError
 
 #: Errors of calls that a file system does not have, such as those for locks.
 MISSING_CALL = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
+#: Errors of a disk, or a user's share of it, that is full. Windows has no EDQUOT.
+_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
 
 
 class WriteError(OSError):
@@ -31,6 +33,8 @@ def unwritten(path: pathlib.Path, error: Exception) -> str:
 def _reason(error: Exception) -> str:
     # A library's error may have no `strerror`, and a message of several lines or none.
     strerror = getattr(error, "strerror", None)
+    if getattr(error, "errno", None) in _FULL:
+        return f"{strerror}: make room there"
     return strerror or str(error).partition("\n")[0] or type(error).__name__
 
 

@@ -41,6 +41,16 @@ def _line(title: str, text: str) -> None:
     sys.stderr.flush()
 
 
+class _Activity:
+    """A name that is shown with the seconds since it was first shown."""
+
+    def __init__(self, name: str):
+        self._name, self._started = name, time.monotonic()
+
+    def __str__(self) -> str:
+        return f"{self._name} ({time.monotonic() - self._started:.0f} s)"
+
+
 class Progress:
     """Shows the share of the steps, the return, steps/s and the time left.
 
@@ -100,7 +110,7 @@ class Progress:
         """Show the name of a phase that begins after `steps` environment steps."""
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = steps
-        self._bar.update(self._task, status=name)
+        self._bar.update(self._task, status=_Activity(name))
         if self._in_lines:
             _line(self._title, name)
 
@@ -112,7 +122,7 @@ class Progress:
         """
         started = time.monotonic()
         status = self._bar.tasks[0].fields["status"]
-        self._bar.update(self._task, status=name)
+        self._bar.update(self._task, status=_Activity(name))
         with contextlib.ExitStack() as stack:
             if self._in_lines:
                 stack.enter_context(announced(self._title, name))

@@ -3,7 +3,6 @@
 import contextlib
 import dataclasses
 import errno
-import fcntl
 import functools
 import hashlib
 import os
@@ -12,7 +11,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, Required, TypedDict
+from typing import IO, Any, NamedTuple, Required, TypedDict
 
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
@@ -36,7 +35,7 @@ _LOCKED = (
     *(_CONFIG, "fit.json", "summary.json", "policy.npz", "learning_curve.png"),
     *("results.csv", "curves.npz", "sweep.png", "hyperparameters.png"),
 )
-#: Errors of locking on a file system without locks.
+#: Errors of locking where there are no locks.
 _NO_LOCKS = (*output_file.MISSING_CALL, errno.ENOLCK)
 
 
@@ -124,9 +123,18 @@ def create_new(name: str) -> pathlib.Path:
 def _note_missing_locks(folder: pathlib.Path, why: str) -> None:
     """Print a note that a folder can't be locked, once for each folder."""
     command_line.note(
-        f"{folder} is on a file system without locks ({why}): make sure that no other "
-        "process writes to it"
+        f"{folder} can't be locked ({why}): make sure that no other process writes "
+        "to it"
     )
+
+
+def _lock_file(file: IO[str]) -> None:
+    """Lock an open file until it is closed; raise `OSError` if it can't be."""
+    try:
+        import fcntl
+    except ImportError:  # Windows.
+        raise OSError(errno.ENOSYS, "the system has no fcntl") from None
+    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 @contextlib.contextmanager
@@ -135,15 +143,15 @@ def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
 
     What a killed process had half written is deleted.
 
-    The operating system frees the lock when the process ends, however it ends. Where
-    the file system has no locks, a note says so, and nothing is locked.
+    The operating system frees the lock when the process ends, however it ends. Where it
+    or the file system has no locks, a note says so, and nothing is locked.
 
     Raises:
       InputError: if another process holds the lock.
     """
     with (folder / _LOCK).open("a+") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _lock_file(file)
         except BlockingIOError:
             file.seek(0)
             raise InputError(

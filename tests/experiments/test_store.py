@@ -1,16 +1,18 @@
 """A run stands once, under what decides its numbers; files are whole and the same."""
 
+import contextlib
 import dataclasses
 import subprocess
 import threading
 
 import numpy as np
 import pytest
+from altered_archives import altered
 
 import gasil_jax
 from experiments import engine
 from experiments.store import RESULTS, Record, Run, Store, merge, read, write
-from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize
+from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize, npz
 from gasil_jax.errors import InputError
 from gasil_jax.host.descriptions import find_agent
 
@@ -132,6 +134,21 @@ def test_a_damaged_file_is_told(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"hopper\.npz is not a file of runs"):
         _ = run() in Store(tmp_path)
+
+
+def test_an_altered_file_is_read_or_told(tmp_path):
+    path = tmp_path / "hopper.npz"
+    write(path, {run(): record(), run(seed=1): record(2.0)})
+    for content in altered(npz.read(path), 150):
+        path.write_bytes(content)
+        with contextlib.suppress(InputError):
+            read(path)
+    # Text that is JSON but no index.
+    arrays = {"index": np.array("[]"), "seed": np.array(np.inf)}
+    for changed in ({}, {"index": np.array('{"experiments": 1}')}):
+        np.savez(path, **{**arrays, **changed})
+        with pytest.raises(InputError, match="is not a file of runs"):
+            read(path)
 
 
 def test_a_setting_that_the_package_has_not_is_told(tmp_path, monkeypatch):

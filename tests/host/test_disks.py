@@ -1,6 +1,7 @@
 """Folders of any name, disks that lack something, and what happens when one is full."""
 
 import errno
+import fcntl
 import io
 import os
 import re
@@ -8,6 +9,7 @@ import resource
 import shutil
 import subprocess
 import sys
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -189,7 +191,7 @@ def test_a_disk_without_locks_and_flushes_keeps_everything(
     def fail(*arguments):
         raise OSError(number, os.strerror(number))
 
-    monkeypatch.setattr(run_folder.fcntl, "flock", fail)
+    monkeypatch.setattr(fcntl, "flock", fail)
     monkeypatch.setattr(os, "fsync", fail)
     out = tmp_path / "out"
     assert run.main([*SMALL, "--out", str(out)]) == 0
@@ -197,6 +199,64 @@ def test_a_disk_without_locks_and_flushes_keeps_everything(
     assert newest.iteration == PPO.config.num_iterations
     for name in ("policy.npz", "summary.json"):
         assert (out / name).exists()
+
+
+def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path):
+    """Each of Orbax's and TensorStore's threads has a traceback of its own."""
+    program = """
+import pathlib, resource, sys
+import numpy as np
+from gasil_jax.host import checkpoint
+
+# No file may grow beyond this: writing fails as on a full disk.
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
+try:
+    checkpoint.write(pathlib.Path(sys.argv[1]), 1, state, {})
+except checkpoint.WriteError as error:
+    print(error, file=sys.stderr)
+"""
+    arguments = [sys.executable, "-c", program, str(tmp_path)]
+    ended = subprocess.run(arguments, capture_output=True, text=True)
+    assert ended.stderr == f"{tmp_path} can't be written: File too large\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    (tmp_path / "state").mkdir()
+    with pytest.raises(ValueError, match="already exists"):
+        checkpoint.save(tmp_path / "state", {"x": np.ones(3)})
+    for text in ("Event loop is closed", "mine"):
+        sys.unraisablehook(mock.Mock(exc_value=RuntimeError(text)))
+    assert [str(unraisable.exc_value) for unraisable in told] == ["mine"]
+
+
+def test_a_full_disk_has_a_hint(tmp_path):
+    with pytest.raises(output_file.WriteError, match="left on device: make room there"):
+        with output_file.errors_named(tmp_path):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_a_system_without_fcntl_trains(tmp_path):
+    program = (
+        "import sys; sys.modules['fcntl'] = None; from gasil_jax import run; "
+        "sys.exit(run.main(sys.argv[1:]))"
+    )
+    arguments = [*SMALL, "--out", str(tmp_path / "out")]
+    ended = subprocess.run(
+        [sys.executable, "-c", program, *arguments],
+        capture_output=True,
+        text=True,
+    )
+    assert ended.returncode == 0, ended.stderr
+    notes = re.findall("note: .*locked.*", ended.stderr)
+    assert notes == [
+        f"note: {tmp_path / 'out'} can't be locked (the system has no fcntl): make "
+        "sure that no other process writes to it"
+    ]
+    assert (tmp_path / "out" / "policy.npz").exists()
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):

@@ -77,6 +77,10 @@ def test_at_80_columns_only_the_bar_gives_way(monkeypatch):
     monkeypatch.setattr(progress, "Console", lambda stderr: console())
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with progress.Progress("halfcheetah ppo+gasil sweep", 10**9, 100) as bar:
+        bar.phase("compiling")
+        clock[0] += 65.0
+        bar._bar.refresh()
+        assert "compiling (65 s)" in shown.getvalue()
         bar.phase("training")
         clock[0] += 1000.0
         bar.update(10**8, np.array([[-12345.6], [12345.6]]))

@@ -1,6 +1,7 @@
 """A run that is stopped early loses nothing, and continues bit for bit."""
 
 import errno
+import fcntl
 import itertools
 import json
 import os
@@ -222,9 +223,9 @@ def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
     def flock(file, operation):
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(run_folder.fcntl, "flock", flock)
+    monkeypatch.setattr(fcntl, "flock", flock)
     with run_folder.lock(tmp_path):
-        assert "without locks (No locks available): make" in capsys.readouterr().err
+        assert "can't be locked (No locks available): make" in capsys.readouterr().err
     with run_folder.lock(tmp_path):
         assert capsys.readouterr().err == ""
 
