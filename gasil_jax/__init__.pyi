@@ -1,3 +1,4 @@
+from . import statistics as statistics
 from .algorithms import Algorithm as Algorithm
 from .algorithms import algorithm as algorithm
 from .config import Config as Config

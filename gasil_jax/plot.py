@@ -9,8 +9,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import tyro
 
+from gasil_jax import statistics
 from gasil_jax.errors import InputError
-from gasil_jax.figures import plotting, statistics
+from gasil_jax.figures import plotting
 from gasil_jax.figures.plotting import COLORS
 from gasil_jax.host import command_line, metrics_files, output_file, run_folder
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax.figures.statistics import (
+from gasil_jax.statistics import (
     are_numbers,
     bootstrap_interval,
     groups,

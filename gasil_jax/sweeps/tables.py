@@ -15,8 +15,8 @@ import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.figures.statistics import importance
 from gasil_jax.host import metrics_files, output_file
+from gasil_jax.statistics import importance
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
 

@@ -3,8 +3,8 @@
 import matplotlib.figure
 import numpy as np
 
-from gasil_jax import plot
-from gasil_jax.figures import plotting, statistics
+from gasil_jax import plot, statistics
+from gasil_jax.figures import plotting
 from gasil_jax.sweeps import tables
 
 

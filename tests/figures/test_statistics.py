@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gasil_jax.figures import statistics
+from gasil_jax import statistics
 
 ALPHA, RATE = map(np.ravel, np.meshgrid([0.02, 0.1, 0.2, 1.0], [1e-5, 1e-4, 1e-3]))
 
