@@ -61,14 +61,9 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     Raises:
       InputError: if it is not the folder of a run, or if no episode has ended in it.
     """
-    description = run_folder.read(folder)
-    if "points" in description:
-        raise InputError(
-            f"run is {folder}, a sweep: its plots are sweep.png and "
-            "hyperparameters.png, and its curves are in curves.npz"
-        )
+    env, agent, num_seeds = _names(folder)
     read_table = lambda name, column: metrics_files.read_metrics(
-        folder / name, ("seed",), description["seeds"], (column,), unfinished=True
+        folder / name, ("seed",), num_seeds, (column,), unfinished=True
     )
     evaluations = None
     if (folder / "evaluations.csv").is_file():
@@ -81,15 +76,28 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
-    default = f"{description['env']}, {description['algorithm'].agent.name}"
     return Curves(
-        env=description["env"],
-        label=label or default,
+        env=env,
+        label=label or f"{env}, {agent}",
         env_steps=env_steps,
         returns=means,
         final=metrics_files.final_returns(returns),
         evaluations=evaluations,
     )
+
+
+def _names(folder: pathlib.Path) -> tuple[str, str, int]:
+    """Return the environment's and the agent's name, and the number of seeds."""
+    if (folder / run_folder.FIT).is_file():
+        fit = run_folder.read_fit(folder)
+        return fit["env"], fit["agent"], len(fit["seeds"])
+    run = run_folder.read(folder)
+    if "points" in run:
+        raise InputError(
+            f"run is {folder}, a sweep: its plots are sweep.png and "
+            "hyperparameters.png, and its curves are in curves.npz"
+        )
+    return run["env"], run["algorithm"].agent.name, run["seeds"]
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
