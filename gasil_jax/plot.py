@@ -101,7 +101,7 @@ def _names(folder: pathlib.Path) -> tuple[str, str, int]:
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
-    """Write the figure: interquartile means over seeds, with 95% intervals.
+    """Write the figure: interquartile means over seeds, with their 95% intervals.
 
     Each environment has a row of three panels. The left one shows returns over
     environment steps, with evaluations dashed; the middle one final returns, with a dot
@@ -145,9 +145,10 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
             evaluated=f"{labels[number]}, evaluations",
             style=style,
         )
-        low, high = statistics.bootstrap_interval(run.final)
-        middle = statistics.interquartile_mean(run.final)
-        bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
+        middle, interval = statistics.estimate(run.final)
+        if interval is not None:
+            low, high = interval
+            bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
         bars.plot([middle, middle], [number - 0.25, number + 0.25], color=color, lw=2)
         bars.plot(run.final, [number] * len(run.final), "o", color="0.3", ms=3)
 
@@ -181,12 +182,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial)
-    print("run                             seeds  interquartile mean  95% interval")
+    print("run                             seeds  interquartile mean [95% interval]")
     for run in runs:
-        low, high = statistics.bootstrap_interval(run.final)
-        middle = statistics.interquartile_mean(run.final)
-        interval = f"{low:.1f} to {high:.1f}"
-        print(f"{run.label:30} {len(run.final):6} {middle:19.1f}  {interval}")
+        estimate = statistics.estimate(run.final)
+        print(f"{run.label:30} {len(run.final):6}  {estimate}")
     print(f"in {options.out}")
     return 0
 

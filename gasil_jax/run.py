@@ -5,6 +5,9 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
+from gasil_jax import statistics
 from gasil_jax.host import command_line, driver, run_folder
 from gasil_jax.host.members import Members
 from gasil_jax.host.progress import announced
@@ -76,18 +79,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     env = assembly.prepare(options, programs, programs)
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, programs[0], folder)
-    mean = summary["final_return_mean"]
-    evaluated = ""
-    if options.evaluate_every is not None:
-        evaluated = (
-            f"final evaluation {summary['final_evaluation_mean']:.1f} "
-            f"({summary['evaluation_seconds']:,.0f} s of evaluations), "
-        )
+    scores = {
+        name.replace("_", " "): np.array(list(summary[name].values()), float)
+        for name in ("final_return", "final_evaluation")
+        if name in summary
+    }
     print(
-        f"final return {'unknown' if mean is None else format(mean, '.1f')} "
-        f"(mean over {options.seeds} seed{'s' * (options.seeds > 1)}), {evaluated}"
-        f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}, "
-        f"in {folder}"
+        f"{statistics.in_words(scores)}, {summary['env_steps_per_second']:,.0f} "
+        f"steps/s on {summary['device']}, in {folder}"
     )
     if summary["unhealthy_seeds"]:
         print(

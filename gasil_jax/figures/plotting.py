@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.statistics import (
+    FEWEST_SEEDS,
     are_numbers,
     bootstrap_interval,
     groups,
@@ -65,7 +66,7 @@ def draw_returns(
     evaluated: str = "evaluations",
     style: str = "-",
 ) -> None:
-    """Draw the interquartile mean over seeds with its 95% interval.
+    """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
 
     Args:
       axes: where to draw; steps are in millions.
@@ -79,9 +80,10 @@ def draw_returns(
       style: style of the line.
     """
     if len(env_steps):
-        low, high = bootstrap_interval(returns)
         steps, middle = env_steps / 1e6, interquartile_mean(returns, axis=0)
-        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+        if len(returns) >= FEWEST_SEEDS:
+            low, high = bootstrap_interval(returns)
+            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
         axes.plot(steps, middle, style, color=color, label=label)
     if evaluations is not None:
         steps = evaluations["env_steps"][0] / 1e6
@@ -101,7 +103,10 @@ def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None
     *others, largest = sorted(set(num_seeds))
     seeds = f"{', '.join(map(str, others))}{' or ' if others else ''}{largest}"
     seeds += " seed" if largest == 1 else " seeds"
-    text = f"interquartile mean over {seeds}, shaded its 95% interval{more}"
+    shaded = ", shaded its 95% interval" if largest >= FEWEST_SEEDS else ""
+    if shaded and min(num_seeds) < FEWEST_SEEDS:
+        shaded += f" from {FEWEST_SEEDS} seeds on"
+    text = f"interquartile mean over {seeds}{shaded}{more}"
     figure.supxlabel(text, fontsize="small", color="0.3")
 
 

@@ -6,6 +6,7 @@ from typing import Any, NotRequired, TypedDict
 
 import numpy as np
 
+from gasil_jax import statistics
 from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
@@ -91,7 +92,7 @@ def write(
         "env": env_name,
         "agent": agent,
         "env_steps_per_seed": int(steps[-1]),
-        **_by_seed_and_mean(seeds, finals),
+        **_by_seed_and_over_seeds(seeds, finals),
         "faulty_steps": by_seed(faulty, int),
         "skipped_updates": by_seed(skipped, int),
         "unhealthy_seeds": [
@@ -103,10 +104,10 @@ def write(
     return summary
 
 
-def _by_seed_and_mean(
+def _by_seed_and_over_seeds(
     seeds: Sequence[int], quantities: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
-    """Return each quantity, (seeds,), by seed, and its mean; NaN becomes None."""
+    """Return each quantity, (seeds,), by seed, and over seeds; NaN becomes None."""
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
         finite = np.isfinite(values)
@@ -115,7 +116,10 @@ def _by_seed_and_mean(
             for seed, value, is_finite in zip(seeds, values, finite, strict=True)
         }
         mean = float(values[finite].mean()) if finite.any() else None
+        estimate = statistics.estimate(values)
         fields[f"{name}_mean"] = mean
+        fields[f"{name}_interquartile_mean"] = estimate.interquartile_mean
+        fields[f"{name}_interval"] = estimate.interval
     return fields
 
 

@@ -72,7 +72,11 @@ def test_the_help_explains_every_option_in_whole_lines(agent, monkeypatch, capsy
 def test_a_run_from_end_to_end(finished):
     result, out = finished
     assert "compiling" in result.stderr and "steps/s" in result.stderr
-    assert len(result.stdout.splitlines()) == 1 and "final return" in result.stdout
+    assert len(result.stdout.splitlines()) == 1
+    assert re.match(
+        r"final return -?\d+\.\d \(interquartile mean over 3 seeds\), [\d,]+ steps/s",
+        result.stdout,
+    )
 
     config = json.loads((out / "config.json").read_text())
     assert config["env"] == "point_mass" and config["first_seed"] == 5
@@ -110,7 +114,8 @@ def test_the_final_policies_are_scored(finished, capsys):
     _, out = finished
     assert main([str(out), "--episodes", "4"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "mean"]
+    assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "return"]
+    assert lines[-1].endswith("(interquartile mean over 3 seeds)")
     assert main([str(out.parent)]) == 2
     assert "must be the folder of a run" in capsys.readouterr().err
     for number, message in (("0", "it must be"), ("1000000000000", "GB of memory")):

@@ -58,7 +58,14 @@ def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
     assert len(seeds) == 5
     expected = statistics.interquartile_mean(run.returns, axis=0)
     np.testing.assert_allclose(middle.get_ydata(), expected)
-    assert "over 5 seeds" in figure.get_supxlabel()
+    assert "over 5 seeds, shaded its 95% interval" in figure.get_supxlabel()
+    assert len(figure.axes[0].collections) == 1
+    # Four seeds are too few for an interval.
+    plotting.learning_curve(
+        tmp_path / "x.png", run.env_steps, run.returns[:4], title="hopper"
+    )
+    assert "over 4 seeds; grey" in figures[1].get_supxlabel()
+    assert not figures[1].axes[0].collections
     # Nothing to draw is no error.
     nothing = np.full((2, 50), np.nan)
     plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, title="hopper")

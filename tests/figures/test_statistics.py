@@ -42,6 +42,23 @@ def test_the_interval_is_scipys():
         np.testing.assert_allclose([low[i], high[i]], expected, atol=0.05)
 
 
+def test_seeds_are_told_in_one_way():
+    scores = np.array([1.0, 2.0, 3.0, 4.0, 90.0])
+    low, high = statistics.bootstrap_interval(scores)
+    told = f"3.0 [{low:.1f}, {high:.1f}]"
+    assert str(statistics.estimate(scores)) == told
+    assert statistics.in_words({"return": scores, "length": np.ones(5)}) == (
+        f"return {told}, length 1.0 [1.0, 1.0] "
+        "(interquartile mean [95% interval] over 5 seeds)"
+    )
+    # Fewer have no interval, and an unknown score counts nowhere.
+    scores[4] = np.nan
+    assert statistics.estimate(scores) == (2.5, None)
+    assert statistics.in_words({"return": scores[1:2]}) == "return 2.0 (1 seed)"
+    unknown = {"return": np.full(3, np.nan)}
+    assert statistics.in_words(unknown).startswith("return unknown (interq")
+
+
 def test_the_profile_counts():
     scores, levels = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 2.0, 3.5, 9.0])
     profile = statistics.performance_profile(scores, levels)
