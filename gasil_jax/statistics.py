@@ -15,6 +15,8 @@ FEWEST_SEEDS = 5
 #: Fewer points of a sweep tell nothing of a hyperparameter's importance.
 _FEWEST_POINTS = 8
 _MOST_GROUPS = 8
+#: With fewer points a hyperparameter's importance is uncertain.
+FEW_POINTS = 32
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:

@@ -16,7 +16,7 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.host import metrics_files, output_file
-from gasil_jax.statistics import Estimate, estimate, importance
+from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
 
@@ -305,7 +305,10 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
         )
     shares = summary["importance"].items()
     shown = [f"{name} {share:.0%}" for name, share in shares if share is not None]
-    return lines + ([f"importance: {', '.join(shown)}"] if shown else [])
+    uncertain = ""
+    if len(points) < FEW_POINTS:
+        uncertain = f" (uncertain with {len(points)} points)"
+    return lines + ([f"importance: {', '.join(shown)}{uncertain}"] if shown else [])
 
 
 def _labels(points: Sequence[Point]) -> list[str]:
