@@ -69,6 +69,21 @@ def test_the_help_explains_every_option_in_whole_lines(agent, monkeypatch, capsy
         assert f" --{name.replace('_', '-')}" in shown
 
 
+def test_the_help_is_in_groups_by_topic(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = capsys.readouterr().out
+    flags = ("--log", "--obs-noise", "--gamma", "--alpha ", "--decomposition", "--rew")
+    titles = ("", "environment ", "training ", "agent ", "decompose-rewards ")
+    titles += ("normalize-rewards ",)
+    for title, following, flag in zip(titles, (*titles[1:], None), flags):
+        group = shown.split(f" {title}options ", 1)[1]
+        if following is not None:
+            group = group.split(f" {following}options ")[0]
+        assert f" {flag}" in group
+
+
 def test_a_run_from_end_to_end(finished):
     result, out = finished
     assert "compiling" in result.stderr and "steps/s" in result.stderr
@@ -174,6 +189,8 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
             "--env hopper --total-step 5",
             "option --total-step is unknown: did you mean --total-steps",
         ),
+        ("--env hopper --seed 3", "unknown: did you mean --seeds or --first-seed?"),
+        ("--env hopper --lr 1e-3", "unknown: did you mean --learning-rate?"),
         ("--env hopper --xyz 5", "option --xyz is unknown: see --help"),
         (
             "--env hopper --normalize-rewards False",
