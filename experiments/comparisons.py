@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.curves import Comparisons
-from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: Significance level of a family of verdicts.
 LEVEL = 0.05

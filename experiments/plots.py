@@ -17,8 +17,8 @@ from experiments.curves import Figure
 from experiments.search import AGENTS
 from experiments.store import Record
 from gasil_jax.figures import plotting
-from gasil_jax.figures.statistics import bootstrap_interval, interquartile_mean
 from gasil_jax.host import output_file
+from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: The color of each agent, the same in all figures.
 _COLOR_OF = dict(zip(AGENTS, plotting.COLORS, strict=False))

@@ -44,8 +44,8 @@ from experiments.search import (
 from experiments.store import Record, Run, Store
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
-from gasil_jax.figures.statistics import interquartile_mean
 from gasil_jax.host import output_file
+from gasil_jax.statistics import interquartile_mean
 
 NOTES = pathlib.Path(__file__).parent / "notes"
 #: Mean returns that others have published, after about 1M steps, with their sources.

@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments.store import Run, Store
+from gasil_jax import statistics
 from gasil_jax.algorithms import Algorithm, algorithm
-from gasil_jax.figures import statistics
 
 Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]

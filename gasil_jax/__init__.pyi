@@ -1,11 +1,9 @@
+from . import statistics as statistics
 from .algorithms import Algorithm as Algorithm
 from .algorithms import algorithm as algorithm
 from .config import Config as Config
 from .context import Context as Context
 from .host.environments import make_env as make_env
-from .host.fitting import FitProgress as FitProgress
-from .host.fitting import FitResult as FitResult
-from .host.fitting import fit as fit
 from .host.members import member as member
 from .imitation import GAIL as GAIL
 from .imitation import GASIL as GASIL
@@ -22,6 +20,9 @@ from .presets import preset as preset
 from .rewards import Decompose as Decompose
 from .rewards import Normalize as Normalize
 from .rewards import RewardModel as RewardModel
+from .sweeps.fitting import FitProgress as FitProgress
+from .sweeps.fitting import FitResult as FitResult
+from .sweeps.fitting import fit as fit
 from .train import TrainState as TrainState
 from .train import init as init
 from .train import iterate as iterate

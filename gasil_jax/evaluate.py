@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from gasil_jax import numpy_policy, policy
+from gasil_jax import numpy_policy, policy, statistics
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import run_episodes
 from gasil_jax.host import command_line, environments, output_file, resources
@@ -155,7 +155,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{seed:4d}  {options.episodes:8d}  {returns.mean():10.2f} "
             f"{returns.std():10.2f}  {length.mean():6.1f}"
         )
-    print(f"mean over seeds: {scores['episode_return'].mean():.2f}")
+    over_seeds = {"return": scores["episode_return"].mean(axis=1)}
+    print(statistics.in_words(over_seeds))
     if options.out is not None:
         _write(options.out, seeds, scores)
         print(f"in {options.out}")

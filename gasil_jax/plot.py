@@ -9,8 +9,9 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 import tyro
 
+from gasil_jax import statistics
 from gasil_jax.errors import InputError
-from gasil_jax.figures import plotting, statistics
+from gasil_jax.figures import plotting
 from gasil_jax.figures.plotting import COLORS
 from gasil_jax.host import command_line, metrics_files, output_file, run_folder
 
@@ -60,14 +61,9 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     Raises:
       InputError: if it is not the folder of a run, or if no episode has ended in it.
     """
-    description = run_folder.read(folder)
-    if "points" in description:
-        raise InputError(
-            f"run is {folder}, a sweep: its plots are sweep.png and "
-            "hyperparameters.png, and its curves are in curves.npz"
-        )
+    env, agent, num_seeds = _names(folder)
     read_table = lambda name, column: metrics_files.read_metrics(
-        folder / name, ("seed",), description["seeds"], (column,), unfinished=True
+        folder / name, ("seed",), num_seeds, (column,), unfinished=True
     )
     evaluations = None
     if (folder / "evaluations.csv").is_file():
@@ -80,10 +76,9 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
         raise InputError(f"{path}: not every seed has ended an episode")
-    default = f"{description['env']}, {description['algorithm'].agent.name}"
     return Curves(
-        env=description["env"],
-        label=label or default,
+        env=env,
+        label=label or f"{env}, {agent}",
         env_steps=env_steps,
         returns=means,
         final=metrics_files.final_returns(returns),
@@ -91,8 +86,22 @@ def read(folder: pathlib.Path, label: str | None = None) -> Curves:
     )
 
 
+def _names(folder: pathlib.Path) -> tuple[str, str, int]:
+    """Return the environment's and the agent's name, and the number of seeds."""
+    if (folder / run_folder.FIT).is_file():
+        fit = run_folder.read_fit(folder)
+        return fit["env"], fit["agent"], len(fit["seeds"])
+    run = run_folder.read(folder)
+    if "points" in run:
+        raise InputError(
+            f"run is {folder}, a sweep: its plots are sweep.png and "
+            "hyperparameters.png, and its curves are in curves.npz"
+        )
+    return run["env"], run["algorithm"].agent.name, run["seeds"]
+
+
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
-    """Write the figure: interquartile means over seeds, with 95% intervals.
+    """Write the figure: interquartile means over seeds, with their 95% intervals.
 
     Each environment has a row of three panels. The left one shows returns over
     environment steps, with evaluations dashed; the middle one final returns, with a dot
@@ -136,9 +145,10 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
             evaluated=f"{labels[number]}, evaluations",
             style=style,
         )
-        low, high = statistics.bootstrap_interval(run.final)
-        middle = statistics.interquartile_mean(run.final)
-        bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
+        middle, interval = statistics.estimate(run.final)
+        if interval is not None:
+            low, high = interval
+            bars.barh(number, high - low, left=low, height=0.5, color=color, alpha=0.4)
         bars.plot([middle, middle], [number - 0.25, number + 0.25], color=color, lw=2)
         bars.plot(run.final, [number] * len(run.final), "o", color="0.3", ms=3)
 
@@ -172,12 +182,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial)
-    print("run                             seeds  interquartile mean  95% interval")
+    print("run                             seeds  interquartile mean [95% interval]")
     for run in runs:
-        low, high = statistics.bootstrap_interval(run.final)
-        middle = statistics.interquartile_mean(run.final)
-        interval = f"{low:.1f} to {high:.1f}"
-        print(f"{run.label:30} {len(run.final):6} {middle:19.1f}  {interval}")
+        estimate = statistics.estimate(run.final)
+        print(f"{run.label:30} {len(run.final):6}  {estimate}")
     print(f"in {options.out}")
     return 0
 

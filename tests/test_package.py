@@ -45,6 +45,15 @@ def test_the_commands_are_listed(capsys):
     assert "'foo' is unknown (without an argument" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", package.COMMANDS)
+def test_every_command_tells_its_version(command, capsys):
+    module = importlib.import_module(f"gasil_jax.{command}")
+    with pytest.raises(SystemExit) as exit_:
+        module.main(["--version"])
+    assert exit_.value.code == 0
+    assert capsys.readouterr().out == f"{gasil_jax.__version__}\n"
+
+
 def test_an_algorithm_can_be_made_before_anything_else():
     make = "import gasil_jax; gasil_jax.algorithm('ppo+gasil').replace(num_envs=8)"
     subprocess.run([sys.executable, "-c", make], check=True)

@@ -240,4 +240,15 @@ def make(name: str, **settings: Any) -> Env:
         env = wrappers.RewardDelay(env, int(chosen.reward_delay))
     if chosen.obs_noise > 0:
         env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
+    env._made_with = (name, chosen)
     return env
+
+
+def made_with(env: Any) -> tuple[str, Settings] | None:
+    """Return the name and the settings with which `make` built an environment.
+
+    The result is None for any other environment, also for a wrapper around one of
+    `make`.
+    """
+    # A wrapper has the attributes of what it wraps; only its own ones count here.
+    return getattr(env, "__dict__", {}).get("_made_with")

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax.figures.statistics import (
+from gasil_jax.statistics import (
+    FEW_POINTS,
+    FEWEST_SEEDS,
     are_numbers,
     bootstrap_interval,
     groups,
@@ -65,7 +67,7 @@ def draw_returns(
     evaluated: str = "evaluations",
     style: str = "-",
 ) -> None:
-    """Draw the interquartile mean over seeds with its 95% interval.
+    """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
 
     Args:
       axes: where to draw; steps are in millions.
@@ -79,9 +81,10 @@ def draw_returns(
       style: style of the line.
     """
     if len(env_steps):
-        low, high = bootstrap_interval(returns)
         steps, middle = env_steps / 1e6, interquartile_mean(returns, axis=0)
-        axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
+        if len(returns) >= FEWEST_SEEDS:
+            low, high = bootstrap_interval(returns)
+            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
         axes.plot(steps, middle, style, color=color, label=label)
     if evaluations is not None:
         steps = evaluations["env_steps"][0] / 1e6
@@ -101,7 +104,10 @@ def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None
     *others, largest = sorted(set(num_seeds))
     seeds = f"{', '.join(map(str, others))}{' or ' if others else ''}{largest}"
     seeds += " seed" if largest == 1 else " seeds"
-    text = f"interquartile mean over {seeds}, shaded its 95% interval{more}"
+    shaded = ", shaded its 95% interval" if largest >= FEWEST_SEEDS else ""
+    if shaded and min(num_seeds) < FEWEST_SEEDS:
+        shaded += f" from {FEWEST_SEEDS} seeds on"
+    text = f"interquartile mean over {seeds}{shaded}{more}"
     figure.supxlabel(text, fontsize="small", color="0.3")
 
 
@@ -157,15 +163,21 @@ def final_returns(
     """
     from matplotlib.figure import Figure
 
+    # A label is no wider than half of the figure. Its numbers have hyphens: 3e-05.
+    wrapped = [
+        textwrap.fill(f"{number}: {label}", 48, break_on_hyphens=False)
+        for number, label in enumerate(labels)
+    ]
+    lines = 1 + max(label.count("\n") for label in wrapped)
     # Matplotlib refuses pictures of more than 2**16 pixels.
-    size = (8.0, min(1.4 + 0.35 * len(labels), 400.0))
+    size = (8.0, min(1.4 + (0.22 + 0.13 * lines) * len(labels), 400.0))
     figure = Figure(figsize=size, layout="constrained")
     axes = figure.subplots()
     for row, seeds in enumerate(returns):
         axes.plot(seeds, [row] * len(seeds), "o", color="0.7", markersize=4)
         color = COLORS[1] if row == best else COLORS[0]
         axes.plot(seeds.mean(), row, "|", color=color, markersize=14, mew=2)
-    axes.set_yticks(range(len(labels)), labels, fontsize=8)
+    axes.set_yticks(range(len(labels)), wrapped, fontsize=8)
     if best is not None:
         axes.get_yticklabels()[best].set(color=COLORS[1], weight="bold")
     axes.set(xlabel="final return of each seed; the bar is their mean")
@@ -218,6 +230,9 @@ def marginals(
     if any(share is not None for share in importance.values()):
         text += "; importance: share of the points' variance that these means explain, "
         text += "corrected for their number"
+        if len(returns) < FEW_POINTS:
+            text += f" (uncertain with {len(returns)} points: shares may add up to "
+            text += "more than 100%)"
     if left_out:
         text += f"; {left_out} of {len(returns) + left_out} points are left out, "
         text += "because a seed has no return"

@@ -5,6 +5,7 @@ import dataclasses
 import difflib
 import errno
 import functools
+import importlib
 import io
 import itertools
 import os
@@ -33,7 +34,7 @@ _REGISTRY = ConstructorRegistry()
 
 
 class HelpShown(SystemExit):
-    """Ends a command that has printed its help."""
+    """Ends a command that has printed its help or its version."""
 
 
 @contextlib.contextmanager
@@ -121,10 +122,13 @@ def parse(
       why_not: returns why there is no option of a name, for an error message.
 
     Raises:
-      HelpShown: with --help, once the help is printed.
+      HelpShown: with --help or --version, once that is printed.
       InputError: if tyro rejects the command line; the message is one line.
     """
     given = sys.argv[1:] if arguments is None else arguments
+    if "--version" in given:
+        print(importlib.import_module("gasil_jax").__version__)
+        raise HelpShown(0)
     _check_flags(dict(_flags(options, default)), given, why_not)
     printed = io.StringIO()
     try:
@@ -165,11 +169,10 @@ def _check_flags(
             continue
         name = flag.removeprefix("--").replace("-", "_")
         if name not in ("help", "", *kinds) and name.removeprefix("no_") not in kinds:
-            flags = [f"--{x.replace('_', '-')}" for x in kinds]
             own = why_not(name.removeprefix("no_")) if why_not else ""
             if " is a setting of " in own:
                 raise InputError(f"option {flag} is unknown: {own}")
-            near = difflib.get_close_matches(flag, flags, n=3, cutoff=0.7)
+            near = [f"--{x.replace('_', '-')}" for x in _similar(name, tuple(kinds))]
             what = f"did you mean {' or '.join(near)}?" if near else "see --help"
             raise InputError(f"option {flag} is unknown: {what}")
         if equals and kinds.get(name.removeprefix("no_")) is bool:
@@ -183,6 +186,18 @@ def _check_flags(
         if get_origin(kinds.get(name)) is tuple and name in given:
             raise InputError(f"{name} is given twice: put all values after one {flag}")
         given.add(name)
+
+
+def _similar(name: str, names: Sequence[str]) -> list[str]:
+    """Return up to three names that have the given word or initials, or its letters."""
+    singular = lambda word: word.removesuffix("s")
+    same = [
+        x
+        for x in names
+        if singular(name) in map(singular, x.split("_"))
+        or name == "".join(word[:1] for word in x.split("_"))
+    ]
+    return (same or difflib.get_close_matches(name, names, n=3, cutoff=0.7))[:3]
 
 
 def _flags(kind: Any, default: Any = None) -> Iterator[tuple[str, Any]]:

@@ -5,7 +5,14 @@ from typing import Any
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
 from gasil_envs.point_mass import PointMass
-from gasil_envs.registry import Settings, check, make, prepare, without_effect
+from gasil_envs.registry import (
+    Settings,
+    check,
+    made_with,
+    make,
+    prepare,
+    without_effect,
+)
 
 make_env = make
 
@@ -16,6 +23,7 @@ __all__ = [
     "ends_early",
     "is_locomotion",
     "is_point_mass",
+    "made_with",
     "make_env",
     "prepare",
     "without_effect",

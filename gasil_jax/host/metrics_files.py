@@ -64,9 +64,18 @@ def _version(package: str) -> str | None:
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file atomically."""
-    text = json.dumps(content, indent=2, default=_to_json, allow_nan=False)
+    text = to_json(content)
     with output_file.atomic(path) as partial:
         partial.write_text(text + "\n")
+
+
+def to_json(content: Mapping[str, Any]) -> str:
+    """Return what `write_json` writes.
+
+    Raises:
+      TypeError: if a value has no JSON form.
+    """
+    return json.dumps(content, indent=2, default=_to_json, allow_nan=False)
 
 
 def _to_json(value: Any) -> Any:

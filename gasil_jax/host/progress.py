@@ -14,6 +14,8 @@ from rich.progress import BarColumn, SpinnerColumn, TextColumn
 from rich.progress import Progress as RichProgress
 from rich.table import Column
 
+from gasil_jax.statistics import interquartile_mean
+
 _SECONDS_BETWEEN_LINES = 10.0
 _SECONDS_BEFORE_ANNOUNCEMENT = 1.0
 
@@ -54,7 +56,7 @@ class _Activity:
 class Progress:
     """Shows the share of the steps, the return, steps/s and the time left.
 
-    The return is a mean over members, with the standard deviation between them.
+    The return is the interquartile mean over members.
 
     Args:
       title: name of what is trained.
@@ -147,8 +149,7 @@ class Progress:
         each = [row[np.isfinite(row)] for row in returns]
         each = [row.mean() for row in each if row.size]
         if each:
-            deviation = f" ± {np.std(each):.1f}" if len(returns) > 1 else ""
-            self._return = f"{np.mean(each):.1f}{deviation}"
+            self._return = f"{interquartile_mean(np.array(each)):.1f}"
         now = time.monotonic()
         speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
         # The last iteration may go beyond the total.

@@ -29,10 +29,12 @@ from gasil_jax.imitation import expert
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
-_CONFIG = "config.json"
+CONFIG = "config.json"
+#: What `gasil_jax.fit` writes instead, if no command can train the same.
+FIT = "fit.json"
 #: Files that only the process that has locked the folder writes.
 _LOCKED = (
-    *(_CONFIG, "fit.json", "summary.json", "policy.npz", "learning_curve.png"),
+    *(CONFIG, FIT, "summary.json", "policy.npz", "learning_curve.png"),
     *("results.csv", "curves.npz", "sweep.png", "hyperparameters.png"),
 )
 #: Errors of locking where there are no locks.
@@ -220,13 +222,13 @@ def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
 
 def has_run(folder: pathlib.Path) -> bool:
     """Return whether the folder holds a run, sweep or shard, finished or not."""
-    return (folder / _CONFIG).is_file()
+    return (folder / CONFIG).is_file()
 
 
 def write_description(folder: pathlib.Path, description: Mapping[str, Any]) -> None:
     """Write config.json, the description of a run, sweep or shard."""
     algorithm = descriptions.describe(description["algorithm"])
-    metrics_files.write_json(folder / _CONFIG, {**description, "algorithm": algorithm})
+    metrics_files.write_json(folder / CONFIG, {**description, "algorithm": algorithm})
 
 
 class _Description(TypedDict, total=False):
@@ -255,15 +257,38 @@ class _Description(TypedDict, total=False):
     shards: int | None
 
 
+class Fit(TypedDict):
+    """The fields of fit.json that are read; the settings are beside them."""
+
+    why_no_run: str
+    env: str
+    agent: str
+    seeds: tuple[int, ...]
+
+
+def read_fit(folder: pathlib.Path) -> Fit:
+    """Return the content of fit.json.
+
+    Raises:
+      InputError: if it is damaged.
+      OSError: if there is no such file.
+    """
+    return json_reader.read(folder / FIT, Fit)
+
+
 def _why_no_run(folder: pathlib.Path) -> str:
     """Return why a folder has no config.json, for an error message."""
     if not folder.exists():
         return ", which does not exist: it must be the folder of a run"
-    if (folder / "fit.json").is_file():
-        return ", which gasil_jax.fit has written: gasil_jax.load_policy takes it"
+    if (folder / FIT).is_file():
+        return (
+            f", in which gasil_jax.fit has trained what no run can describe "
+            f"({read_fit(folder)['why_no_run']}): only gasil_jax.plot and "
+            "gasil_jax.load_policy take it"
+        )
     if (folder / "shards").is_dir():
         return f", which holds shards: first run python -m gasil_jax.merge {folder}"
-    return f", which has no {_CONFIG}: it must be the folder of a run"
+    return f", which has no {CONFIG}: it must be the folder of a run"
 
 
 def read(folder: pathlib.Path) -> dict[str, Any]:
@@ -273,7 +298,7 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
       InputError: if there is no such file, if it does not describe a run, or if its
         agent can't be imported here.
     """
-    path = folder / _CONFIG
+    path = folder / CONFIG
     try:
         description = json_reader.read(path, _Description)
     except (FileNotFoundError, NotADirectoryError):

@@ -36,9 +36,12 @@ from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.imitation import PPOGASIL, Agent
 from gasil_jax.rewards import REWARD_MODELS, Decompose, Normalize, RewardModel
 
-_Part = TypeVar("_Part")
-#: A dataclass whose fields are options of their own, without a prefix.
-_Nested = Annotated[_Part, tyro.conf.arg(name="")]
+# Each is a group of the help; its fields are options without a prefix.
+_Environment = Annotated[Settings, tyro.conf.arg(name="environment")]
+_Training = Annotated[Config, tyro.conf.arg(name="training")]
+_Agent = Annotated[Agent, tyro.conf.arg(name="agent")]
+_Decompose = Annotated[Decompose, tyro.conf.arg(name="decompose-rewards")]
+_Normalize = Annotated[Normalize, tyro.conf.arg(name="normalize-rewards")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,11 +106,11 @@ class Options:
     devices: int | None = None
     decompose_rewards: bool = False
     normalize_rewards: bool = False
-    settings: _Nested[Settings] = dataclasses.field(default_factory=Settings)
-    config: _Nested[Config] = dataclasses.field(default_factory=Config)
-    own: _Nested[Agent] = dataclasses.field(default_factory=PPOGASIL)
-    decompose: _Nested[Decompose] = dataclasses.field(default_factory=Decompose)
-    normalize: _Nested[Normalize] = dataclasses.field(default_factory=Normalize)
+    settings: _Environment = dataclasses.field(default_factory=Settings)
+    config: _Training = dataclasses.field(default_factory=Config)
+    own: _Agent = dataclasses.field(default_factory=PPOGASIL)
+    decompose: _Decompose = dataclasses.field(default_factory=Decompose)
+    normalize: _Normalize = dataclasses.field(default_factory=Normalize)
 
     @property
     def algorithm(self) -> Algorithm:

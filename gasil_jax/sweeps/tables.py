@@ -15,8 +15,8 @@ import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.figures.statistics import importance
 from gasil_jax.host import metrics_files, output_file
+from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
 
@@ -166,6 +166,7 @@ def _summary(
             {
                 **point,
                 "mean": _finite(mean[i]),
+                **_estimate(final[i])._asdict(),
                 "worst_seed": _finite(final[i].min()),
                 **{name: _finite(values[i].mean()) for name, values in others.items()},
                 "diverged_seeds": int(diverged[i].sum()),
@@ -270,6 +271,11 @@ def _curves(
     }
 
 
+def _estimate(final: np.ndarray) -> Estimate:
+    """Return what a point's final returns tell; nothing if one is unknown."""
+    return estimate(final if np.isfinite(final).all() else final[:0])
+
+
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
@@ -292,13 +298,17 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
             )
             continue
         scores = summary["points"][best]
+        told = Estimate(scores["interquartile_mean"], scores["interval"])
         lines.append(
             f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
-            f"worst seed {scores['worst_seed']:.1f})"
+            f"interquartile mean {told}, worst seed {scores['worst_seed']:.1f})"
         )
     shares = summary["importance"].items()
     shown = [f"{name} {share:.0%}" for name, share in shares if share is not None]
-    return lines + ([f"importance: {', '.join(shown)}"] if shown else [])
+    uncertain = ""
+    if len(points) < FEW_POINTS:
+        uncertain = f" (uncertain with {len(points)} points)"
+    return lines + ([f"importance: {', '.join(shown)}{uncertain}"] if shown else [])
 
 
 def _labels(points: Sequence[Point]) -> list[str]:

@@ -69,10 +69,29 @@ def test_the_help_explains_every_option_in_whole_lines(agent, monkeypatch, capsy
         assert f" --{name.replace('_', '-')}" in shown
 
 
+def test_the_help_is_in_groups_by_topic(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    shown = capsys.readouterr().out
+    flags = ("--log", "--obs-noise", "--gamma", "--alpha ", "--decomposition", "--rew")
+    titles = ("", "environment ", "training ", "agent ", "decompose-rewards ")
+    titles += ("normalize-rewards ",)
+    for title, following, flag in zip(titles, (*titles[1:], None), flags):
+        group = shown.split(f" {title}options ", 1)[1]
+        if following is not None:
+            group = group.split(f" {following}options ")[0]
+        assert f" {flag}" in group
+
+
 def test_a_run_from_end_to_end(finished):
     result, out = finished
     assert "compiling" in result.stderr and "steps/s" in result.stderr
-    assert len(result.stdout.splitlines()) == 1 and "final return" in result.stdout
+    assert len(result.stdout.splitlines()) == 1
+    assert re.match(
+        r"final return -?\d+\.\d \(interquartile mean over 3 seeds\), [\d,]+ steps/s",
+        result.stdout,
+    )
 
     config = json.loads((out / "config.json").read_text())
     assert config["env"] == "point_mass" and config["first_seed"] == 5
@@ -110,7 +129,8 @@ def test_the_final_policies_are_scored(finished, capsys):
     _, out = finished
     assert main([str(out), "--episodes", "4"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "mean"]
+    assert [line.split()[0] for line in lines] == ["seed", "5", "6", "7", "return"]
+    assert lines[-1].endswith("(interquartile mean over 3 seeds)")
     assert main([str(out.parent)]) == 2
     assert "must be the folder of a run" in capsys.readouterr().err
     for number, message in (("0", "it must be"), ("1000000000000", "GB of memory")):
@@ -169,6 +189,8 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
             "--env hopper --total-step 5",
             "option --total-step is unknown: did you mean --total-steps",
         ),
+        ("--env hopper --seed 3", "unknown: did you mean --seeds or --first-seed?"),
+        ("--env hopper --lr 1e-3", "unknown: did you mean --learning-rate?"),
         ("--env hopper --xyz 5", "option --xyz is unknown: see --help"),
         (
             "--env hopper --normalize-rewards False",

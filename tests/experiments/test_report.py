@@ -16,7 +16,7 @@ from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
-from gasil_jax.figures.statistics import interquartile_mean
+from gasil_jax.statistics import interquartile_mean
 
 STORE = Store(RESULTS / "runs")
 

@@ -3,8 +3,8 @@
 import matplotlib.figure
 import numpy as np
 
-from gasil_jax import plot
-from gasil_jax.figures import plotting, statistics
+from gasil_jax import plot, statistics
+from gasil_jax.figures import plotting
 from gasil_jax.sweeps import tables
 
 
@@ -58,7 +58,14 @@ def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
     assert len(seeds) == 5
     expected = statistics.interquartile_mean(run.returns, axis=0)
     np.testing.assert_allclose(middle.get_ydata(), expected)
-    assert "over 5 seeds" in figure.get_supxlabel()
+    assert "over 5 seeds, shaded its 95% interval" in figure.get_supxlabel()
+    assert len(figure.axes[0].collections) == 1
+    # Four seeds are too few for an interval.
+    plotting.learning_curve(
+        tmp_path / "x.png", run.env_steps, run.returns[:4], title="hopper"
+    )
+    assert "over 4 seeds; grey" in figures[1].get_supxlabel()
+    assert not figures[1].axes[0].collections
     # Nothing to draw is no error.
     nothing = np.full((2, 50), np.nan)
     plotting.learning_curve(tmp_path / "x.png", run.env_steps, nothing, title="hopper")
@@ -90,6 +97,7 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), [1.0, 4.0, 7.0])
     caption = figure.get_supxlabel().replace("\n", " ")
     assert "2 of 11 points are left out, because a seed has no return" in caption
+    assert "(uncertain with 9 points: shares may add up" in caption
     assert "neighbouring values" in caption and "share of the points' var" in caption
 
 
@@ -114,8 +122,25 @@ def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
     names, returns = tables._labels(points), np.array([[1.0, 2.0], [3.0, 4.0]])
     plotting.final_returns(tmp_path / "x.png", names, returns, best=1)
     labels = figures[0].axes[0].get_yticklabels()
-    assert [label.get_text() for label in labels] == ["alpha=0.1", "alpha=1"]
+    assert [label.get_text() for label in labels] == ["0: alpha=0.1", "1: alpha=1"]
     assert [label.get_weight() for label in labels] == ["normal", "bold"]
+
+
+def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
+    point = {"learning_rate": 3e-5, "discriminator_updates": 10, "alpha": 0.1}
+    point |= {"discriminator_learning_rate": 2e-5, "buffer_steps": 10_000}
+    points = [point, {name: 2 * value for name, value in point.items()}]
+    plotting.final_returns(
+        tmp_path / "x.png", tables._labels(points), np.ones((2, 5)), best=1
+    )
+    (figure,) = figures
+    figure.draw_without_rendering()
+    (axes,) = figure.axes
+    assert axes.get_position().width > 0.5
+    low, high = [label.get_window_extent() for label in axes.get_yticklabels()]
+    assert not low.overlaps(high) and min(low.x0, high.x0) >= 0.0
+    text = axes.get_yticklabels()[0].get_text()
+    assert text.replace("\n", " ") == f"0: {tables._labels(points)[0]}"
 
 
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from gasil_jax.figures import statistics
+from gasil_jax import statistics
 
 ALPHA, RATE = map(np.ravel, np.meshgrid([0.02, 0.1, 0.2, 1.0], [1e-5, 1e-4, 1e-3]))
 
@@ -40,6 +40,23 @@ def test_the_interval_is_scipys():
             rng=np.random.default_rng(1),
         ).confidence_interval
         np.testing.assert_allclose([low[i], high[i]], expected, atol=0.05)
+
+
+def test_seeds_are_told_in_one_way():
+    scores = np.array([1.0, 2.0, 3.0, 4.0, 90.0])
+    low, high = statistics.bootstrap_interval(scores)
+    told = f"3.0 [{low:.1f}, {high:.1f}]"
+    assert str(statistics.estimate(scores)) == told
+    assert statistics.in_words({"return": scores, "length": np.ones(5)}) == (
+        f"return {told}, length 1.0 [1.0, 1.0] "
+        "(interquartile mean [95% interval] over 5 seeds)"
+    )
+    # Fewer have no interval, and an unknown score counts nowhere.
+    scores[4] = np.nan
+    assert statistics.estimate(scores) == (2.5, None)
+    assert statistics.in_words({"return": scores[1:2]}) == "return 2.0 (1 seed)"
+    unknown = {"return": np.full(3, np.nan)}
+    assert statistics.in_words(unknown).startswith("return unknown (interq")
 
 
 def test_the_profile_counts():

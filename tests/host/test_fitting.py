@@ -6,13 +6,14 @@ import os
 import shutil
 import signal
 
+import brax.envs
 import jax
 import numpy as np
 import pytest
 import small_training
 
 import gasil_jax
-from gasil_jax import run
+from gasil_jax import Decompose, Normalize, evaluate, plot, render, run
 from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, metrics_files
 from gasil_jax.host.interruption import Interrupted
@@ -33,6 +34,12 @@ BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
 @pytest.fixture(scope="module")
 def env():
     return gasil_jax.make_env("point_mass")
+
+
+@pytest.fixture(scope="module")
+def own(env):
+    """An environment that is not as `make_env` returned it."""
+    return brax.envs.Wrapper(env)
 
 
 @pytest.fixture(scope="module")
@@ -124,43 +131,86 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     )
 
 
-def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
-    """It was not evaluated if it has no evaluations; else the user has to say how."""
+def test_checkpoints_without_evaluations_are_no_reason_to_begin_anew(own, tmp_path):
     description, root = tmp_path / "fit.json", tmp_path / "checkpoints"
-
-    def describe(**evaluated):
-        described = json.loads(description.read_text())
-        for name in EVALUATED:
-            described.pop(name, None)
-        description.write_text(json.dumps(described | evaluated))
 
     def fit(**arguments):
         # It stops after a chunk.
         once = lambda progress: True
-        return gasil_jax.fit(env, PPO, folder=tmp_path, callback=once, **arguments)
+        return gasil_jax.fit(own, PPO, folder=tmp_path, callback=once, **arguments)
 
     before = fit().metrics["policy_loss"].shape[1]
     (root / "00000099.partial" / "state").mkdir(parents=True)
     saved = sorted(root.rglob("*"))
-    describe()
-    with pytest.raises(ValueError, match="evaluate_every was None, is 5120"):
-        fit(resume=True, **EVALUATED)
-    # Its checkpoints are whole, and no reason to start anew.
-    describe(**EVALUATED)
+    described = json.loads(description.read_text())
+    description.write_text(json.dumps(described | EVALUATED))
     with pytest.raises(InputError, match=f"0000000{before} .* no evaluations_size"):
         fit(resume=True, **EVALUATED)
     assert sorted(root.rglob("*")) == saved
 
-    describe()
+    description.write_text(json.dumps(described))
     assert fit(resume=True).metrics["policy_loss"].shape[1] > before
-    assert json.loads(description.read_text())["evaluate_every"] is None
     # What a killed process had half written is deleted.
     assert saved[0] in root.iterdir() and not list(root.glob("*.partial"))
 
-    describe()
-    (tmp_path / "evaluations.csv").touch()
-    with pytest.raises(ValueError, match=r"fit.json .* add evaluate_every and evalua"):
-        fit(resume=True, **EVALUATED)
+
+def test_its_folder_is_a_runs_folder(env, commanded, tmp_path, capsys):
+    out = tmp_path / "out"
+    # It ends early, before any evaluation; the command trains the rest.
+    begun = {"callback": lambda progress: True, **EVALUATED}
+    gasil_jax.fit(env, PPO, seeds=2, folder=out, **begun)
+    assert json.loads((out / "summary.json").read_text())["final_return_mean"] is None
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    rows = [x / "metrics.csv" for x in (out, commanded)]
+    assert rows[0].read_text() == rows[1].read_text()
+    # The command adds nothing to what `fit` writes, and says the same of it.
+    whole = tmp_path / "whole"
+    gasil_jax.fit(env, PPO, seeds=2, folder=whole, **EVALUATED)
+    assert {x.name for x in whole.iterdir()} == {x.name for x in commanded.iterdir()}
+    contents = [json.loads((x / "config.json").read_text()) for x in (whole, commanded)]
+    differing = {name for name in contents[1] if contents[0][name] != contents[1][name]}
+    assert differing == {"out", "preset"} and contents[0].keys() == contents[1].keys()
+    summaries = [json.loads((x / "summary.json").read_text()) for x in (whole, out)]
+    for name in ("env", "agent", "final_return", "final_evaluation"):
+        assert summaries[0][name] == summaries[1][name]
+    for command, path in (
+        (plot, tmp_path / "curves.png"),
+        (evaluate, tmp_path / "scores.csv"),
+        (render, tmp_path / "film.gif"),
+    ):
+        assert command.main([str(whole), "--out", str(path)]) == 0
+        assert path.stat().st_size > 0
+    assert "point_mass, ppo" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({}, "the environment is not one that gasil_jax.make_env returned"),
+        ({"seeds": [4, 2]}, "the seeds do not follow one another"),
+        (
+            {"algorithm": PPO.replace(clip_epsilon_schedule=lambda steps: 1.0)},
+            "function has no JSON form",
+        ),
+        (
+            {"algorithm": dataclasses.replace(PPO, rewards=(Normalize(), Decompose()))},
+            "the algorithm has other models of rewards",
+        ),
+    ],
+)
+def test_what_no_run_can_describe_is_plotted(env, own, changes, why, tmp_path, capsys):
+    out = tmp_path / "out"
+    arguments = {"algorithm": PPO, **changes, "folder": out}
+    once = lambda progress: progress.iteration >= 30
+    gasil_jax.fit(env if changes else own, callback=once, **arguments)
+    assert not (out / "config.json").exists()
+    assert (out / "learning_curve.png").exists()
+    assert plot.main([str(out), "--out", str(tmp_path / "curves.png")]) == 0
+    assert "PointMass, ppo" in capsys.readouterr().out
+    for command in (evaluate, render):
+        assert command.main([str(out)]) == 2
+        (message,) = capsys.readouterr().err.splitlines()
+        assert why in message and "only gasil_jax.plot and" in message
 
 
 @pytest.mark.parametrize(
@@ -186,7 +236,7 @@ def test_a_folder_that_does_not_say_how_it_was_evaluated(env, tmp_path):
         (BEGUN | {"seeds": 2}, r"seeds was \(0,\), is \(0, 1\): only total_steps"),
     ],
 )
-def test_what_is_wrong_is_refused_by_name(env, changes, why, tmp_path, monkeypatch):
+def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
@@ -194,4 +244,4 @@ def test_what_is_wrong_is_refused_by_name(env, changes, why, tmp_path, monkeypat
     described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
     (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
-        gasil_jax.fit(env, **{"algorithm": PPO, **changes})
+        gasil_jax.fit(own, **{"algorithm": PPO, **changes})

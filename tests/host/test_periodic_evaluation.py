@@ -15,9 +15,9 @@ import pytest
 from small_training import FLAGS, SETTINGS
 
 import gasil_jax
-from gasil_jax import plot, run, sweep
+from gasil_jax import plot, run, statistics, sweep
 from gasil_jax.evaluation import evaluate as evaluate_directly
-from gasil_jax.figures import plotting, statistics
+from gasil_jax.figures import plotting
 from gasil_jax.host import checkpoint, trackers
 from gasil_jax.host.members import make_members
 from gasil_jax.host.periodic_evaluation import (

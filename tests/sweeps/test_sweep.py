@@ -108,6 +108,11 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
     monkeypatch.setattr(plotting, "marginals", marginals)
     summary = tables.write(tmp_path, tables.read(points, [5], [trained]))
     assert summary["best_by_mean"] == 1
+    assert summary["points"][1]["interquartile_mean"] == 2.0
+    told = "(mean 2.0, interquartile mean 2.0, worst seed 2.0)"
+    assert f"best_by_mean: learning_rate=0.0001 {told}" in tables.report(
+        points, summary
+    )
     # A point that does not name a value has the sweep's own.
     ((values, returns, importance),) = drawn
     assert values == {

@@ -1,6 +1,7 @@
 """Train from Python as the command line does: `gasil_jax.fit`."""
 
 import contextlib
+import json
 import os
 import pathlib
 import tempfile
@@ -16,22 +17,23 @@ from gasil_jax.config import Range
 from gasil_jax.host import (
     descriptions,
     driver,
+    environments,
     json_reader,
     metrics_files,
-    policy_file,
     run_folder,
+    run_options,
 )
 from gasil_jax.host.driver import Callback, FitProgress
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.members import make_members
+from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import Progress
+from gasil_jax.sweeps import run_results
 from gasil_jax.train import TrainState
 
 __all__ = ["FitProgress", "FitResult", "fit"]
 
-_DESCRIPTION = "fit.json"
 _COUNT = Range(1, whole=True)
 
 
@@ -72,9 +74,12 @@ def fit(
       env: one environment.
       algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
-      folder: folder of metrics.csv, evaluations.csv, checkpoints/ and, at the end,
-        policy.npz for `gasil_jax.load_policy`. It is created if it is missing; None
-        keeps nothing.
+      folder: folder for the files of a run, created if it is missing; None keeps
+        nothing. The commands take it like a run's. Only if the environment is not from
+        `gasil_jax.make_env`, if the seeds do not follow one another, or if a schedule
+        or a model of rewards is one that options can't name, it has a fit.json in place
+        of config.json: then `gasil_jax.load_policy` and ``python -m gasil_jax.plot``
+        take it, but no command that needs the environment.
       resume: continue the training in the folder from its newest checkpoint. Of the
         seeds, the algorithm and the evaluations only `total_steps` may differ, and only
         grow. The environment, and schedules that are functions, are not compared. If
@@ -111,21 +116,21 @@ def fit(
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
     interruption = Interruption()
-    write_description: Callable[[], None] = lambda: None
+    record = None
     with contextlib.ExitStack() as stack:
         if folder is None:
             # Ctrl-C ends training at once, because there is nothing to save.
             path = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         else:
-            description = {
-                "seeds": tuple(members.seeds),
-                "evaluate_every": evaluate_every,
-                "evaluate_episodes": evaluate_episodes if evaluate_every else None,
-                **descriptions.describe(algorithm),
-                **run_folder.expert_hash(algorithm),
-            }
             path = pathlib.Path(folder)
-            write_description = stack.enter_context(_opened(path, description, resume))
+            record = _record(
+                members,
+                path,
+                checkpoint_every=checkpoint_every,
+                evaluate_every=evaluate_every,
+                evaluate_episodes=evaluate_episodes if evaluate_every else None,
+            )
+            stack.enter_context(_opened(path, record, resume))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
@@ -136,21 +141,21 @@ def fit(
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,
-            on_restored=write_description,
+            on_restored=(lambda: None) if record is None else record.write,
         )
-        metrics = _table(path / "metrics.csv", members.num_members)
-        if folder is not None:
-            final = metrics_files.final_returns(metrics["episode_return"])
-            policy_file.save(
-                path / "policy.npz", outcome.states, env, members.seeds, final
+        metrics, evaluations = run_results.read(path, members.num_members)
+        if record is not None:
+            run_results.write(
+                path,
+                record.env_name,
+                members=members,
+                outcome=outcome,
+                metrics=metrics,
+                evaluations=evaluations,
             )
         if outcome.unsaved is not None:
             raise outcome.unsaved
-        return FitResult(
-            outcome.states,
-            metrics,
-            _table(path / "evaluations.csv", members.num_members),
-        )
+        return FitResult(outcome.states, metrics, evaluations)
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:
@@ -174,67 +179,123 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     )
 
 
-@contextlib.contextmanager
-def _opened(
-    folder: pathlib.Path, description: Mapping[str, Any], resume: bool
-) -> Iterator[Callable[[], None]]:
-    """Create and lock a folder of `fit`, and write fit.json if training begins.
+class _Record(NamedTuple):
+    """How a folder says what is trained in it.
 
-    Yields a function that writes fit.json, to call when training continues.
+    Attributes:
+      env_name: name of the environment.
+      path: config.json, or fit.json if no command can train the same.
+      now: every field by its own name.
+      read: returns the fields that the file has.
+      write: writes the file.
+    """
+
+    env_name: str
+    path: pathlib.Path
+    now: Mapping[str, Any]
+    read: Callable[[], Mapping[str, Any]]
+    write: Callable[[], None]
+
+
+def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record:
+    """Return the record of a training.
+
+    Args:
+      members: the seeds.
+      folder: the folder.
+      **arguments: the options of a run that are arguments of `fit`.
+
+    Raises:
+      ValueError: if the expert's data can't be read.
+    """
+    env, algorithm = members.env, members.algorithm
+    try:
+        options = _options(members, **arguments)
+    except (ValueError, TypeError) as error:
+        path, name = folder / run_folder.FIT, type(getattr(env, "unwrapped", env))
+        described = {
+            "why_no_run": str(error),
+            "env": name.__name__,
+            "seeds": tuple(members.seeds),
+            **arguments,
+            **descriptions.describe(algorithm),
+            **run_folder.expert_hash(algorithm),
+        }
+        # JSON has no functions.
+        now = {x: "a function" if callable(y) else y for x, y in described.items()}
+        return _Record(
+            name.__name__,
+            path,
+            now,
+            read=lambda: json_reader.read(path, dict[str, Any]),
+            write=lambda: metrics_files.write_json(path, now),
+        )
+    return _Record(
+        options.env,
+        folder / run_folder.CONFIG,
+        run_folder.flat(run_options.description(options)),
+        read=lambda: run_folder.read(folder),
+        write=lambda: run_options.write_config(options, folder),
+    )
+
+
+def _options(members: Members, **arguments: Any) -> run_options.Options:
+    """Return the options with which a command trains the same.
+
+    Raises:
+      TypeError: if a setting has no JSON form; or
+      ValueError: if the environment, the seeds or a part of the algorithm are not what
+        options can name.
+    """
+    made_with = environments.made_with(members.env)
+    if made_with is None:
+        raise ValueError("the environment is not one that gasil_jax.make_env returned")
+    seeds = list(members.seeds)
+    if seeds != list(range(seeds[0], seeds[0] + len(seeds))):
+        raise ValueError("the seeds do not follow one another")
+    algorithm = members.algorithm
+    stored = metrics_files.to_json(descriptions.describe(algorithm))
+    if descriptions.read(json.loads(stored)) != algorithm:
+        raise ValueError("the algorithm has other models of rewards")
+    name, settings = made_with
+    return run_options.Options(
+        env=name,
+        settings=settings,
+        seeds=len(seeds),
+        first_seed=seeds[0],
+        **arguments,
+        **run_options.algorithm_options(algorithm),
+    )
+
+
+@contextlib.contextmanager
+def _opened(folder: pathlib.Path, record: _Record, resume: bool) -> Iterator[None]:
+    """Create and lock a folder of `fit`, and write its record if training begins.
 
     Raises:
       ValueError: if the folder can't be written, is in use, or holds other files.
     """
-    path = folder / _DESCRIPTION
     with contextlib.ExitStack() as stack:
         run_folder.create(folder, option="folder")
         stack.enter_context(run_folder.lock(folder, option="folder"))
-        # JSON has no functions.
-        now = {x: "a function" if callable(y) else y for x, y in description.items()}
-        write = lambda: metrics_files.write_json(path, now)
-        if not path.is_file():
+        if not record.path.is_file():
             run_folder.refuse_used(folder, option="folder")
-            write()
+            record.write()
         elif not resume:
             raise ValueError(
                 f"folder is {folder}, where training has begun: give resume=True or "
                 "another folder"
             )
         else:
-            before = _read_description(path)
-            if changes := run_folder.differences(before, now):
+            before = record.read()
+            if changes := run_folder.differences(before, record.now):
                 raise ValueError(
                     f"resume continues with {folder}, where {'; '.join(changes)}: "
                     "only total_steps may differ, and grow"
                 )
-            run_folder.refuse_other_expert(before, now, folder)
+            run_folder.refuse_other_expert(before, record.now, folder)
         try:
-            yield write
+            yield
         except Interrupted as interrupted:
             interrupted.add_note("continue with the same arguments and resume=True")
             raise
-
-
-def _read_description(path: pathlib.Path) -> dict[str, Any]:
-    """Return the content of fit.json.
-
-    Raises:
-      ValueError: if it is damaged, or does not say how the policies were evaluated.
-    """
-    description = json_reader.read(path, dict[str, Any])
-    # Older versions did not write these two, even if they evaluated policies.
-    names = ("evaluate_every", "evaluate_episodes")
-    missing = [name for name in names if name not in description]
-    if missing and path.with_name("evaluations.csv").exists():
-        raise ValueError(
-            f"{path} is of an older version: add {' and '.join(missing)}, the numbers "
-            "that its policies were evaluated with"
-        )
-    return dict.fromkeys(missing) | description
-
-
-def _table(path: pathlib.Path, num_members: int) -> dict[str, np.ndarray]:
-    """Return the columns of a table, (seeds, rows) each; empty if it has no rows."""
-    if not path.exists() or not path.stat().st_size:
-        return {}
-    return metrics_files.read_metrics(path, ("seed",), num_members)

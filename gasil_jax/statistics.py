@@ -5,14 +5,18 @@ hyperparameter explains.
 """
 
 import numbers
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
+#: Fewer seeds tell too little for an interval.
+FEWEST_SEEDS = 5
 #: Fewer points of a sweep tell nothing of a hyperparameter's importance.
 _FEWEST_POINTS = 8
 _MOST_GROUPS = 8
+#: With fewer points a hyperparameter's importance is uncertain.
+FEW_POINTS = 32
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -53,6 +57,51 @@ def bootstrap_interval(
     )
     low, high = np.percentile(means, [2.5, 97.5], axis=0)
     return low.reshape(scores.shape[1:]), high.reshape(scores.shape[1:])
+
+
+class Estimate(NamedTuple):
+    """What seeds tell of a score.
+
+    Attributes:
+      interquartile_mean: the mean of the middle half; None if no score is known.
+      interval: the ends of its 95% bootstrap interval; None for fewer than five seeds.
+    """
+
+    interquartile_mean: float | None
+    interval: tuple[float, float] | None
+
+    def __str__(self) -> str:
+        if self.interquartile_mean is None:
+            return "unknown"
+        middle = f"{self.interquartile_mean:.1f}"
+        if self.interval is None:
+            return middle
+        low, high = self.interval
+        return f"{middle} [{low:.1f}, {high:.1f}]"
+
+
+def estimate(scores: np.ndarray) -> Estimate:
+    """Return what seeds' scores tell, (seeds,); those that are NaN do not count."""
+    known = scores[np.isfinite(scores)]
+    if not known.size:
+        return Estimate(None, None)
+    interval = None
+    if known.size >= FEWEST_SEEDS:
+        low, high = bootstrap_interval(known)
+        interval = (float(low), float(high))
+    return Estimate(float(interquartile_mean(known)), interval)
+
+
+def in_words(scores: Mapping[str, np.ndarray]) -> str:
+    """Return estimates of the same seeds' scores, (seeds,) each, as a line to print."""
+    estimates = {name: estimate(values) for name, values in scores.items()}
+    shown = ", ".join(f"{name} {value}" for name, value in estimates.items())
+    (count,) = {len(values) for values in scores.values()}
+    if count == 1:
+        return f"{shown} (1 seed)"
+    has_interval = any(x.interval is not None for x in estimates.values())
+    interval = " [95% interval]" if has_interval else ""
+    return f"{shown} (interquartile mean{interval} over {count} seeds)"
 
 
 def performance_profile(scores: np.ndarray, levels: np.ndarray) -> np.ndarray:
