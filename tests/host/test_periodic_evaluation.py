@@ -121,7 +121,7 @@ def test_the_scores_are_those_of_evaluate(evaluated):
             env,
             algorithm,
             gasil_jax.member(states, index),
-            evaluation_key(seed, ITERATIONS),
+            key=evaluation_key(seed, ITERATIONS),
             num_episodes=EPISODES,
         )
         returns = np.asarray(scores["episode_return"])
