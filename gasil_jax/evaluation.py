@@ -97,8 +97,10 @@ def run_episodes(
         running = running & ~ended & sound
         return (states, running, return_, length), None
 
+    states = jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes))
     start = (
-        jax.vmap(env.reset)(jax.random.split(reset_key, num_episodes)),
+        # As in training, no episode ends with its reset.
+        states.replace(done=jnp.zeros_like(states.done)),
         jnp.ones(num_episodes, bool),
         jnp.zeros(num_episodes),
         jnp.zeros(num_episodes, jnp.int32),

@@ -41,9 +41,9 @@ def load_policy(
 ) -> Callable[..., jax.Array]:
     """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
 
-    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action). It
-    clips actions to their range. Without a key the action is the policy's mean; with a
-    key it is drawn from the policy. The key is consumed.
+    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
+    float32. It clips actions to their range. Without a key the action is the policy's
+    mean; with a key it is drawn from the policy. The key is consumed.
 
     Args:
       path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
@@ -71,13 +71,16 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
 
 def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
     """Return the policy with these arrays, as `load_policy` does for a file."""
-    arrays = jax.tree.map(jnp.asarray, dict(weights))
+    float32 = lambda x: jnp.asarray(x, jnp.float32)
+    arrays = jax.tree.map(float32, dict(weights))
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
+        observation = float32(observation)
         action, log_std = numpy_policy.mean_and_log_std(arrays, observation, jnp)
         if key is not None:
-            action += jnp.exp(log_std) * jax.random.normal(key, action.shape)
+            noise = jax.random.normal(key, action.shape, action.dtype)
+            action += jnp.exp(log_std) * noise
         return jnp.clip(action, arrays["low"], arrays["high"])
 
     return policy

@@ -157,6 +157,10 @@ def _is_whole(value: Any, low: int, high: int) -> bool:
 
 def check(name: str, settings: Settings) -> None:
     """Raise `ValueError` if `make` would refuse the arguments; builds nothing."""
+    if jax.config.read("jax_enable_x64"):
+        raise ValueError(
+            "jax_enable_x64 is True: environments are in float32, unset it"
+        )
     _constructor(name)
     if ":" in name:
         for field in ("physics", "solver", "integrator"):

@@ -60,7 +60,8 @@ def _refuse_taken(state: State, *names: str) -> None:
 class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
-    If `terminal` is true, an episode that ends there counts as terminated.
+    If `terminal` is true, an episode that ends there counts as terminated. No episode
+    ends with its reset, whatever the environment's says.
 
     Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
     limit and not the environment ended the episode, or where the environment sets it).
@@ -81,7 +82,7 @@ class EpisodeLimit(Wrapper):
         state = self.env.reset(rng)
         _refuse_taken(state, "steps")
         info = {**state.info, "steps": jnp.int32(0), "truncation": jnp.float32(0)}
-        return state.replace(info=info)
+        return state.replace(done=jnp.zeros_like(state.done), info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
         """Step, and set ``done`` and ``truncation`` at the limit."""

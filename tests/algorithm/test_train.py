@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import gasil_jax
+from gasil_envs.gymnax_adapter import GymnaxEnv
 from gasil_jax import learner, rollout
 from gasil_jax import train as training
 
@@ -187,6 +188,12 @@ def test_double_precision_is_refused():
             gasil_jax.make_train(env, PPO_GASIL)
         with pytest.raises(ValueError, match="jax_enable_x64 is True"):
             gasil_jax.init(env, PPO_GASIL, jax.random.key(0))
+        for make in (gasil_jax.make_env, GymnaxEnv):
+            with pytest.raises(ValueError, match="jax_enable_x64 is True: environm"):
+                make("point_mass")
+        policy = gasil_jax.load_policy("zoo:walker2d-delayed")
+        for key in (None, jax.random.key(0)):
+            assert policy(np.zeros(17), key).dtype == np.float32
 
 
 def test_a_loop_of_ones_own_begins_with_settings_that_are_allowed():

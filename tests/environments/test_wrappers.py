@@ -8,6 +8,7 @@ from brax.envs import Env, State
 
 import gasil_envs
 from gasil_envs import wrappers
+from gasil_jax.evaluation import run_episodes
 
 
 class Scripted(Env):
@@ -55,6 +56,27 @@ def test_delayed_reward_loses_nothing(delay, terminates, limit):
         expected[last] = true[first : last + 1].sum()
     np.testing.assert_array_equal(states.reward, expected)
     assert states.done[-1] == 1.0 and not states.done[:-1].any()
+
+
+class DoneFromTheStart(Scripted):
+    """Says that it has ended in its reset, and leaves that as it is."""
+
+    def reset(self, rng):
+        return super().reset(rng).replace(done=jnp.float32(1))
+
+    def step(self, state, action):
+        return super().step(state, action).replace(done=state.done)
+
+
+@pytest.mark.parametrize("limited", [False, True])
+def test_no_episode_ends_with_its_reset(limited):
+    env = DoneFromTheStart(100)
+    if limited:
+        env = wrappers.EpisodeLimit(env, 100)
+        assert not roll(env, 7)[1].done.any()
+    act = lambda observation, key: jnp.zeros((len(observation), 1))
+    scores = run_episodes(env, act, jax.random.key(0), num_episodes=2, num_steps=7)
+    np.testing.assert_array_equal(scores["episode_length"], [7, 7])
 
 
 class WithTrueReward(Scripted):
