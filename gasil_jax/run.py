@@ -1,6 +1,7 @@
 """Train an agent: ``python -m gasil_jax.run --env walker2d --seeds 10``."""
 
 import pathlib
+import shlex
 import sys
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import statistics
-from gasil_jax.host import command_line, driver, run_folder
+from gasil_jax.host import command_line, driver, environments, run_folder
 from gasil_jax.host.members import Members
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_options import (
@@ -68,6 +69,15 @@ def train(
     return summary
 
 
+def _print_next(env: Any, folder: pathlib.Path) -> None:
+    """Print the commands that are of use for a new run, as a line for the shell."""
+    quoted = shlex.quote(str(folder))
+    commands = [f"evaluate {quoted}", f"plot {quoted}"]
+    if environments.is_locomotion(env) or environments.is_point_mass(env):
+        commands.append(f"render {quoted} --out episode.gif")
+    print("next:", "; ".join(f"python -m gasil_jax.{x}" for x in commands))
+
+
 @command_line.reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
@@ -88,6 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"{statistics.in_words(scores)}, {summary['env_steps_per_second']:,.0f} "
         f"steps/s on {summary['device']}, in {folder}"
     )
+    _print_next(env, folder)
     if summary["unhealthy_seeds"]:
         print(
             f"warning: numbers that were not finite in seeds "

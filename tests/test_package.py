@@ -97,7 +97,7 @@ def test_the_wheel_alone_trains(tmp_path):
     )
     assert result.returncode == 0, result.stderr
     # Nothing that is imported prints.
-    (line,) = result.stdout.splitlines()
-    assert line.startswith("final return")
+    line, following = result.stdout.splitlines()
+    assert line.startswith("final return") and following.startswith("next: ")
     assert all(x.startswith(("point_mass", "note")) for x in result.stderr.splitlines())
     assert (tmp_path / "run" / "policy.npz").is_file()

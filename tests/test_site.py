@@ -106,6 +106,21 @@ def test_links_lead_somewhere(site, pages):
                 assert fragment in pages[file].ids, (path, link)
 
 
+def test_a_copied_command_has_no_prompt(site):
+    """The button marks the code, and takes what is then visible."""
+    rule = ".highlight code[data-md-copying] :is(.gp, .go) {\n  display: none;"
+    assert rule in (site / "code.css").read_text()
+    page = (site / "running" / "index.html").read_text()
+    assert "code.css" in page
+    blocks = re.findall(r'<code><span class="gp">.*?</code>', page, re.DOTALL)
+    assert len(blocks) == (DOCS / "running.md").read_text().count("```console") > 3
+    for block in blocks:
+        hidden = re.sub(r'<span class="g[po]">.*?</span>', "", block)
+        text = re.sub(r"<[^>]*>", "", hidden)
+        assert re.search(r"^python -m gasil_jax", text, re.MULTILINE)
+        assert not re.search(r"^\$", text, re.MULTILINE), text
+
+
 def test_formulas_are_rendered(site, pages):
     for path, page in pages.items():
         found = re.search(r"\\[(\[]|\\[a-z]{2,}|\$\$", page.text)

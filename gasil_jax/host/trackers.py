@@ -8,15 +8,18 @@ member. Steps are environment steps per member.
 
 import contextlib
 import importlib
+import netrc
 import os
 import pathlib
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from gasil_jax.errors import InputError
+from gasil_jax.host import command_line
 
 
 class Tracker(Protocol):
@@ -50,9 +53,10 @@ class _WeightsAndBiases:
         import wandb
 
         # A continued run is the same run in Weights & Biases, even with more steps.
-        # WANDB_MODE=offline needs no account.
         try:
             self._run = wandb.init(
+                # By itself it would ask for a key while the run begins.
+                mode="offline" if _lacks_key() else None,
                 project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
                 name=name,
                 dir=str(folder),
@@ -72,6 +76,20 @@ class _WeightsAndBiases:
 
     def close(self) -> None:
         self._run.finish()
+
+
+def _lacks_key() -> bool:
+    """Return whether Weights & Biases would ask for an API key, so as to go online."""
+    if "WANDB_MODE" in os.environ or "WANDB_API_KEY" in os.environ:
+        return False
+    server = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")
+    # `wandb login` keeps the key here.
+    path = os.environ.get("NETRC") or os.path.expanduser("~/.netrc")
+    try:
+        login = netrc.netrc(path).authenticators(urlsplit(server).hostname or "")
+    except (OSError, netrc.NetrcParseError):
+        return True
+    return login is None
 
 
 def _identifier(path: pathlib.Path) -> str:
@@ -96,7 +114,10 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise `ValueError` for a tracker that is unknown or not installed."""
+    """Raise `ValueError` for a tracker that is unknown or not installed.
+
+    A note says if Weights & Biases will be offline.
+    """
     for name in names:
         if name not in TRACKERS:
             allowed = ", ".join(TRACKERS)
@@ -109,6 +130,11 @@ def check(names: Sequence[str]) -> None:
                 f"log is {name!r}: it needs the package {package} "
                 f'(pip install "gasil_jax[{name}]")'
             ) from None
+    if "wandb" in names and _lacks_key():
+        command_line.note(
+            "log is 'wandb' and there is no API key: the run is kept in its folder, "
+            "for `wandb sync` (`wandb login` beforehand logs online)"
+        )
 
 
 def make(

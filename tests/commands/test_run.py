@@ -87,10 +87,14 @@ def test_the_help_is_in_groups_by_topic(monkeypatch, capsys):
 def test_a_run_from_end_to_end(finished):
     result, out = finished
     assert "compiling" in result.stderr and "steps/s" in result.stderr
-    assert len(result.stdout.splitlines()) == 1
+    final, following = result.stdout.splitlines()
     assert re.match(
         r"final return -?\d+\.\d \(interquartile mean over 3 seeds\), [\d,]+ steps/s",
-        result.stdout,
+        final,
+    )
+    assert following == (
+        "next: python -m gasil_jax.evaluate out; python -m gasil_jax.plot out; "
+        "python -m gasil_jax.render out --out episode.gif"
     )
 
     config = json.loads((out / "config.json").read_text())

@@ -3,6 +3,7 @@
 import contextlib
 import sys
 import time
+import types
 
 import numpy as np
 import pytest
@@ -130,6 +131,36 @@ def test_runs_have_the_names_of_their_folders(tmp_path, monkeypatch):
     assert second == "beta-2-of-2-1"
     (tmp_path / "beta" / "shards" / "2-of-2").rename(tmp_path / "moved")
     assert first_made(monkeypatch, sweep, "--resume", "--out", "moved")[0] == "moved-1"
+
+
+def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, capsys):
+    """A stand-in tells how it was started; other files and settings are a user's."""
+    modes = []
+    wandb = types.ModuleType("wandb")
+    wandb.init = lambda **settings: modes.append(settings["mode"])
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL", "NETRC"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+
+    def started():
+        trackers.check(["wandb"])
+        trackers.make(["wandb"], tmp_path, run_name="alpha-2", config={})
+        return modes.pop(), capsys.readouterr().err
+
+    mode, printed = started()
+    assert mode == "offline" and "no API key" in printed
+    assert len(printed.splitlines()) == 1
+    for name, value in (("WANDB_API_KEY", "key"), ("WANDB_MODE", "online")):
+        with monkeypatch.context() as patch:
+            patch.setenv(name, value)
+            assert started() == (None, "")
+    login = "machine api.wandb.ai\n  login user\n  password key\n"
+    (tmp_path / ".netrc").write_text(login)
+    assert started() == (None, "")
+    # The key is of another server.
+    monkeypatch.setenv("WANDB_BASE_URL", "https://wandb.example.org")
+    assert started()[0] == "offline"
 
 
 def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
