@@ -212,10 +212,11 @@ def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record
     try:
         options = _options(members, **arguments)
     except (ValueError, TypeError) as error:
-        path, name = folder / run_folder.FIT, type(getattr(env, "unwrapped", env))
+        path = folder / run_folder.FIT
+        env_name = type(getattr(env, "unwrapped", env)).__name__
         described = {
             "why_no_run": str(error),
-            "env": name.__name__,
+            "env": env_name,
             "seeds": tuple(members.seeds),
             **arguments,
             **descriptions.describe(algorithm),
@@ -224,7 +225,7 @@ def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record
         # JSON has no functions.
         now = {x: "a function" if callable(y) else y for x, y in described.items()}
         return _Record(
-            name.__name__,
+            env_name,
             path,
             now,
             read=lambda: json_reader.read(path, dict[str, Any]),
@@ -243,9 +244,9 @@ def _options(members: Members, **arguments: Any) -> run_options.Options:
     """Return the options with which a command trains the same.
 
     Raises:
-      TypeError: if a setting has no JSON form; or
-      ValueError: if the environment, the seeds or a part of the algorithm are not what
-        options can name.
+      TypeError: if a setting has no JSON form.
+      ValueError: if options can't name the environment, the seeds or a part of the
+        algorithm.
     """
     made_with = environments.made_with(members.env)
     if made_with is None:
@@ -256,7 +257,7 @@ def _options(members: Members, **arguments: Any) -> run_options.Options:
     algorithm = members.algorithm
     stored = metrics_files.to_json(descriptions.describe(algorithm))
     if descriptions.read(json.loads(stored)) != algorithm:
-        raise ValueError("the algorithm has other models of rewards")
+        raise ValueError("options can't name the agent or the models of rewards")
     name, settings = made_with
     return run_options.Options(
         env=name,

@@ -194,7 +194,7 @@ def test_its_folder_is_a_runs_folder(env, commanded, tmp_path, capsys):
         ),
         (
             {"algorithm": dataclasses.replace(PPO, rewards=(Normalize(), Decompose()))},
-            "the algorithm has other models of rewards",
+            "options can't name the agent or the models of rewards",
         ),
     ],
 )
