@@ -15,6 +15,9 @@ from gasil_jax.algorithms import Algorithm
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
 _BATCHES_PER_PROGRAM = 8
+# Memory of a gradient step, or of a network's pass over a batch, in outputs of its
+# layers. XLA reports 1.9 to 3.1, and twice that with a penalty on the gradient.
+_OUTPUTS_PER_STEP = 2.5
 # Memory of an evaluated episode, in states of its environment. XLA reports 7 (point
 # mass) and 25 (hopper).
 _STATES_PER_EPISODE = 7
@@ -53,8 +56,11 @@ def need(env: Any, algorithm: Algorithm) -> Need:
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + env.action_size + 12
     batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
-    # The agent's state may be large, and is copied if it is not donated.
-    memory = _size(state) + _size(state.agent) + batches
+    steps = _gradient_steps(env, algorithm)
+    # What is learned may be large, and is copied if it is not donated. Gradient steps
+    # come after the batch's other uses, and one after the other.
+    learned = _size(state.agent) + _size(state.actor_critic)
+    memory = _size(state) + learned + max(batches, *steps.values())
     episodes = (state.environments, state.history, state.rewards)
     parts = {
         f"batches, with batch_steps {config.batch_steps}": batches,
@@ -62,9 +68,34 @@ def need(env: Any, algorithm: Algorithm) -> Need:
         f"the state of agent {algorithm.agent.name!r}{_of_buffer(algorithm)}": (
             2 * _size(state.agent)
         ),
-        "networks": _size(state.actor_critic),
+        "networks": 2 * _size(state.actor_critic),
+        **steps,
     }
     return Need(_size(state), memory, max(parts, key=lambda part: parts[part]))
+
+
+def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
+    """Return the bytes of each kind of gradient step, by the sizes in words.
+
+    These are the drawn steps and the outputs of a network's layers, also in a pass over
+    the whole batch.
+    """
+    settings, steps = algorithm.settings, {}
+    inputs = env.observation_size + env.action_size
+    for name, minibatch_size in settings.items():
+        # An agent of the user's may have one that is None.
+        if name.endswith("minibatch_size") and minibatch_size:
+            widths = name.replace("minibatch_size", "hidden_sizes")
+            widths = widths if widths in settings else "hidden_sizes"
+            sizes = {name: minibatch_size, "batch_steps": settings["batch_steps"]}
+            largest = max(sizes, key=lambda size: sizes[size])
+            rows = sizes[largest]
+            outputs = _OUTPUTS_PER_STEP * 4 * rows * (inputs + sum(settings[widths]))
+            if name.startswith("discriminator"):
+                outputs *= 1 + bool(settings.get("discriminator_gradient_penalty"))
+            words = f"{largest} {rows} and {widths} {settings[widths]}"
+            steps[f"outputs of layers, with {words}"] = int(outputs)
+    return steps
 
 
 def _of_buffer(algorithm: Algorithm) -> str:

@@ -21,6 +21,9 @@ from gasil_jax.host.members import make_members
             marks=pytest.mark.compiled_as_for_users,
         ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
+        ("ppo+sil", {"sil_minibatch_size": 50_000}),
+        ("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
+        ("ppo", {"hidden_sizes": (1500, 1500)}),
     ],
 )
 def test_the_estimate_is_within_a_factor_of_two(agent, changes):
@@ -66,11 +69,28 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
             *("ppo+bc", {"buffer_steps": 10**8}),
             "the state of agent 'ppo+bc', with buffer_steps 100000000",
         ),
-        ("ppo", {"batch_steps": 2**24}, "batches, with batch_steps 16777216"),
+        ("ppo", {"batch_steps": 2**24}, "outputs of layers, with batch_steps 16777216"),
+        (
+            *("ppo", {"batch_steps": 2**24, "hidden_sizes": (8,)}),
+            "batches, with batch_steps 16777216",
+        ),
         (
             *("ppo+sil", {"sil_buffer_steps": 10**8}),
             "the state of agent 'ppo+sil', with sil_buffer_steps 100000000",
         ),
+        (
+            *("ppo+sil", {"sil_minibatch_size": 10**9}),
+            "outputs of layers, with sil_minibatch_size 1000000000 and hidden_sizes (",
+        ),
+        (
+            *("ppo+gasil", {"discriminator_minibatch_size": 10**9}),
+            "outputs of layers, with discriminator_minibatch_size 1000000000 and disc",
+        ),
+        (
+            *("ppo", {"hidden_sizes": (10**6,)}),
+            "outputs of layers, with batch_steps 2048 and hidden_sizes (1000000,)",
+        ),
+        ("ppo", {"hidden_sizes": (10**5, 10**5)}, "networks"),
     ],
 )
 def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
