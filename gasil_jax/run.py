@@ -55,14 +55,9 @@ def train(
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
         members, outcome = finished[0]
-        metrics, evaluations = run_results.read(folder, options.seeds)
+        tables = run_results.read(folder, options.seeds)
         summary = run_results.write(
-            folder,
-            options.env,
-            members=members,
-            outcome=outcome,
-            metrics=metrics,
-            evaluations=evaluations,
+            folder, options.env, members=members, outcome=outcome, tables=tables
         )
     if outcome.unsaved is not None:
         raise outcome.unsaved

@@ -63,7 +63,7 @@ class Estimate(NamedTuple):
     """What seeds tell of a score.
 
     Attributes:
-      interquartile_mean: the mean of the middle half; None if no score is known.
+      interquartile_mean: the mean of the middle half; None if no score is finite.
       interval: the ends of its 95% bootstrap interval; None for fewer than five seeds.
     """
 
@@ -82,14 +82,14 @@ class Estimate(NamedTuple):
 
 def estimate(scores: np.ndarray) -> Estimate:
     """Return what seeds' scores tell, (seeds,); those that are NaN do not count."""
-    known = scores[np.isfinite(scores)]
-    if not known.size:
+    finite = scores[np.isfinite(scores)]
+    if not finite.size:
         return Estimate(None, None)
     interval = None
-    if known.size >= FEWEST_SEEDS:
-        low, high = bootstrap_interval(known)
+    if finite.size >= FEWEST_SEEDS:
+        low, high = bootstrap_interval(finite)
         interval = (float(low), float(high))
-    return Estimate(float(interquartile_mean(known)), interval)
+    return Estimate(float(interquartile_mean(finite)), interval)
 
 
 def in_words(scores: Mapping[str, np.ndarray]) -> str:

@@ -168,9 +168,9 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
 
 def _key_impl(key: Any) -> Any:
     """Return the implementation of random keys, which may be `ShapeDtypeStruct`."""
-    found = []
-    jax.eval_shape(lambda x: found.append(jax.random.key_impl(x)), key)
-    return found[0]
+    implementations = []
+    jax.eval_shape(lambda x: implementations.append(jax.random.key_impl(x)), key)
+    return implementations[0]
 
 
 class Checkpoint(NamedTuple):

@@ -120,10 +120,6 @@ class Options:
         return Algorithm(self.own, tuple(rewards), self.config)
 
 
-#: The fields of `Options` that describe the algorithm.
-_OF_ALGORITHM = ("agent", "config", "own", "decompose", "normalize")
-
-
 def algorithm_options(algorithm: Algorithm) -> dict[str, Any]:
     """Return the fields of `Options` that describe an algorithm."""
     models = {type(model): model for model in algorithm.rewards}
@@ -141,8 +137,8 @@ def algorithm_options(algorithm: Algorithm) -> dict[str, Any]:
 def description(options: Options) -> dict[str, Any]:
     """Return options as config.json has them: the algorithm, and all other fields."""
     algorithm = options.algorithm
-    left_out = {*_OF_ALGORITHM, *(model.switch for model in REWARD_MODELS)}
-    fields = [f.name for f in dataclasses.fields(options) if f.name not in left_out]
+    of_algorithm = algorithm_options(algorithm)
+    fields = [f.name for f in dataclasses.fields(options) if f.name not in of_algorithm]
     with command_line.input_checked():
         return {
             **{name: getattr(options, name) for name in fields},

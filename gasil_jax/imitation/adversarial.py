@@ -286,6 +286,28 @@ class AdversarialAgent(Agent):
         return learner.select(ready, trained, discriminator), metrics
 
 
+class ShapedRewardAgent(AdversarialAgent):
+    """An agent whose bonus is added to the environment's reward, or replaces it.
+
+    Attributes:
+      alpha: scale of the discriminator's reward (paper, section 4.3).
+      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
+        pairs. On Humanoid the paper's alpha is 0 for 2M steps and then rises to its
+        full value at 3M. That is 2e6 0 3e6 1 on the command line and
+        ((2e6, 0), (3e6, 1)) in Python.
+    """
+
+    alpha: float = number(0.1, 0.0)
+    alpha_schedule: Schedule = schedule()
+
+    def shape(self, context: Context, bonus: jax.Array) -> tuple[jax.Array, Metrics]:
+        """Return the rewards that PPO maximizes, (time, env), and metrics."""
+        shaped = self.alpha * bonus
+        metrics = {"bonus": jnp.mean(shaped), "bonus_deviation": jnp.std(shaped)}
+        reward = context.rollout.reward
+        return (reward + shaped if self.uses_reward else shaped), metrics
+
+
 class SelfImitation(struct.PyTreeNode):
     """The discriminator and what it learns from.
 
@@ -317,21 +339,10 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
         )
 
 
-class PPOGASIL(SelfImitatingAgent):
-    """PPO on r - alpha log D (section 4.3).
-
-    Attributes:
-      alpha: scale of the discriminator's reward (paper, section 4.3).
-      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
-        pairs. On Humanoid the paper's alpha is 0 for 2M steps and then rises to its
-        full value at 3M. That is 2e6 0 3e6 1 on the command line and
-        ((2e6, 0), (3e6, 1)) in Python.
-    """
+class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
+    """PPO on r - alpha log D (section 4.3)."""
 
     name = "ppo+gasil"
-
-    alpha: float = number(0.1, 0.0)
-    alpha_schedule: Schedule = schedule()
 
     def init(self, key: jax.Array, sizes: Sizes) -> SelfImitation:
         """Return an untrained discriminator and an empty buffer."""
@@ -347,7 +358,7 @@ class PPOGASIL(SelfImitatingAgent):
         discriminator, bonus, metrics = self.update_and_score(
             state.discriminator, self.source(buffer), context, key
         )
-        reward, shaped = _shaped(self, context, bonus)
+        reward, shaped = self.shape(context, bonus)
         state = state.replace(discriminator=discriminator)
         return state, reward, {**metrics, **shaped, **self.buffer_metrics(buffer)}
 
@@ -359,13 +370,10 @@ class GASIL(PPOGASIL):
     uses_reward = False
 
 
-class GAIL(AdversarialAgent):
+class GAIL(ShapedRewardAgent):
     """PPO on -alpha log D alone, with D against expert trajectories (section 3.2).
 
     Attributes:
-      alpha: scale of the discriminator's reward (paper, section 4.3).
-      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
-        pairs.
       expert: expert that GAIL imitates: minari:NAME for a Minari data set, or an .npz
         file with the arrays "observation" and "action".
     """
@@ -373,8 +381,6 @@ class GAIL(AdversarialAgent):
     name = "gail"
     uses_reward = False
 
-    alpha: float = number(0.1, 0.0)
-    alpha_schedule: Schedule = schedule()
     expert: str | None = text()
 
     def check(self, sizes: Sizes) -> None:
@@ -398,15 +404,5 @@ class GAIL(AdversarialAgent):
 
         source = Source(sample, jnp.bool_(True))
         state, bonus, metrics = self.update_and_score(state, source, context, key)
-        reward, shaped = _shaped(self, context, bonus)
+        reward, shaped = self.shape(context, bonus)
         return state, reward, {**metrics, **shaped}
-
-
-def _shaped(
-    agent: PPOGASIL | GAIL, context: Context, bonus: jax.Array
-) -> tuple[jax.Array, Metrics]:
-    """Return the rewards that PPO maximizes, (time, env), and metrics of the bonus."""
-    shaped = agent.alpha * bonus
-    metrics = {"bonus": jnp.mean(shaped), "bonus_deviation": jnp.std(shaped)}
-    reward = context.rollout.reward
-    return (reward + shaped if agent.uses_reward else shaped), metrics

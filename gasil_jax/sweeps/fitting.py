@@ -143,19 +143,14 @@ def fit(
             callback=callback,
             on_restored=(lambda: None) if record is None else record.write,
         )
-        metrics, evaluations = run_results.read(path, members.num_members)
+        tables = run_results.read(path, members.num_members)
         if record is not None:
             run_results.write(
-                path,
-                record.env_name,
-                members=members,
-                outcome=outcome,
-                metrics=metrics,
-                evaluations=evaluations,
+                path, record.env_name, members=members, outcome=outcome, tables=tables
             )
         if outcome.unsaved is not None:
             raise outcome.unsaved
-        return FitResult(outcome.states, metrics, evaluations)
+        return FitResult(outcome.states, *tables)
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:

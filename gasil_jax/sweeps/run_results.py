@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NotRequired, TypedDict
+from typing import Any, NamedTuple, NotRequired, TypedDict
 
 import numpy as np
 
@@ -12,13 +12,19 @@ from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
 
-_Columns = dict[str, np.ndarray]
 
-
-def read(folder: pathlib.Path, num_seeds: int) -> tuple[_Columns, _Columns]:
-    """Return the columns of metrics.csv and evaluations.csv, (seeds, rows) each.
+class Tables(NamedTuple):
+    """The columns of metrics.csv and evaluations.csv, (seeds, rows) each.
 
     Those of evaluations.csv are none if nothing was evaluated.
+    """
+
+    metrics: dict[str, np.ndarray]
+    evaluations: dict[str, np.ndarray]
+
+
+def read(folder: pathlib.Path, num_seeds: int) -> Tables:
+    """Return the tables of a run.
 
     Raises:
       InputError: if a table is damaged.
@@ -30,7 +36,7 @@ def read(folder: pathlib.Path, num_seeds: int) -> tuple[_Columns, _Columns]:
     metrics = table(folder / "metrics.csv", required)
     path = folder / "evaluations.csv"
     evaluated = path.exists() and path.stat().st_size > 0
-    return metrics, table(path, ("mean",)) if evaluated else {}
+    return Tables(metrics, table(path, ("mean",)) if evaluated else {})
 
 
 def write(
@@ -39,8 +45,7 @@ def write(
     *,
     members: Members,
     outcome: Outcome,
-    metrics: Mapping[str, np.ndarray],
-    evaluations: Mapping[str, np.ndarray],
+    tables: Tables,
 ) -> dict[str, Any]:
     """Write policy.npz, learning_curve.png and summary.json; return the summary.
 
@@ -49,9 +54,9 @@ def write(
       env_name: name of the environment.
       members: the run's seeds.
       outcome: the result of their training.
-      metrics: their metrics, from `read`.
-      evaluations: their evaluations, from `read`.
+      tables: their tables, from `read`.
     """
+    metrics, evaluations = tables
     seeds, agent = members.seeds, members.algorithm.agent.name
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
     final = metrics_files.final_returns(returns)

@@ -193,25 +193,8 @@ def test_vmapped_insertion_equals_one_by_one():
 
 
 def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
-    history = good_trajectories.init_history(
-        1, 2, 2, observation_size=1, action_size=1, keep_next=True
-    )
-    assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
-    for first in (0.0, 2.0, 4.0):
-        observation = first + jnp.arange(2.0)[:, None, None]
-        zeros = jnp.zeros((2, 1))
-        history = good_trajectories.record(
-            history,
-            observation,
-            zeros[..., None],
-            reward=zeros,
-            ended=zeros > 0,
-            next_observation=observation + 1,
-        )
-    assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
-    assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
-    history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
-    history = good_trajectories.record(
+    zeros = jnp.zeros((2, 1))
+    record = lambda history, observation: good_trajectories.record(
         history,
         observation,
         zeros[..., None],
@@ -219,4 +202,14 @@ def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
         ended=zeros > 0,
         next_observation=observation + 1,
     )
-    assert history.next_observation is None
+    history = good_trajectories.init_history(
+        1, 2, 2, observation_size=1, action_size=1, keep_next=True
+    )
+    assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
+    for first in (0.0, 2.0, 4.0):
+        observation = first + jnp.arange(2.0)[:, None, None]
+        history = record(history, observation)
+    assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
+    assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
+    history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
+    assert record(history, observation).next_observation is None
