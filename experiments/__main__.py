@@ -24,11 +24,12 @@ from experiments.curves import Curve, Figure
 from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import PaperSearch, coverage
-from experiments.store import RESULTS, ResultsFolder, Run, Store
+from experiments.store import RESULTS, ResultsFolder, Store
 from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
+from gasil_jax.sweeps.runs import Run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -149,8 +150,8 @@ def _train(name: str, options: Options) -> None:
         else:
             engine.train_missing(missing, stored, setup)
     if options.list:
-        for program in engine.programs(missing, setup):
-            print(f"  {program}")
+        for each in engine.unfinished(missing, setup):
+            print(f"  {engine.title(each.program)}")
         return
     if published and not options.quick:
         # Other pages may have some of the same runs.

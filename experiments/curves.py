@@ -7,10 +7,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.search import DELAY, PAPERS, Point, Search
-from experiments.store import Run, Store
+from experiments.store import Store
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.host.environments import Settings
 from gasil_jax.imitation import AGENTS
+from gasil_jax.sweeps.runs import Run
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.
 Terms = tuple[tuple[float, str, str], ...]
@@ -85,16 +87,13 @@ class Curve:
                 self.env, self.agent, self.base, reward_delay=self.reward_delay
             )
         algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
+        settings = Settings(
+            reward_delay=self.reward_delay,
+            obs_noise=self.obs_noise,
+            terminal_limits=self.terminal_limits,
+        )
         return tuple(
-            Run(
-                self.env,
-                algorithm,
-                seed,
-                self.reward_delay,
-                self.obs_noise,
-                terminal_limits=self.terminal_limits,
-            )
-            for seed in range(self.seeds)
+            Run(self.env, algorithm, seed, settings) for seed in range(self.seeds)
         )
 
 

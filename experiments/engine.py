@@ -1,15 +1,12 @@
 """Train the runs that are missing in a store, and add them to it.
 
-Runs with the same environment and static settings are members of one compiled program.
-A program is trained in a scratch folder whose name is a hash of all its settings, so a
-folder never mixes two programs. Interrupted training is only continued if
-`Setup.resume` is set.
+Runs with the same environment and static settings are members of one compiled program,
+which is trained in a scratch folder as a program of a sweep is in its own. Interrupted
+training is only continued if `Setup.resume` is set.
 """
 
 import dataclasses
 import functools
-import hashlib
-import itertools
 import json
 import math
 import multiprocessing
@@ -25,13 +22,13 @@ import jax
 import numpy as np
 
 from experiments.search import FINALIST_SEEDS
-from experiments.store import Record, Run, Store, run_of
-from gasil_jax.algorithms import Algorithm
+from experiments.store import Record, Store
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
-from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.sweeps import assembly, shards
+from gasil_jax.sweeps import assembly, programs, shards
+from gasil_jax.sweeps.programs import Program, ProgramFolder
+from gasil_jax.sweeps.runs import Run
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -40,10 +37,8 @@ _WRITTEN = (
     *("experiments/results", "README.md", "gasil_jax/tuned_presets.json"),
     *("gasil_jax/zoo", "docs/zoo.md"),
 )
-#: The file of a scratch folder that lists the runs in training there.
-_RUNS = "runs.json"
-#: The columns of metrics.csv that identify the members of a program.
-_LABELS = ("member", "seed")
+#: The file of a scratch folder that says how each session trained.
+_SESSIONS = "provenance.json"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,66 +95,57 @@ def source(commit: str | None) -> dict[str, Any]:
     return {"commit": git("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
 
 
-@dataclasses.dataclass(frozen=True)
-class Program:
-    """The runs that one compiled program trains.
-
-    Attributes:
-      runs: the members, which differ only in hyperparameters and seeds.
-      setup: how they are trained.
-    """
-
-    runs: tuple[Run, ...]
-    setup: Setup
-
-    @property
-    def evaluate_episodes(self) -> int:
-        """The number of episodes of each evaluation."""
-        return 0 if _is_of_search(self.runs[0]) else self.setup.evaluate_episodes
-
-    @property
-    def folder(self) -> pathlib.Path:
-        """The program's scratch folder."""
-        # Physics and evaluations are not in a run's key, but checkpoints and tables
-        # depend on them.
-        names = [self.setup.physics, str(self.evaluate_episodes)]
-        text = " ".join([*names, *(run.key for run in self.runs)])
-        return self.setup.runs / hashlib.sha256(text.encode()).hexdigest()[:16]
-
-    def __str__(self) -> str:
-        run, count = self.runs[0], len(self.runs)
-        config = run.algorithm.config
-        words = [f"{run.env} {run.algorithm.agent.name}"]
-        words += [f"{config.num_envs} environments"]
-        words += [f"delayed {run.reward_delay}"] if run.reward_delay > 1 else []
-        words += [] if config.stagger_episodes else ["in step"]
-        words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
-        return ", ".join(words)
+def title(program: Program) -> str:
+    """Return a short description of a program's runs."""
+    run, count = program.runs[0], len(program.runs)
+    config, delay = run.algorithm.config, run.settings.reward_delay
+    words = [f"{run.env} {run.algorithm.agent.name}"]
+    words += [f"{config.num_envs} environments"]
+    words += [f"delayed {delay}"] if delay > 1 else []
+    words += [] if config.stagger_episodes else ["in step"]
+    words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
+    return ", ".join(words)
 
 
 def _is_of_search(run: Run) -> bool:
     return run.seed in FINALIST_SEEDS
 
 
-def programs(runs: Iterable[Run], setup: Setup) -> list[Program]:
-    """Group runs into as few programs as possible, of at most `setup.members`."""
-    groups: dict[tuple[Run, bool], list[Run]] = {}
-    for run in runs:
-        # Numbers that are traced may differ within a program.
-        agent = type(run.algorithm.agent)
-        models = tuple(type(model)() for model in run.algorithm.rewards)
-        numbers = Algorithm(agent(), models).hyperparameters
-        shared = dataclasses.replace(
-            run, algorithm=run.algorithm.replace(**numbers), seed=0
+def _scratch(setup: Setup) -> pathlib.Path:
+    """Return the folder of the programs in training.
+
+    Physics and evaluations are not in a run's key, but checkpoints and tables depend on
+    them.
+    """
+    return setup.runs / f"{setup.physics}-{setup.evaluate_episodes}"
+
+
+def unfinished(missing: Sequence[Run], setup: Setup) -> list[ProgramFolder]:
+    """Return the programs to train: those that have begun, then the most important.
+
+    Args:
+      missing: the runs that are not stored, the most important first.
+      setup: how they are trained.
+
+    Raises:
+      InputError: if a program.json in the scratch folder is damaged.
+    """
+    rank = {run: rank for rank, run in enumerate(missing)}
+    # The order in which runs are missing does not change a program.
+    ordered = sorted(rank, key=lambda run: run.key)
+    # Runs of a search are not evaluated, so they have programs of their own.
+    every = [
+        each
+        for of_search in (True, False)
+        for each in programs.unfinished(
+            [run for run in ordered if _is_of_search(run) == of_search],
+            _scratch(setup),
+            labels=_labels,
+            most=setup.members,
         )
-        groups.setdefault((shared, _is_of_search(run)), []).append(run)
-    parts = []
-    for group in groups.values():
-        ordered = sorted(group, key=lambda run: run.key)
-        count = math.ceil(len(ordered) / (setup.members or len(ordered)))
-        cuts = [len(ordered) * part // count for part in range(count + 1)]
-        parts += [tuple(ordered[a:b]) for a, b in itertools.pairwise(cuts)]
-    return [Program(part, setup) for part in parts]
+    ]
+    order = lambda x: (not x.path.exists(), min(rank.get(r, 0) for r in x.program.runs))
+    return sorted(every, key=order)
 
 
 def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
@@ -170,7 +156,7 @@ def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
     return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
 
 
-def train(program: Program) -> dict[Run, Record]:
+def train(stored: ProgramFolder, setup: Setup) -> dict[Run, Record]:
     """Train a program, or continue its training.
 
     Raises:
@@ -178,60 +164,52 @@ def train(program: Program) -> dict[Run, Record]:
         trains it.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
-    run, setup, folder = program.runs[0], program.setup, program.folder
-    episodes = program.evaluate_episodes or None
-    algorithm, total_steps = run.algorithm, run.algorithm.config.total_steps
-    settings = Settings(
-        reward_delay=run.reward_delay,
-        obs_noise=run.obs_noise,
-        physics=setup.physics,
-        integrator=run.integrator,
-        terminal_limits=run.terminal_limits,
-    )
+    program = stored.program
+    run = program.runs[0]
+    episodes = None if _is_of_search(run) else setup.evaluate_episodes or None
+    total_steps = run.algorithm.config.total_steps
     options = run_options.Options(
         env=run.env,
-        out=folder,
+        out=stored.path,
         keep_checkpoints=1,
         evaluate_every=episodes and math.ceil(total_steps / EVALUATIONS),
         evaluate_episodes=episodes,
         devices=setup.devices,
-        settings=settings,
-        **run_options.algorithm_options(algorithm),
+        settings=dataclasses.replace(run.settings, physics=setup.physics),
+        **run_options.algorithm_options(run.algorithm),
     )
-    seeds = tuple(run.seed for run in program.runs)
-    numbers = tuple(run.algorithm.hyperparameters for run in program.runs)
-    members = shards.Program(0, algorithm, tuple(enumerate(seeds)), numbers)
-    labels = dict(zip(_LABELS, (range(len(seeds)), seeds), strict=True))
-    env = assembly.prepare(options, [members], [members])
-    read = lambda name: metrics_files.read_metrics(folder / name, _LABELS, len(seeds))
-    with run_folder.lock(run_folder.create(folder)):
-        runs = [{"experiment": x.experiment, "seed": x.seed} for x in program.runs]
-        metrics_files.write_json(folder / _RUNS, {"runs": runs})
-        provenance = _provenance(program)
-        try:
-            assembly.train(
-                options,
-                env,
-                [assembly.Job(members, folder, labels, folder.name)],
-                title=str(program),
-                on_finished=lambda job, batch, outcome: None,
-            )
-        except Interrupted as interrupted:
-            interrupted.add_note("continue with: the same command and --resume")
-            raise
-        metrics = read("metrics.csv")
-        evaluations = read("evaluations.csv") if episodes else {}
-    of = lambda table, member: {name: values[member] for name, values in table.items()}
+    env = assembly.prepare(options, [program], [stored.path])
+    job = assembly.Job(stored, stored.path.name)
+    _add_session(stored, setup)
+    try:
+        assembly.train_in_folders(options, env, [job], title=title(program))
+    except Interrupted as interrupted:
+        interrupted.add_note("continue with: the same command and --resume")
+        raise
+    return records(stored)
+
+
+def records(stored: ProgramFolder) -> dict[Run, Record]:
+    """Return the records of a program that is trained to its end."""
+    metrics, evaluations = stored.tables()
+    provenance = _provenance(stored)
     return {
-        run: record(of(metrics, member), of(evaluations, member), provenance)
-        for member, run in enumerate(program.runs)
+        run: record(own, scores, provenance)
+        for run, own, scores in zip(
+            stored.program.runs, metrics, evaluations or [{}] * len(metrics)
+        )
     }
 
 
-def _provenance(program: Program) -> dict[str, Any]:
-    """Return how a program is trained, over all sessions of interrupted training."""
-    setup, path = program.setup, program.folder / "provenance.json"
-    devices = jax.devices()[: len(program.runs)]
+def _labels(program: Program) -> dict[str, Sequence[int]]:
+    """Return the columns of metrics.csv that identify a program's members."""
+    return {"member": range(len(program.runs)), "seed": program.seeds}
+
+
+def _add_session(stored: ProgramFolder, setup: Setup) -> None:
+    """Add to a program's provenance.json how it is trained in this process."""
+    path = run_folder.create(stored.path) / _SESSIONS
+    devices = jax.devices()[: len(stored.program.runs)]
     now = {
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
@@ -240,15 +218,19 @@ def _provenance(program: Program) -> dict[str, Any]:
     }
     sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
     if now not in sessions:
-        sessions.append(now)
-        metrics_files.write_json(path, {"sessions": sessions})
+        metrics_files.write_json(path, {"sessions": [*sessions, now]})
+
+
+def _provenance(stored: ProgramFolder) -> dict[str, Any]:
+    """Return how a program was trained, over all sessions of interrupted training."""
+    sessions = json.loads((stored.path / _SESSIONS).read_text())["sessions"]
     every = lambda name: ", then ".join(
         dict.fromkeys(str(session[name]) for session in sessions if session[name])
     )
     # False if any session had a changed checkout; otherwise None if any is unknown.
     clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
     commit = every("commit") or None
-    return {**now, "device": every("device"), "commit": commit, "clean": clean}
+    return {**sessions[-1], "device": every("device"), "commit": commit, "clean": clean}
 
 
 def record(
@@ -282,60 +264,40 @@ def record(
     )
 
 
-def begun(missing: Iterable[Run], setup: Setup) -> list[Program]:
-    """Return the programs in the scratch folder that train any of the missing runs.
-
-    They may also have runs that have been stored since.
-
-    Raises:
-      InputError: if a folder's list of runs can't be read.
-    """
-    requested = frozenset(missing)
-    return [
-        program
-        for path in sorted(setup.runs.glob(f"*/{_RUNS}"))
-        # A program with another physics or evaluations has another folder.
-        if (program := _listed(path, setup)).folder == path.parent
-        and not requested.isdisjoint(program.runs)
-    ]
-
-
-def _listed(path: pathlib.Path, setup: Setup) -> Program:
-    """Return the program of the runs that a file lists."""
-    try:
-        listed = json.loads(path.read_text())["runs"]
-        return Program(tuple(run_of(**fields) for fields in listed), setup)
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{path} is not a list of runs: {error}") from None
-
-
-def _requested(missing: Sequence[Run], setup: Setup) -> list[Program]:
-    """Return the programs that train the missing runs, those in training first.
+def _requested(
+    missing: Sequence[Run], store: Store, setup: Setup
+) -> list[ProgramFolder]:
+    """Return the programs that train the missing runs; store those that are trained.
 
     Raises:
       InputError: if the scratch folder holds training of these runs and `Setup.resume`
         is not set.
     """
-    unfinished = begun(missing, setup)
-    continued = {run for program in unfinished for run in program.runs}
-    others = [run for run in missing if run not in continued]
-    requested = [*unfinished, *programs(others, setup)]
-    used = [x.folder.name for x in requested if any(x.folder.glob("[!.]*"))]
+    asked = set(missing)
+    begun = programs.read(_scratch(setup))
+    used = [x for x in begun if not asked.isdisjoint(x.program.runs)]
     if used and not setup.resume:
         raise InputError(
             f"runs is {setup.runs}, which holds training of these runs in "
-            f"{', '.join(used)}: continue it with --resume, or name another folder"
+            f"{', '.join(x.path.name for x in used)}: continue it with --resume, or "
+            "name another folder"
         )
-    return requested
+    for each in used:
+        # It was stopped before its runs were stored.
+        if each.training:
+            store.add(records(each))
+    return unfinished(missing, setup)
 
 
-def _train_on_core(program: Program, store: pathlib.Path, core: int) -> None:
+def _train_on_core(
+    program: ProgramFolder, setup: Setup, store: pathlib.Path, *, core: int
+) -> None:
     """Train a program on one core; what this process prints goes to a log file."""
     os.sched_setaffinity(0, {core})
-    with open(f"{program.folder}.log", "a") as log:
+    with open(f"{program.path}.log", "a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
-        Store(store).add(train(program))
+        Store(store).add(train(program, setup))
 
 
 def train_in_processes(
@@ -360,7 +322,7 @@ def train_in_processes(
             f"processes is {setup.processes}: it must be at most the number of cores, "
             f"{len(cores)}"
         )
-    setup.runs.mkdir(parents=True, exist_ok=True)
+    _scratch(setup).mkdir(parents=True, exist_ok=True)
     spawn = multiprocessing.get_context("spawn")
     free = cores[: setup.processes]
     failed: list[Program] = []
@@ -369,13 +331,15 @@ def train_in_processes(
         begun_here = [*failed, *(program for _, program, _ in running.values())]
         not_waiting = {run for program in begun_here for run in program.runs}
         waiting = [run for run in missing() if run not in not_waiting]
-        for program in _requested(waiting, setup)[: len(free)]:
+        for stored in _requested(waiting, store, setup)[: len(free)]:
             core = free.pop()
             process = spawn.Process(
-                target=_train_on_core, args=(program, store.folder, core)
+                target=_train_on_core,
+                args=(stored, setup, store.folder),
+                kwargs={"core": core},
             )
             process.start()
-            running[process.sentinel] = process, program, core
+            running[process.sentinel] = process, stored.program, core
         if not running:
             break
         for sentinel in multiprocessing.connection.wait(list(running)):
@@ -383,9 +347,10 @@ def train_in_processes(
             process.join()
             free.append(core)
             failed += [program] if process.exitcode else []
-            print(f"{'failed' if process.exitcode else 'done'}: {program}", flush=True)
+            outcome = "failed" if process.exitcode else "done"
+            print(f"{outcome}: {title(program)}", flush=True)
     if failed:
-        logs = ", ".join(f"{program.folder}.log" for program in failed)
+        logs = ", ".join(f"{_scratch(setup) / x.name}.log" for x in failed)
         raise InputError(f"the training of {len(failed)} programs failed: see {logs}")
 
 
@@ -397,7 +362,7 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
         is not set.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
-    for program in _requested(missing, setup):
+    for stored in _requested(missing, store, setup):
         # Another process may have added them since.
-        if Store(store.folder).missing(program.runs):
-            store.add(train(program))
+        if Store(store.folder).missing(stored.program.runs):
+            store.add(train(stored, setup))

@@ -41,11 +41,12 @@ from experiments.search import (
     importance,
     mean_ranks,
 )
-from experiments.store import Record, Run, Store
+from experiments.store import Record, Store
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 from gasil_jax.statistics import interquartile_mean
+from gasil_jax.sweeps.runs import Run
 
 NOTES = pathlib.Path(__file__).parent / "notes"
 #: Mean returns that others have published, after about 1M steps, with their sources.

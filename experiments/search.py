@@ -19,9 +19,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.store import Run, Store
+from experiments.store import Store
 from gasil_jax import statistics
 from gasil_jax.algorithms import Algorithm, algorithm
+from gasil_jax.host.environments import Settings
+from gasil_jax.sweeps.runs import Run
 
 Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
@@ -168,12 +170,9 @@ class Search:
         self, points: Iterable[Point], seeds: Iterable[int] = SEEDS
     ) -> list[list[Run]]:
         """Return the runs of points, a list for each."""
-        seeds = tuple(seeds)
+        seeds, settings = tuple(seeds), Settings(reward_delay=self.reward_delay)
         return [
-            [
-                Run(self.env, self.algorithm(x), seed, self.reward_delay)
-                for seed in seeds
-            ]
+            [Run(self.env, self.algorithm(x), seed, settings) for seed in seeds]
             for x in points
         ]
 

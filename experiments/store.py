@@ -6,8 +6,6 @@ trained.
 """
 
 import dataclasses
-import functools
-import hashlib
 import json
 import pathlib
 from collections.abc import Iterable, Mapping
@@ -17,15 +15,9 @@ import numpy as np
 import tyro
 
 from gasil_jax import npz
-from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import ranges
 from gasil_jax.errors import InputError
-from gasil_jax.host import descriptions, output_file, run_folder
-
-#: Raise this by hand when a change makes the same settings give different numbers, by
-#: more than rounding. All earlier runs then count as missing. Runs of version 1 had
-#: their environments in step, and were converted from an earlier format of results.
-ALGORITHM_VERSION = 2
+from gasil_jax.host import output_file, run_folder
+from gasil_jax.sweeps.runs import Run, read_run
 
 _NONE = np.empty(0)
 RESULTS = pathlib.Path(__file__).parent / "results"
@@ -34,62 +26,6 @@ ResultsFolder = Annotated[
     pathlib.Path,
     tyro.conf.arg(help_behavior_hint="(default: experiments/results of the checkout)"),
 ]
-
-
-@dataclasses.dataclass(frozen=True)
-class Run:
-    """The settings that decide the numbers of one training run.
-
-    The physics engine (mjx or mujoco) and the device are not among them, because they
-    compute the same thing in different ways. A record says which were used.
-    """
-
-    env: str
-    algorithm: Algorithm
-    seed: int
-    reward_delay: int = 1
-    obs_noise: float = 0.0
-    integrator: str = "model"
-    terminal_limits: bool = False
-    algorithm_version: int = ALGORITHM_VERSION
-
-    @functools.cached_property
-    def experiment(self) -> str:
-        """All settings but the seed as JSON, which the runs of a curve share."""
-        values = descriptions.describe(self.algorithm)
-        for name, value in values.items():
-            if callable(value):
-                raise InputError(f"{name} is a function: a stored run needs points")
-            if name.endswith("_schedule"):
-                values[name] = [[float(x) for x in point] for point in value]
-        # 1 and 1.0 are the same number, and so the same run.
-        for part in self.algorithm.parts:
-            for name, allowed in ranges(part).items():
-                if values[name] is not None:
-                    values[name] = (int if allowed.whole else float)(values[name])
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        fields |= {"algorithm": values, "obs_noise": float(self.obs_noise)}
-        del fields["seed"]
-        return json.dumps(fields, sort_keys=True)
-
-    @functools.cached_property
-    def key(self) -> str:
-        """A hash of all settings, which identifies the run."""
-        text = f"{self.experiment} {self.seed}"
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
-
-
-def _experiment(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a `Run`'s fields without its seed.
-
-    Settings that are newer than the stored run have their defaults.
-    """
-    return {**fields, "algorithm": descriptions.read(fields["algorithm"])}
-
-
-def run_of(experiment: str, seed: int) -> Run:
-    """Return the run whose `Run.experiment` and seed these are."""
-    return Run(seed=seed, **_experiment(json.loads(experiment)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,9 +97,9 @@ def _rounded(name: str, values: np.ndarray) -> np.ndarray:
 
 def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     """Write a file of runs; its bytes do not depend on the order of the runs."""
-    runs = sorted(records, key=lambda run: (run.experiment, run.seed))
-    provenance = {x: json.dumps(records[x].provenance, sort_keys=True) for x in runs}
-    experiments = sorted({run.experiment for run in runs})
+    ordered = sorted(records, key=lambda run: (run.experiment, run.seed))
+    provenance = {x: json.dumps(records[x].provenance, sort_keys=True) for x in ordered}
+    experiments = sorted({run.experiment for run in ordered})
     provenances = sorted(set(provenance.values()))
     index = {
         "experiments": list(map(json.loads, experiments)),
@@ -171,13 +107,13 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     }
     arrays = {
         "index": np.array(json.dumps(index, sort_keys=True)),
-        "experiment": np.array([experiments.index(run.experiment) for run in runs]),
-        "provenance": np.array([provenances.index(provenance[run]) for run in runs]),
-        "seed": np.array([run.seed for run in runs], np.uint32),
+        "experiment": np.array([experiments.index(run.experiment) for run in ordered]),
+        "provenance": np.array([provenances.index(provenance[run]) for run in ordered]),
+        "seed": np.array([run.seed for run in ordered], np.uint32),
     }
     for lengths, names in _TABLES.items():
         for name in names:
-            columns = [getattr(records[run], name) for run in runs]
+            columns = [getattr(records[run], name) for run in ordered]
             arrays[lengths] = np.array(list(map(len, columns)))
             arrays[name] = _rounded(name, np.concatenate(columns))
     with output_file.atomic(path) as partial:
@@ -194,14 +130,16 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
     try:
         arrays = npz.read(path)
         index = json.loads(str(arrays["index"]))
-        experiments = list(map(_experiment, index["experiments"]))
+        # A file has thousands of runs of some hundred experiments.
+        experiments = [read_run(fields, 0) for fields in index["experiments"]]
         columns = {
             name: np.split(arrays[name].astype(float), np.cumsum(arrays[lengths])[:-1])
             for lengths, names in _TABLES.items()
             for name in names
         }
         for i, seed in enumerate(arrays["seed"]):
-            run = Run(seed=int(seed), **experiments[arrays["experiment"][i]])
+            experiment = experiments[arrays["experiment"][i]]
+            run = dataclasses.replace(experiment, seed=int(seed))
             provenance = index["provenances"][arrays["provenance"][i]]
             values = {name: column[i] for name, column in columns.items()}
             records[run] = Record(provenance=provenance, **values)

@@ -1,7 +1,8 @@
-"""Merge the shards of a sweep: ``python -m gasil_jax.merge OUT``.
+"""Unite sweeps, or parts of one: ``python -m gasil_jax.merge A B --out OUT``.
 
-Writes the same files as a sweep without shards: config.json, results.csv, curves.npz,
-summary.json and the plots. The shards are only read.
+Parts of a sweep that were trained in different folders, sweeps of other points, and
+sweeps of other seeds become one: its folder holds all programs and the tables, and it
+can be continued. The folders are only read.
 """
 
 import dataclasses
@@ -13,18 +14,18 @@ from typing import Annotated
 import tyro
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, run_folder
-from gasil_jax.sweeps import merging, shards, tables
+from gasil_jax.host import command_line
+from gasil_jax.sweeps import merging, tables
 
 
 @dataclasses.dataclass(frozen=True)
 class Options:
-    """Merge the shards of a sweep.
+    """Unite sweeps that differ in points and seeds alone, and write their tables.
 
     Attributes:
-      folders: the folder of the sweep, which holds shards/; or the folders of all its
-        shards, which may have been copied elsewhere.
-      out: folder to write the tables to; default the folder of the sweep.
+      folders: the folders of the sweeps, which may be trained in part each.
+      out: folder of the united sweep, created if it is missing; default the one folder
+        that is named, whose tables are written anew.
     """
 
     folders: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
@@ -36,22 +37,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     options = command_line.parse(Options, arguments, "gasil_jax.merge")
     if not options.folders:
-        raise InputError(
-            "folders is empty: name the sweep's folder, or those of all its shards"
-        )
+        raise InputError("folders is empty: name those of the sweeps")
     out = options.out
     if out is None:
         if len(options.folders) > 1:
             raise InputError("out is missing: several folders need --out")
         out = options.folders[0]
-        if not shards.root(out).is_dir():
-            raise InputError(
-                f"folder is {out}, which holds no shards: name the sweep's folder, or "
-                "the folders of all its shards and --out"
-            )
-    summary = merging.merge(options.folders, out)
-    points = run_folder.read(out)["points"]
-    print(*tables.report(points, summary), f"in {out}", sep="\n")
+    plan, summary = merging.merge(options.folders, out)
+    print(*tables.report(plan.points, summary), f"in {out}", sep="\n")
     return 0
 
 

@@ -22,8 +22,9 @@ from gasil_jax.host.run_options import (
     seeds_of,
     write_config,
 )
-from gasil_jax.sweeps import assembly, run_results, shards
-from gasil_jax.sweeps.shards import Program
+from gasil_jax.sweeps import assembly, run_results
+from gasil_jax.sweeps.programs import Program, ProgramFolder
+from gasil_jax.sweeps.runs import Run
 
 
 def train(
@@ -42,7 +43,8 @@ def train(
         write()
     title = f"{options.env} {options.agent}"
     labels = {"seed": seeds_of(options)}
-    job = assembly.Job(program, folder, labels, folder.absolute().name)
+    stored = ProgramFolder(program, folder, labels)
+    job = assembly.Job(stored, folder.absolute().name)
     finished: list[tuple[Members, driver.Outcome]] = []
     assembly.train(
         options,
@@ -79,11 +81,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
-    # A run is a sweep of one point, in one program.
-    programs = shards.programs(options.algorithm, [{}], seeds_of(options))
-    env = assembly.prepare(options, programs, programs)
+    # A run of many seeds is one program.
+    program = Program(
+        tuple(
+            Run(options.env, options.algorithm, seed, options.settings)
+            for seed in seeds_of(options)
+        )
+    )
+    env = assembly.prepare(options, [program], [options.out] if options.out else [])
     with open_folder(options, "gasil_jax.run") as folder:
-        summary = train(options, env, programs[0], folder)
+        summary = train(options, env, program, folder)
     scores = {
         name.replace("_", " "): np.array(list(summary[name].values()), float)
         for name in ("final_return", "final_evaluation")

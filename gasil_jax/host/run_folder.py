@@ -10,7 +10,7 @@ import pathlib
 import socket
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import IO, Any, NamedTuple, Required, TypedDict
 
 from gasil_jax import algorithms
@@ -51,7 +51,7 @@ def check(out: pathlib.Path, resume: bool) -> None:
     if out.is_dir():
         with lock(create(out)):
             if resume and has_run(out):
-                _refuse_without_checkpoints(out)
+                refuse_without_checkpoints(out)
             else:
                 refuse_used(out)
         return
@@ -65,15 +65,19 @@ def check(out: pathlib.Path, resume: bool) -> None:
         raise InputError(unwritable(out, error)) from None
 
 
-def _refuse_without_checkpoints(out: pathlib.Path) -> None:
-    """Raise `InputError` if training has ended and its checkpoints are gone."""
-    # A run has one metrics.csv, a sweep one for each program.
-    for folder in (path.parent for path in out.rglob("metrics.csv")):
-        if has_results(folder) and not any((folder / "checkpoints").glob("*")):
-            raise InputError(
-                f"out is {out}: training in {folder} has ended and its checkpoints are "
-                "gone, so that it can't continue: name another folder"
-            )
+def refuse_without_checkpoints(folder: pathlib.Path) -> None:
+    """Raise `InputError` if training has ended and its checkpoints are gone.
+
+    Args:
+      folder: folder of a run, or of a program of a sweep.
+    """
+    # A sweep has results too, but its checkpoints are in the folders of its programs.
+    trained = (folder / "metrics.csv").exists() and has_results(folder)
+    if trained and not any((folder / "checkpoints").glob("*")):
+        raise InputError(
+            f"out is {folder}: training in it has ended and its checkpoints are gone, "
+            "so that it can't continue: name another folder"
+        )
 
 
 def has_results(folder: pathlib.Path) -> bool:
@@ -286,8 +290,6 @@ def _why_no_run(folder: pathlib.Path) -> str:
             f"({read_fit(folder)['why_no_run']}): only gasil_jax.plot and "
             "gasil_jax.load_policy take it"
         )
-    if (folder / "shards").is_dir():
-        return f", which holds shards: first run python -m gasil_jax.merge {folder}"
     return f", which has no {CONFIG}: it must be the folder of a run"
 
 
@@ -304,8 +306,6 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}{_why_no_run(folder)}") from None
     try:
-        if "points" in description and "shard" not in description:
-            raise ValueError("shard is missing")
         algorithm = descriptions.read(description["algorithm"])
         algorithms.check(algorithm)
         check_seeds(description["seeds"], description["first_seed"])
@@ -360,20 +360,25 @@ _MAY_DIFFER = (
     "keep_checkpoints",
     "devices",
     "log",
-    # The points that the file lists are compared instead.
-    "points_file",
+    # A sweep may be divided in another way, and points may be added to it.
+    *("shard", "shards", "launcher", "grid", "random", "points_file", "points"),
     # `refuse_other_expert` compares its content, which may have moved.
     "expert",
     EXPERT_HASH,
 )
 
 
-def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
+def differences(
+    before: Mapping[str, Any],
+    now: Mapping[str, Any],
+    grows: Sequence[str] = ("total_steps",),
+) -> list[str]:
     """Return the fields in which a run must not differ from its continuation, but does.
 
     Args:
       before: description of the run, from `read`.
-      now: description of its continuation, whose "total_steps" may be larger.
+      now: description of its continuation.
+      grows: the fields that may be larger now.
 
     Returns:
       "NAME was A, is B" for each of these fields.
@@ -381,7 +386,7 @@ def differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> list[str]:
     changes, requested = [], flat(now)
     for name, old in flat(before).items():
         new = requested.get(name)
-        grown = name == "total_steps" and new is not None and new >= old
+        grown = name in grows and new is not None and new >= old
         if old != new and not grown and name not in _MAY_DIFFER:
             changes.append(f"{name} was {old}, is {new}")
     return changes

@@ -181,7 +181,7 @@ def parse(
         kind, arguments, program, default, why_not=default.algorithm.why_not
     )
     if resumed is not None:
-        _refuse_changes(options, default, resumed)
+        refuse_changes(options, resumed)
     elif options.agent != default.agent or options.preset != default.preset:
         # A value of a list, such as --grid, looks like a flag to the first reading.
         raise InputError("agent and preset must be given as --agent and --preset")
@@ -220,19 +220,19 @@ def _stored_options(kind: type[T], run: StoredRun) -> T:
     return kind(**{name: values[name] for name in names}, **of_algorithm)
 
 
-def _refuse_changes(options: Options, stored: Options, run: StoredRun) -> None:
+def refuse_changes(options: Options, run: StoredRun) -> None:
     """Raise `InputError` if a run is continued with other options than it has.
 
     Args:
       options: the options of the continuation.
-      stored: the options that the run was started with.
-      run: the run.
+      run: the stored run or sweep.
     """
-    of = lambda each: run_folder.flat(vars(each))
-    if changed := run_folder.differences(of(stored), of(options)):
+    before = run_folder.flat(vars(_stored_options(type(options), run)))
+    grows = ("total_steps", *(("seeds",) if "points" in run.description else ()))
+    if changed := run_folder.differences(before, run_folder.flat(vars(options)), grows):
         raise InputError(
-            f"resume continues the run in {run.folder}, where {'; '.join(changed)}: "
-            "only total_steps may change, and grow, and checkpoint_every, "
+            f"resume continues {run.folder}, where {'; '.join(changed)}: only "
+            f"{' and '.join(grows)} may change, and grow, and checkpoint_every, "
             "keep_checkpoints, devices and log"
         )
     now = run_folder.flat(description(options))
@@ -460,21 +460,33 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
         if options.resume and run_folder.has_run(folder):
             # Another process may have written to it since the options were parsed.
             run = StoredRun(folder, run_folder.read(folder))
-            _refuse_changes(options, _stored_options(type(options), run), run)
+            refuse_changes(options, run)
         else:
             run_folder.refuse_used(folder)
-        quoted = shlex.quote(str(folder))
-        how = f"continue with: python -m {program} --resume --out {quoted}"
-        try:
+        with told_how_to_continue(folder, program):
             yield folder
-        except Interrupted as interrupted:
-            interrupted.add_note(how)
+
+
+@contextlib.contextmanager
+def told_how_to_continue(folder: pathlib.Path, program: str) -> Iterator[None]:
+    """Add to a `WriteError` or `Interrupted` the command that continues a run.
+
+    Args:
+      folder: the run's folder.
+      program: name of the module that was started, and options if it needs any.
+    """
+    quoted = shlex.quote(str(folder))
+    how = f"continue with: python -m {program} --resume --out {quoted}"
+    try:
+        yield
+    except Interrupted as interrupted:
+        interrupted.add_note(how)
+        raise
+    except output_file.WriteError as error:
+        # A run that has results may be without checkpoints.
+        if not run_folder.has_run(folder) or run_folder.has_results(folder):
             raise
-        except output_file.WriteError as error:
-            # A run that has results may be without checkpoints.
-            if not run_folder.has_run(folder) or run_folder.has_results(folder):
-                raise
-            raise output_file.WriteError(f"{error}; {how}") from error
+        raise output_file.WriteError(f"{error}; {how}") from error
 
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:

@@ -3,9 +3,11 @@
 A run is a sweep of one point, whose only program has the run's own folder.
 """
 
+import contextlib
 import dataclasses
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import jax
@@ -31,36 +33,29 @@ from gasil_jax.host.run_options import (
     evaluation_schedule,
     make_env,
 )
-from gasil_jax.sweeps.shards import Program
+from gasil_jax.sweeps.programs import Program, ProgramFolder
 
 
 @dataclasses.dataclass(frozen=True)
 class Job:
-    """A program and the folder that it is trained in.
+    """A program to train.
 
     Attributes:
-      program: the program, with its algorithm and members.
-      folder: folder of its metrics.csv and checkpoints, created if it is missing.
-      labels: columns that identify the members in the tables, (members,) each.
+      stored: the program with the folder of its metrics.csv and checkpoints.
       name: name of the program's run in trackers.
-      finished: whether it is trained to its end, so that it is skipped.
     """
 
-    program: Program
-    folder: pathlib.Path
-    labels: Mapping[str, Sequence[Any]]
+    stored: ProgramFolder
     name: str
-    finished: bool = False
 
     @property
-    def env_steps(self) -> int:
-        """The number of environment steps over all members."""
-        config = self.program.algorithm.config
-        return config.num_iterations * config.batch_steps * len(self.program.members)
+    def program(self) -> Program:
+        """The program."""
+        return self.stored.program
 
 
 def prepare(
-    options: Options, programs: Sequence[Program], unfinished: Sequence[Program]
+    options: Options, programs: Sequence[Program], folders: Sequence[pathlib.Path] = ()
 ) -> Any:
     """Start the devices, check that everything fits, and return the environment.
 
@@ -68,24 +63,21 @@ def prepare(
 
     Args:
       options: options of the run or sweep.
-      programs: the programs; the members of each are trained at once.
-      unfinished: the programs whose checkpoints are still to be written.
+      programs: the programs to train; the runs of each are trained at once.
+      folders: their folders, where they have begun.
 
     Raises:
       InputError: if the programs do not fit the devices or the disk.
     """
-    num_members = sum(len(program.members) for program in programs)
+    num_members = sum(len(program.runs) for program in programs)
     devices.use_devices(options.settings, options.devices, num_members)
     env = make_env(options)
     schedule = evaluation_schedule(options)
     with announced(options.env, "starting the devices"):
         every = jax.devices()
-    out = options.out
-    # A run's checkpoints are in its own folder, a sweep's in those of its programs.
-    folders = [out, *(program.folder(out) for program in unfinished)] if out else []
     with command_line.input_checked():
         for program in programs:
-            count = len(program.members)
+            count = len(program.runs)
             resources.check_memory(env, program.algorithm, count, every)
             if schedule is not None:
                 resources.check_episodes(
@@ -97,8 +89,8 @@ def prepare(
                 )
         resources.check_disk(
             env,
-            [(program.algorithm, len(program.members)) for program in unfinished],
-            out or pathlib.Path("runs"),
+            [(program.algorithm, len(program.runs)) for program in programs],
+            options.out or pathlib.Path("runs"),
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,
             written=sum(map(resources.size_of_checkpoints, folders)),
@@ -131,26 +123,28 @@ def train(
     title: str,
     on_finished: Callable[[Job, Members, driver.Outcome], None],
     on_restored: Callable[[], None] = lambda: None,
+    opened: Callable[[Job], AbstractContextManager[Any]] = contextlib.nullcontext,
 ) -> None:
-    """Train the unfinished jobs, one after the other.
+    """Train programs, one after the other.
 
     Args:
       options: options of the run or sweep.
       env: one environment.
-      jobs: the jobs in order, including finished ones.
+      jobs: the programs with their folders, in order.
       title: title of the progress display.
-      on_finished: called when a job has been trained to its end.
-      on_restored: called for each job once its training can begin or continue without
-        an error.
+      on_finished: called when a program has been trained to its end.
+      on_restored: called for each program once its training can begin or continue
+        without an error.
+      opened: opens a program's folder for the time of its training.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      OSError: if a folder can no longer be written. If only a job's last checkpoint
+      OSError: if a folder can no longer be written. If only a program's last checkpoint
         can't, its outcome has the error.
-      ValueError: if a job to continue does not fit the options.
+      ValueError: if a program to continue does not fit the options.
     """
     schedule = CheckpointSchedule(options.checkpoint_every, options.keep_checkpoints)
-    num_members = sum(len(job.program.members) for job in jobs)
+    num_members = sum(len(job.program.runs) for job in jobs)
     total_steps = options.algorithm.config.total_steps * num_members
     kind = "seeds" if num_members == options.seeds else "members"
     steps_before = 0
@@ -159,28 +153,24 @@ def train(
         Progress(title, total_steps, num_members, members=kind) as progress,
     ):
         for job in jobs:
-            if not job.finished:
-                if interruption.signal is not None:
-                    raise Interrupted(interruption.signal)
-                job.folder.mkdir(parents=True, exist_ok=True)
+            if interruption.signal is not None:
+                raise Interrupted(interruption.signal)
+            program, folder = job.program, job.stored.path
+            with opened(job):
                 with progress.aside("starting the trackers"):
                     job_trackers = trackers.make(
                         options.log,
-                        job.folder,
+                        folder,
                         run_name=job.name,
-                        # The points of a program may change settings of the algorithm.
-                        config=described(options, job.program.algorithm),
+                        config=described(options, _shared(program, options)),
                     )
                 members = make_members(
-                    env,
-                    job.program.algorithm,
-                    [seed for _, seed in job.program.members],
-                    job.program.hyperparameters,
+                    env, program.algorithm, program.seeds, program.hyperparameters
                 )
                 outcome = driver.drive(
                     members,
-                    job.folder,
-                    job.labels,
+                    folder,
+                    job.stored.labels,
                     schedule=schedule,
                     evaluation_schedule=evaluation_schedule(options),
                     progress=progress,
@@ -190,4 +180,47 @@ def train(
                     on_restored=on_restored,
                 )
                 on_finished(job, members, outcome)
-            steps_before += job.env_steps
+            steps_before += program.env_steps
+
+
+def _shared(program: Program, options: Options) -> Algorithm:
+    """Return a program's algorithm with the traced numbers of the options."""
+    return program.algorithm.replace(**options.algorithm.hyperparameters)
+
+
+def train_in_folders(
+    options: Options,
+    env: Any,
+    jobs: Sequence[Job],
+    *,
+    title: str,
+    on_restored: Callable[[], None] = lambda: None,
+) -> None:
+    """Train programs as `train` does, each in a folder that says what is in it.
+
+    Raises:
+      InputError: if another process trains one of them.
+    """
+
+    def finish(job: Job, members: Members, outcome: driver.Outcome) -> None:
+        if outcome.unsaved is not None:
+            # Its policies are nowhere else, so it is not finished.
+            raise outcome.unsaved
+        job.stored.finish(
+            env_steps=outcome.new_steps,
+            compile_seconds=outcome.compile_seconds,
+            train_seconds=outcome.train_seconds,
+            evaluation_seconds=outcome.evaluation_seconds,
+            device=members.device_kind,
+            device_count=len(members.devices),
+        )
+
+    train(
+        options,
+        env,
+        jobs,
+        title=title,
+        on_finished=finish,
+        on_restored=on_restored,
+        opened=lambda job: job.stored.opened(),
+    )

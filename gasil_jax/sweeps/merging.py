@@ -1,137 +1,87 @@
-"""Merge the shards of a sweep: read the shards and write the tables of the sweep."""
+"""Unite sweeps: copy the programs of several folders into one, and write its tables."""
 
 import pathlib
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Sequence
 from typing import Any
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.sweeps import shards, tables
-from gasil_jax.sweeps.trained_programs import TrainedPrograms
+from gasil_jax.sweeps import tables
+from gasil_jax.sweeps.plan import Plan, programs_of, stored_plan
+
+_ADDED = ("points", "seeds", "first_seed")
 
 
-def _shard_folders(folder: pathlib.Path) -> list[pathlib.Path]:
-    """Return the folders of the shards in a folder, or the folder if it is a shard."""
-    inside = shards.root(folder)
-    paths = sorted(inside.iterdir()) if inside.is_dir() else [folder]
-    shard_folders = [path for path in paths if run_folder.has_run(path)]
-    if not shard_folders:
-        raise InputError(f"folder is {folder}: it must hold shards or be one")
-    return shard_folders
+def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> tuple[Plan, Any]:
+    """Write the tables of all runs of some sweeps; return their plan and the summary.
 
-
-def _comparable(description: Mapping[str, Any]) -> dict[str, Any]:
-    return {name: x for name, x in description.items() if name != "shard"}
-
-
-def refuse_different(first: StoredRun, other: StoredRun) -> None:
-    """Raise `InputError` if two shards are of different sweeps or experts."""
-    before, now = _comparable(first.description), _comparable(other.description)
-    # total_steps may not grow here.
-    changed = run_folder.differences(before, now)
-    changed = changed or run_folder.differences(now, before)
-    if changed:
-        raise InputError(
-            f"{other.folder} is of another sweep than {first.folder}: "
-            f"{'; '.join(changed)}"
-        )
-    fields = run_folder.flat(other.description)
-    run_folder.refuse_other_expert(first.description, fields, first.folder)
-
-
-def _read(folder: pathlib.Path) -> StoredRun:
-    description = run_folder.read(folder)
-    if not isinstance(description.get("shard"), str) or "points" not in description:
-        raise InputError(f"folder is {folder}: it must be of a sweep's shard")
-    return StoredRun(folder, description)
-
-
-def stored_shards(inside: pathlib.Path) -> list[StoredRun]:
-    """Return the shards of a sweep that exist, which may be unfinished.
+    The points are those of all sweeps, and so are the seeds. Programs that `out` does
+    not hold are copied to it.
 
     Args:
-      inside: the folder that holds the shards, which may be missing.
+      folders: folders of sweeps, each of which may be trained in part.
+      out: folder of the united sweep, created if it is missing; it may be one of them.
 
     Raises:
-      InputError: if one of them is damaged.
+      InputError: if the sweeps differ in more than points and seeds, if a run is
+        missing or has two different results, if a folder is damaged, or if `out` holds
+        other files. Nothing has been written then.
     """
-    paths = sorted(inside.glob("*-of-*"))
-    return [_read(path) for path in paths if run_folder.has_run(path)]
-
-
-def _read_all(folders: Sequence[pathlib.Path]) -> list[StoredRun]:
-    """Return the shards in order, after checking that they are all of one sweep."""
-    paths = [path for folder in folders for path in _shard_folders(folder)]
-    first, *others = every = [_read(path) for path in dict.fromkeys(paths)]
-    for other in others:
-        refuse_different(first, other)
-    stored: dict[shards.Shard, StoredRun] = {}
-    for each in every:
-        shard = shards.parse(each.description["shard"])
-        if shard in stored:
-            raise InputError(
-                f"shard {shard} is given twice: {stored[shard].folder}, {each.folder}"
-            )
-        stored[shard] = each
-    counts = {shard.count for shard in stored}
-    if len(counts) > 1:
-        raise InputError(
-            f"there are shards of {' and of '.join(map(str, sorted(counts)))}: name "
-            "the folders of those that belong together"
-        )
-    count = counts.pop()
-    expected = [shards.Shard(number, count) for number in range(1, count + 1)]
-    missing = [str(shard) for shard in expected if shard not in stored]
-    if missing:
-        raise InputError(f"missing: shards {', '.join(missing)}, which have not begun")
-    return [stored[shard] for shard in expected]
-
-
-def _refuse_used(out: pathlib.Path, shard: StoredRun) -> None:
-    """Raise `InputError` if `out` holds more than earlier tables of the same shards."""
+    every = list(dict.fromkeys(folders))
     if run_folder.has_run(out):
-        earlier, now = run_folder.read(out), shard.description
-        # The shards may have been continued to more total_steps since.
-        if run_folder.differences(_comparable(earlier), _comparable(now)):
-            refuse_different(StoredRun(out, earlier), shard)
-        # A single run has no points, and a sweep that was not merged has programs.
-        used = "points" not in earlier or (out / "programs").is_dir()
-    else:
-        used = bool(run_folder.content(out) - {"shards"})
-    if used:
-        raise InputError(f"out is {out}, which holds other files: name another folder")
-
-
-def merge(folders: Sequence[pathlib.Path], out: pathlib.Path) -> dict[str, Any]:
-    """Write the tables of a sweep that was trained in shards; return the summary.
-
-    Args:
-      folders: the folder of the sweep, or the folders of all its shards.
-      out: folder of the tables, created if it is missing.
-
-    Raises:
-      InputError: if a shard is missing, unfinished, damaged or of another sweep, or if
-        `out` holds other files. Nothing has been written then.
-    """
-    every = _read_all(folders)
-    description = every[0].description
-    points = description["points"]
-    seeds = run_folder.seeds_of(description)
-    parts = [TrainedPrograms.from_description(*shard) for shard in every]
-    unfinished = [
-        shard.description["shard"]
-        for part, shard in zip(parts, every, strict=True)
-        if part.unfinished()
-    ]
-    if unfinished:
-        raise InputError(
-            f"not finished: shards {', '.join(unfinished)}; continue them with --resume"
-        )
-    results = tables.read(points, seeds, parts)
+        every = list(dict.fromkeys([out, *every]))
+    description = _united([StoredRun(folder, _read(folder)) for folder in every])
+    plan = stored_plan(every[0], description)
+    trained = [each for folder in every for each in plan.trained(folder)]
+    results = tables.read(plan, trained)
     run_folder.create(out)
     with run_folder.lock(out):
-        _refuse_used(out, every[0])
-        own = {"shard": None, "resume": False, "out": str(out)}
-        run_folder.write_description(out, {**description, **own})
-        return tables.write(out, results)
+        if not run_folder.has_run(out):
+            run_folder.refuse_used(out)
+        for each in trained:
+            _copy(each.path, programs_of(out))
+        run_folder.write_description(out, {**description, "out": str(out)})
+        return plan, tables.write(out, results)
+
+
+def _read(folder: pathlib.Path) -> dict[str, Any]:
+    description = run_folder.read(folder)
+    if "points" not in description:
+        raise InputError(f"folder is {folder}, a run: it must be of a sweep")
+    return description
+
+
+def _united(every: Sequence[StoredRun]) -> dict[str, Any]:
+    """Return the description of a sweep with the points and seeds of all.
+
+    Raises:
+      InputError: if they differ in something else.
+    """
+    (first, united), *others = every
+    settings = {name: x for name, x in united.items() if name not in _ADDED}
+    for folder, description in others:
+        own = {name: x for name, x in description.items() if name not in _ADDED}
+        changed = run_folder.differences(settings, own, grows=())
+        changed = changed or run_folder.differences(own, settings, grows=())
+        if changed:
+            raise InputError(
+                f"{folder} is of another sweep than {first}: {'; '.join(changed)}"
+            )
+        fields = run_folder.flat(description)
+        run_folder.refuse_other_expert(united, fields, first)
+    points = [point for _, x in every for point in x["points"]]
+    seeds = [run_folder.seeds_of(x) for _, x in every]
+    low, high = min(x.start for x in seeds), max(x.stop for x in seeds)
+    distinct = [x for i, x in enumerate(points) if x not in points[:i]]
+    return {**united, "points": distinct, "first_seed": low, "seeds": high - low}
+
+
+def _copy(program: pathlib.Path, parent: pathlib.Path) -> None:
+    """Copy a program's folder, whole or not at all, unless it is there."""
+    target, partial = parent / program.name, parent / f".{program.name}"
+    if not target.exists():
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(program, partial, ignore=shutil.ignore_patterns(".lock"))
+        partial.rename(target)

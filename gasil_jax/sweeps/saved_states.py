@@ -22,10 +22,9 @@ from gasil_jax.host import (
     run_folder,
 )
 from gasil_jax.host.members import member
-from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.points import Point
-from gasil_jax.sweeps.shards import Program
-from gasil_jax.sweeps.trained_programs import TrainedPrograms
+from gasil_jax.sweeps.plan import Plan, stored_plan
+from gasil_jax.sweeps.programs import Program
+from gasil_jax.sweeps.runs import Run
 
 
 class _Summary(TypedDict):
@@ -35,31 +34,26 @@ class _Summary(TypedDict):
 
 
 class Saved(NamedTuple):
-    """The saved members of a run, or of one point of a sweep.
+    """Members of a program that are saved in a folder of checkpoints.
 
     Attributes:
-      root: folder of the checkpoints that hold the members.
-      program: the program whose members these checkpoints hold.
-      indices: indices of the run's or point's members in the program.
+      root: folder of the checkpoints.
+      program: the program whose members they hold.
+      indices: indices of the requested members in the program.
     """
 
     root: pathlib.Path
     program: Program
     indices: Sequence[int]
 
-    @property
-    def seeds(self) -> list[int]:
-        """The members' seed numbers."""
-        return [self.program.members[i][1] for i in self.indices]
-
 
 def find(
     folder: pathlib.Path, description: Mapping[str, Any], point: int | None
-) -> Saved:
+) -> list[Saved]:
     """Return where the states of a run, or of a sweep's point, are saved.
 
     Args:
-      folder: folder of the run, sweep or shard.
+      folder: folder of the run or sweep.
       description: its config.json, from `run_folder.read`.
       point: number of a sweep's point; default the best by mean.
 
@@ -67,50 +61,43 @@ def find(
       InputError: if the folder has no such point.
     """
     if "points" in description:
-        point = _checked_point(folder, description, point)
-        return _find_point(folder, description, point)
+        plan = stored_plan(folder, description)
+        point = _checked_point(folder, plan, point)
+        requested = {plan.runs[point, seed] for seed in plan.seeds}
+        saved = [
+            Saved(each.path / "checkpoints", each.program, indices)
+            for each in plan.stored(folder)
+            if (
+                indices := [
+                    i for i, run in enumerate(each.program.runs) if run in requested
+                ]
+            )
+        ]
+        if not saved:
+            raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
+        return saved
     if point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
     seeds = run_folder.seeds_of(description)
-    # A run is a sweep of one point, in one program.
-    (program,) = shards.programs(description["algorithm"], [{}], seeds)
-    return Saved(folder / "checkpoints", program, range(len(seeds)))
+    env, settings = description["env"], description["settings"]
+    runs = tuple(Run(env, description["algorithm"], x, settings) for x in seeds)
+    return [Saved(folder / "checkpoints", Program(runs), range(len(runs)))]
 
 
-def _checked_point(
-    folder: pathlib.Path, description: Mapping[str, Any], point: int | None
-) -> int:
+def _checked_point(folder: pathlib.Path, plan: Plan, point: int | None) -> int:
     """Return the requested point, or the best by mean for None."""
-    points: Sequence[Point] = description["points"]
+    last = len(plan.points) - 1
     if point is None:
         with contextlib.suppress(FileNotFoundError):
             point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
         if point is None:
             raise InputError(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
-                f"to {len(points) - 1}"
+                f"to {last}"
             )
-    if not 0 <= point < len(points):
-        raise InputError(
-            f"point is {point}: {folder} has points 0 to {len(points) - 1}"
-        )
+    if not 0 <= point <= last:
+        raise InputError(f"point is {point}: {folder} has points 0 to {last}")
     return point
-
-
-def _find_point(
-    folder: pathlib.Path, description: Mapping[str, Any], point: int
-) -> Saved:
-    """Return where the states of a sweep's point are saved."""
-    if shards.root(folder).is_dir():
-        raise InputError(
-            f"run is {folder}, whose members are in its shards: name one of "
-            f"{shards.root(folder)}"
-        )
-    for program in TrainedPrograms.from_description(folder, description).programs:
-        indices = [i for i, (index, _) in enumerate(program.members) if index == point]
-        if indices:
-            return Saved(program.folder(folder) / "checkpoints", program, indices)
-    raise InputError(f"point is {point}: it is not in {folder}, a shard of its sweep")
 
 
 def load(
@@ -135,11 +122,39 @@ def load(
         other points.
     """
     description = run_folder.read(folder)
-    saved = find(folder, description, point)
+    every = find(folder, description, point)
+    settings = dataclasses.asdict(description["settings"])
+    with command_line.input_checked():
+        env = environments.make_env(description["env"], **settings)
+    states: dict[int, Any] = {}
+    for saved in every:
+        states |= _load(folder, saved, which, env=env)
+    seeds = sorted(states)
+    if seed is not None:
+        if seed not in seeds:
+            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
+        seeds = [seed]
+    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(states[x] for x in seeds))
+    first = every[0]
+    algorithm = first.program.runs[first.indices[0]].algorithm
+    return env, algorithm, seeds, stacked
+
+
+def _load(
+    folder: pathlib.Path, saved: Saved, which: str, *, env: Any
+) -> dict[int, train.TrainState]:
+    """Return the states that a folder of checkpoints holds of a run, by seed.
+
+    Args:
+      folder: folder of the run or sweep, for messages.
+      saved: the folder of checkpoints, and the members.
+      which: see `load`.
+      env: the environment.
+    """
     chosen, errors = checkpoint.latest(saved.root)
     for error in errors:
         print(f"warning: {error}", file=sys.stderr)
-    algorithm, count = saved.program.algorithm, len(saved.program.members)
+    algorithm, count = saved.program.algorithm, len(saved.program.runs)
     if which == "best":
         if len(saved.indices) < count:
             raise InputError(
@@ -150,21 +165,13 @@ def load(
     if chosen is None:
         scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    settings = dataclasses.asdict(description["settings"])
     with command_line.input_checked():
-        env = environments.make_env(description["env"], **settings)
         # The leaves of all members have the same shapes.
         init = lambda seed: train.first_state(env, algorithm, jax.random.key(seed))
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
         states = chosen.restore(like)
-    seeds, indices = saved.seeds, np.array(saved.indices)
-    if seed is not None:
-        if seed not in seeds:
-            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
-        seeds, indices = [seed], indices[[seeds.index(seed)]]
-    if len(indices) < count:
-        states = jax.tree.map(lambda x: x[indices], states)
-    return env, algorithm, seeds, states
+    seeds = saved.program.seeds
+    return {seeds[i]: member(states, i) for i in saved.indices}
 
 
 class Policies(NamedTuple):

@@ -1,8 +1,4 @@
-"""Make a sweep's tables, such as results.csv, from the folders of its programs.
-
-They are made from the programs' files alone, whether one process trained all programs
-or shards did on many hosts.
-"""
+"""Make a sweep's tables, such as results.csv, from the folders of its programs."""
 
 import csv
 import dataclasses
@@ -17,8 +13,12 @@ from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.host import metrics_files, output_file
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
+from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
-from gasil_jax.sweeps.trained_programs import LABELS, Member, TrainedPrograms
+from gasil_jax.sweeps.programs import ProgramFolder
+from gasil_jax.sweeps.runs import Run
+
+_Columns = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -26,9 +26,8 @@ class Results:
     """The results of all points and seeds of a sweep.
 
     Attributes:
-      parts: the parts of the sweep that they were read from.
-      points: the points.
-      seeds: absolute seed numbers.
+      plan: the points and seeds.
+      trainings: what `ProgramFolder.training` says of each program.
       curves: every metric and score by its name in curves.npz, (points, seeds,
         iterations or evaluations) each.
       finals: the last columns of results.csv by their names, (points, seeds) each; NaN
@@ -36,9 +35,8 @@ class Results:
       diverged: whether an update was undone, bool (points, seeds).
     """
 
-    parts: Sequence[TrainedPrograms]
-    points: Sequence[Point]
-    seeds: Sequence[int]
+    plan: Plan
+    trainings: Sequence[Mapping[str, Any]]
     curves: dict[str, Any]
     finals: dict[str, np.ndarray]
     diverged: np.ndarray
@@ -46,7 +44,7 @@ class Results:
     @property
     def names(self) -> list[str]:
         """The names of all values that points change."""
-        return sorted({name for point in self.points for name in point})
+        return sorted({name for point in self.plan.points for name in point})
 
     @property
     def mean(self) -> np.ndarray:
@@ -58,41 +56,74 @@ class Results:
         """The indices of the points that have a mean final return."""
         return np.flatnonzero(np.isfinite(self.mean)).tolist()
 
+    @property
+    def varied(self) -> dict[str, list[Any]]:
+        """The values of the names in which the points of `ended` differ, (points,)."""
+        seed = self.plan.seeds[0]
+        trained = [self.plan.runs[i, seed].algorithm.settings for i in self.ended]
+        values = {name: [own[name] for own in trained] for name in self.names}
+        return {name: listed for name, listed in values.items() if len(set(listed)) > 1}
 
-def read(
-    points: Sequence[Point], seeds: Sequence[int], parts: Sequence[TrainedPrograms]
-) -> Results:
-    """Return the results that the tables of a sweep's parts hold.
+
+def read(plan: Plan, trained: Sequence[ProgramFolder]) -> Results:
+    """Return the results of a sweep that is trained to its end.
 
     Args:
-      points: all points of the sweep.
-      seeds: absolute seed numbers.
-      parts: the finished parts, which together hold every point with every seed.
+      plan: the points and seeds.
+      trained: the programs that are trained to their end.
 
     Raises:
-      InputError: if a table is damaged, or if one has other columns than the others.
+      InputError: if a run is missing or has two different results, if a table is
+        damaged, or if one has other columns than the others.
     """
-    members: dict[Member, dict[str, np.ndarray]] = {}
-    evaluations: dict[Member, dict[str, np.ndarray]] = {}
-    for part in parts:
-        members |= part.members()
-        evaluations |= part.evaluations()
-    curves = _curves(points, seeds, members)
-    of_point = lambda name, i: np.stack([members[i, seed][name] for seed in seeds])
-    finals_of = lambda name: np.array(
-        [metrics_files.final_returns(of_point(name, i)) for i in range(len(points))]
-    )
-    final, length = finals_of("episode_return"), finals_of("episode_length")
-    finals = {"final_return": final, "final_length": length}
-    if evaluations:
-        scores = _curves(points, seeds, evaluations)
-        curves |= {f"evaluation_{name}": values for name, values in scores.items()}
-        last = lambda member: evaluations[member]["mean"][-1]
-        finals["final_evaluation"] = np.array(
-            [[last((i, seed)) for seed in seeds] for i in range(len(points))]
+    if missing := plan.missing(trained):
+        point, seed = missing[0]
+        raise InputError(
+            f"{len(missing)} of {len(plan.runs)} runs are missing, the first of point "
+            f"{point} and seed {seed}: train them with python -m gasil_jax.sweep "
+            "--resume"
         )
+    metrics: dict[Run, _Columns] = {}
+    scores: dict[Run, _Columns] = {}
+    for each in trained:
+        runs = each.program.runs
+        own_metrics, own_scores = each.tables()
+        for run, columns in zip(runs, own_metrics, strict=True):
+            if not _equal(metrics.setdefault(run, columns), columns):
+                raise InputError(
+                    f"{each.path} has another result than another program for seed "
+                    f"{run.seed} of {run.experiment}"
+                )
+        scores |= dict(zip(runs, own_scores))
+    curves = _curves(plan, metrics)
+    of_point = lambda name, i: np.stack(
+        [metrics[plan.runs[i, seed]][name] for seed in plan.seeds]
+    )
+    finals_of = lambda name: np.array(
+        [
+            metrics_files.final_returns(of_point(name, i))
+            for i in range(len(plan.points))
+        ]
+    )
+    finals = {
+        "final_return": finals_of("episode_return"),
+        "final_length": finals_of("episode_length"),
+    }
+    if scores:
+        of_scores = _curves(plan, scores)
+        curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
+        last = np.array([scores[run]["mean"][-1] for run in plan.runs.values()])
+        finals["final_evaluation"] = last.reshape(finals["final_return"].shape)
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
-    return Results(parts, points, seeds, curves, finals, diverged)
+    # A program may be in several folders.
+    trainings = {each.program.name: each.training for each in trained}
+    return Results(plan, list(trainings.values()), curves, finals, diverged)
+
+
+def _equal(first: _Columns, second: _Columns) -> bool:
+    return first.keys() == second.keys() and all(
+        np.array_equal(first[name], second[name], equal_nan=True) for name in first
+    )
 
 
 def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
@@ -108,16 +139,14 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     _write_results(folder / "results.csv", results)
     with output_file.atomic(folder / "curves.npz") as partial:
         np.savez_compressed(partial, **results.curves)
-    varied = _varied(results.parts, results.names, results.ended)
-    trainings = [training for part in results.parts for training in part.trainings()]
-    summary = _summary(results, varied, trainings)
+    summary = _summary(results)
     metrics_files.write_json(folder / "summary.json", summary)
     with output_file.atomic(folder / "sweep.png") as partial:
         final, best = results.finals["final_return"], summary["best_by_mean"]
-        plotting.final_returns(partial, _labels(results.points), final, best=best)
-    if varied:
+        plotting.final_returns(partial, _labels(results.plan.points), final, best=best)
+    if results.varied:
         with output_file.atomic(folder / "hyperparameters.png") as partial:
-            _draw_hyperparameters(partial, results, varied, summary=summary)
+            _draw_hyperparameters(partial, results, summary)
     return summary
 
 
@@ -131,36 +160,26 @@ def _write_results(path: pathlib.Path, results: Results) -> None:
     with output_file.atomic(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow([*LABELS, *names, *results.finals, "diverged"])
-        for index, point in enumerate(results.points):
+        for index, point in enumerate(results.plan.points):
             own = [point.get(name, "") for name in names]
-            for position, seed in enumerate(results.seeds):
+            for position, seed in enumerate(results.plan.seeds):
                 values = (x[index, position] for x in results.finals.values())
                 cells = ["" if math.isnan(x) else f"{x:.7g}" for x in values]
                 bad = int(results.diverged[index, position])
                 writer.writerow([index, seed, *own, *cells, bad])
 
 
-def _summary(
-    results: Results,
-    varied: Mapping[str, Sequence[Any]],
-    trainings: Sequence[Mapping[str, Any]],
-) -> dict[str, Any]:
-    """Return the content of summary.json.
-
-    Args:
-      results: the results.
-      varied: the values of the hyperparameters that vary, from `_varied`.
-      trainings: what `TrainedPrograms.trainings` returns, for all parts.
-    """
+def _summary(results: Results) -> dict[str, Any]:
+    """Return the content of summary.json."""
     mean, diverged = results.mean, results.diverged
     others = dict(results.finals)
     final = others.pop("final_return")
     sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
     best = lambda scores: int(sound[scores[sound].argmax()]) if sound.size else None
     returns = mean[results.ended]
-    shares = {name: importance(values, returns) for name, values in varied.items()}
+    every = {name: importance(x, returns) for name, x in results.varied.items()}
     # The estimate is noisy and may be below 0.
-    shares = {name: x if x is None else max(0.0, x) for name, x in shares.items()}
+    shares = {name: x if x is None else max(0.0, x) for name, x in every.items()}
     return {
         "points": [
             {
@@ -171,45 +190,29 @@ def _summary(
                 **{name: _finite(values[i].mean()) for name, values in others.items()},
                 "diverged_seeds": int(diverged[i].sum()),
             }
-            for i, point in enumerate(results.points)
+            for i, point in enumerate(results.plan.points)
         ],
         "best_by_mean": best(mean),
         "best_by_worst_seed": best(final.min(axis=1)),
         "importance": shares,
-        **speed(trainings),
-        "versions": _joined([training["versions"] for training in trainings]),
+        **speed(results.trainings),
+        "versions": _joined([x["versions"] for x in results.trainings]),
     }
 
 
 def _draw_hyperparameters(
-    path: pathlib.Path,
-    results: Results,
-    varied: Mapping[str, Sequence[Any]],
-    *,
-    summary: Mapping[str, Any],
+    path: pathlib.Path, results: Results, summary: Mapping[str, Any]
 ) -> None:
-    """Draw the mean final returns over each hyperparameter that `_varied` returns."""
+    """Draw the mean final returns over each hyperparameter that varies."""
     ended, best = results.ended, summary["best_by_mean"]
     plotting.marginals(
         path,
-        varied,
+        results.varied,
         results.mean[ended],
         importance=summary["importance"],
         best=None if best is None else ended.index(best),
-        left_out=len(results.points) - len(ended),
+        left_out=len(results.plan.points) - len(ended),
     )
-
-
-def _varied(
-    parts: Sequence[TrainedPrograms], names: Sequence[str], points: Sequence[int]
-) -> dict[str, list[Any]]:
-    """Return the values of the names in which points differ, (points,) each."""
-    trained: dict[int, dict[str, Any]] = {}
-    for program in (program for part in parts for program in part.programs):
-        for (point, _), own in zip(program.members, program.hyperparameters):
-            trained[point] = program.algorithm.settings | dict(own)
-    values = {name: [trained[point][name] for point in points] for name in names}
-    return {name: listed for name, listed in values.items() if len(set(listed)) > 1}
 
 
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -240,34 +243,27 @@ def _joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _curves(
-    points: Sequence[Point],
-    seeds: Sequence[int],
-    members: Mapping[Member, Mapping[str, np.ndarray]],
-) -> dict[str, Any]:
-    """Return every metric, (points, seeds, iterations); NaN after a member's last.
+def _curves(plan: Plan, tables: Mapping[Run, _Columns]) -> dict[str, Any]:
+    """Return every metric, (points, seeds, iterations); NaN after a run's last.
 
     Raises:
-      InputError: if members have other metrics than the first one.
+      InputError: if runs have other metrics than the first one.
     """
-    names = members[0, seeds[0]].keys()
-    for (point, seed), metrics in members.items():
-        if differing := ", ".join(sorted(names ^ metrics.keys())):
+    every = {member: tables[run] for member, run in plan.runs.items()}
+    (first, columns), *_ = every.items()
+    for (point, seed), metrics in every.items():
+        if differing := ", ".join(sorted(columns.keys() ^ metrics.keys())):
             raise InputError(
                 f"point {point}, seed {seed} was trained with other metrics than point "
-                f"0, seed {seeds[0]}: {differing}"
+                f"{first[0]}, seed {first[1]}: {differing}"
             )
     # Points may differ in batch_steps, and so in iterations.
-    length = max(len(metrics["env_steps"]) for metrics in members.values())
+    length = max(len(metrics["env_steps"]) for metrics in every.values())
     pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
+    shape = (len(plan.points), len(plan.seeds), length)
     return {
-        name: np.array(
-            [
-                [pad(members[i, seed][name]) for seed in seeds]
-                for i in range(len(points))
-            ]
-        )
-        for name in names
+        name: np.array([pad(x[name]) for x in every.values()]).reshape(shape)
+        for name in columns
     }
 
 

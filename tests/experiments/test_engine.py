@@ -2,6 +2,7 @@
 
 import dataclasses
 import os
+import shutil
 import signal
 import threading
 import time
@@ -13,13 +14,16 @@ import pytest
 import gasil_jax
 from experiments import __main__, engine
 from experiments.curves import Curve, Figure
-from experiments.engine import Program, Setup
+from experiments.engine import Setup
 from experiments.figures import FIGURES
-from experiments.store import RESULTS, Run, Store
+from experiments.store import RESULTS, Store
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
+from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import evaluation_key
+from gasil_jax.sweeps import programs
+from gasil_jax.sweeps.runs import Run
 from gasil_jax.sweeps.shards import Shard
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
@@ -42,28 +46,27 @@ def told(monkeypatch, commit, clean):
 def trained(tmp_path_factory):
     """One program of three runs, and their records."""
     setup = Setup(tmp_path_factory.mktemp("runs"), evaluate_episodes=2)
-    (program,) = engine.programs(RUNS, setup)
+    (program,) = engine.unfinished(RUNS, setup)
     with pytest.MonkeyPatch.context() as monkeypatch:
         told(monkeypatch, "c", True)
-        return program, engine.train(program)
+        return setup, program, engine.train(program, setup)
 
 
 def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
     other = [
         run(hidden_sizes=(4,)),
         run(num_envs=2),
-        dataclasses.replace(run(), reward_delay=20),
+        dataclasses.replace(run(), settings=Settings(reward_delay=20)),
         dataclasses.replace(run(), env="hopper"),
     ]
-    programs = engine.programs([*RUNS, *other], Setup())
-    assert sorted(len(program.runs) for program in programs) == [1, 1, 1, 1, 3]
-    folders = {program.folder for program in programs}
-    assert len(folders) == 5
+    folders = engine.unfinished([*RUNS, *other], Setup())
+    assert sorted(len(x.program.runs) for x in folders) == [1, 1, 1, 1, 3]
+    assert len({x.path for x in folders}) == 5
     # The order in which runs are missing does not change a program.
-    (same,) = engine.programs(RUNS[::-1], Setup(devices=1))
-    assert same.folder in folders
-    assert Program(same.runs, Setup(physics="mujoco")).folder not in folders
-    assert Program(same.runs, Setup(evaluate_episodes=0)).folder not in folders
+    assert engine.unfinished(RUNS[::-1], Setup(devices=1))[0] in folders
+    for setup in (Setup(physics="mujoco"), Setup(evaluate_episodes=0)):
+        (another,) = engine.unfinished(RUNS, setup)
+        assert another.path not in {x.path for x in folders}
 
 
 @pytest.mark.parametrize(
@@ -91,8 +94,8 @@ def test_an_agents_and_a_models_numbers_are_no_program_of_their_own(
     )
     alike = {changed(name, value) for name, value in numbers.items()}
     apart = {changed(name, value) for name, value in others.items()}
-    programs = engine.programs([first, *alike, *apart], Setup())
-    assert {frozenset(program.runs) for program in programs} == {
+    every = programs.group([first, *alike, *apart])
+    assert {frozenset(program.runs) for program in every} == {
         frozenset({first, *alike}),
         *(frozenset({one}) for one in apart),
     }
@@ -111,7 +114,7 @@ def test_shards_are_all_runs_once_and_none_moves_when_others_join():
 
 
 def test_a_record_is_what_make_train_gives(trained):
-    _, records = trained
+    _, _, records = trained
     assert set(records) == set(RUNS)
     env = gasil_jax.make_env("point_mass")
     for each, record in records.items():
@@ -132,21 +135,20 @@ def test_a_record_is_what_make_train_gives(trained):
 
 def test_evaluations_are_spread_over_training(tmp_path):
     setup = Setup(tmp_path, evaluate_episodes=1)
-    (program,) = engine.programs([run(total_steps=30 * 256)], setup)
-    (record,) = engine.train(program).values()
+    (program,) = engine.unfinished([run(total_steps=30 * 256)], setup)
+    (record,) = engine.train(program, setup).values()
     assert record.evaluation_steps.tolist() == [3 * 256 * i for i in range(1, 11)]
     assert np.isfinite(record.evaluation_return).all()
 
 
 def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
-    program, records = trained
+    setup, _, records = trained
     monkeypatch.setattr(gasil_jax.train, "iterate", None)
-    told(monkeypatch, "d", None)
     store = Store(tmp_path)
     # Unless that is asked for, training in the scratch folder is not continued.
     with pytest.raises(InputError, match=r"holds training of these runs.*--resume"):
-        engine.train_missing(RUNS, store, program.setup)
-    resumed = dataclasses.replace(program.setup, resume=True)
+        engine.train_missing(RUNS, store, setup)
+    resumed = dataclasses.replace(setup, resume=True)
     engine.train_missing(RUNS, store, resumed)
     for each in RUNS:
         before, again = records[each], Store(tmp_path)[each]
@@ -154,37 +156,31 @@ def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
             np.testing.assert_allclose(
                 getattr(again, name), getattr(before, name), 5e-6
             )
-        # The provenance names everything that the program was trained with.
-        assert again.provenance["commit"] == "c, then d"
-        assert again.provenance["clean"] is None
+        assert again.provenance == before.provenance
 
 
 def test_training_is_continued_when_other_runs_are_missing(
     trained, monkeypatch, tmp_path
 ):
-    program, _ = trained
-    resumed = dataclasses.replace(program.setup, resume=True)
+    setup, program, _ = trained
+    setup = dataclasses.replace(setup, runs=tmp_path / "runs")
+    shutil.copytree(program.path.parent.parent, setup.runs)
+    (unfinished,) = setup.runs.glob("*/*/training.json")
+    unfinished.unlink()
+    resumed = dataclasses.replace(setup, resume=True)
     requested = []
-    monkeypatch.setattr(engine, "train", lambda x: requested.append(x) or {})
+    monkeypatch.setattr(engine, "train", lambda x, _: requested.append(x) or {})
     # Of the two that it trains one was stored, and a third is requested.
     another = dataclasses.replace(RUNS[0], seed=99)
     missing = [another, RUNS[1]]
-    with pytest.raises(InputError, match=f"in {program.folder.name}: continue it"):
-        engine.train_missing(missing, Store(tmp_path), program.setup)
+    with pytest.raises(InputError, match=f"in {program.path.name}: continue it"):
+        engine.train_missing(missing, Store(tmp_path), setup)
     engine.train_missing(missing, Store(tmp_path), resumed)
-    assert [set(x.runs) for x in requested] == [set(RUNS), {another}]
-    assert requested[0].folder == program.folder
+    assert [set(x.program.runs) for x in requested] == [set(RUNS), {another}]
+    assert requested[0].path.name == program.path.name
     # With other physics it is other training.
-    other = dataclasses.replace(program.setup, physics="mujoco")
-    assert engine.begun(missing, other) == [] == engine.begun([another], resumed)
-
-
-def test_a_damaged_list_of_runs_is_named(tmp_path):
-    for text in ("{", '{"runs": [{}]}', "{}"):
-        (tmp_path / "x").mkdir(exist_ok=True)
-        (tmp_path / "x" / "runs.json").write_text(text)
-        with pytest.raises(InputError, match=r"runs\.json is not a list of runs"):
-            engine.begun(RUNS, Setup(tmp_path))
+    other = dataclasses.replace(setup, physics="mujoco")
+    assert not any(x.path.exists() for x in engine.unfinished(missing, other))
 
 
 def test_rows_are_means_over_equal_parts_of_training():
@@ -204,7 +200,9 @@ def test_interrupted_training_is_continued_on_request_only(tmp_path):
     runs = [run(total_steps=10**9)]
 
     def size():
-        return sum(path.stat().st_size for path in tmp_path.glob("runs/*/metrics.csv"))
+        return sum(
+            path.stat().st_size for path in tmp_path.glob("runs/*/*/metrics.csv")
+        )
 
     def interrupt(before):
         while size() <= before:
@@ -216,7 +214,7 @@ def test_interrupted_training_is_continued_on_request_only(tmp_path):
         with pytest.raises(Interrupted) as interrupted:
             engine.train_missing(runs, store, dataclasses.replace(setup, resume=resume))
         assert "--resume" in interrupted.value.__notes__[0]
-        assert list(tmp_path.glob("runs/*/checkpoints/0*/manifest.json"))
+        assert list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))
     with pytest.raises(InputError, match="--resume"):
         engine.train_missing(runs, store, setup)
     assert store.missing(runs) == runs
@@ -332,12 +330,12 @@ def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
         return stored.missing([*RUNS[:2], *later])
 
     engine.train_in_processes(missing, store, setup)
-    stored, (_, alone) = Store(store.folder), trained
+    stored, (*_, alone) = Store(store.folder), trained
     for one in RUNS:
         same = np.testing.assert_allclose
         same(stored[one].episode_return, alone[one].episode_return, rtol=1e-4)
         assert len(stored[one].evaluation_return)
-    logs = list((tmp_path / "runs").glob("*.log"))
+    logs = list((tmp_path / "runs").glob("*/*.log"))
     assert len(logs) == 3
     broken = run(7, num_envs=256, batch_steps=128)
     with pytest.raises(InputError, match=r"1 programs failed: see .*\.log"):
@@ -349,9 +347,8 @@ def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
 
 def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
     runs = [run(seed) for seed in range(5)] + [run(seed) for seed in (1000, 1001)]
-    programs = engine.programs(runs, Setup(members=2))
-    assert sorted(len(program.runs) for program in programs) == [1, 2, 2, 2]
-    assert {x for program in programs for x in program.runs} == set(runs)
-    for program in programs:
-        of_search = program.runs[0].seed >= 1000
-        assert program.evaluate_episodes == (0 if of_search else 10)
+    every = [x.program for x in engine.unfinished(runs, Setup(members=2))]
+    assert sorted(len(program.runs) for program in every) == [1, 2, 2, 2]
+    assert {x for program in every for x in program.runs} == set(runs)
+    for program in every:
+        assert len({run.seed >= 1000 for run in program.runs}) == 1

@@ -98,7 +98,7 @@ def test_an_ablation_is_a_row():
     for _, name, curve in figure.curves():
         runs = curve.runs(STORE)
         assert [run.seed for run in runs] == [0, 1, 2, 3, 4]
-        assert {run.reward_delay for run in runs} == {DELAY}
+        assert {run.settings.reward_delay for run in runs} == {DELAY}
         agent = "ppo" if name == "ppo" else "ppo+gasil"
         expected = gasil_jax.algorithm(agent, total_steps=1_000_000, **SHARED)
         if name == "weak":
@@ -112,7 +112,7 @@ def test_a_figure_over_delays_is_a_row():
     assert list(DELAYS.panels) == ["hopper", "swimmer"]
     for _, name, curve in DELAYS.curves():
         (run, *_) = curve.runs(STORE)
-        assert name == f"{run.algorithm.agent.name}-{run.reward_delay}"
+        assert name == f"{run.algorithm.agent.name}-{run.settings.reward_delay}"
         assert run.algorithm.config.num_envs == 64
     # Agents are compared where the delay is the same.
     others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]

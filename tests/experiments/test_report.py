@@ -261,7 +261,7 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
     records = {}
     for i, (_, _, curve) in enumerate(DELAYS.curves()):
         for run in curve.runs(store):
-            values = np.full(10, 100.0 + i % 2 * run.reward_delay + run.seed)
+            values = np.full(10, 100.0 + i % 2 * run.settings.reward_delay + run.seed)
             records[run] = Record(np.arange(1, 11), values, nan, by | {"clean": True})
     store.add(records)
     page = Page("delays", store, figure=DELAYS)

@@ -72,7 +72,7 @@ def test_the_best_of_all_points_is_chosen(tmp_path):
     for run in one.runs(further)[-1]:
         settings = run.algorithm.settings
         assert settings["normalize_rewards"] and settings["num_envs"] == 32
-        assert not settings["decompose_rewards"] and run.reward_delay == 20
+        assert not settings["decompose_rewards"] and run.settings.reward_delay == 20
 
 
 def test_a_point_that_ended_no_episode_is_not_chosen(tmp_path):

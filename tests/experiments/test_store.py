@@ -10,11 +10,13 @@ import pytest
 from altered_archives import altered
 
 import gasil_jax
-from experiments import engine
-from experiments.store import RESULTS, Record, Run, Store, merge, read, write
+from experiments.store import RESULTS, Record, Store, merge, read, write
 from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize, npz
 from gasil_jax.errors import InputError
 from gasil_jax.host.descriptions import find_agent
+from gasil_jax.host.environments import Settings
+from gasil_jax.sweeps import programs
+from gasil_jax.sweeps.runs import Run
 
 
 def run(seed=0, env="hopper", **changes):
@@ -39,15 +41,18 @@ def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
         *(
             dataclasses.replace(one, **change)
             for change in (
-                {"reward_delay": 20},
-                {"obs_noise": 0.1},
-                {"integrator": "euler"},
+                {"settings": Settings(reward_delay=20)},
+                {"settings": Settings(obs_noise=0.1)},
+                {"settings": Settings(integrator="euler")},
+                {"settings": Settings(max_episode_steps=50)},
                 {"algorithm_version": 99},
             )
         ),
     ]
     assert len({x.key for x in [one, *others]}) == 1 + len(others)
     assert run().key == one.key == run(alpha=0.1).key
+    same = dataclasses.replace(one, settings=Settings(physics="mujoco"))
+    assert same == one and same.key == one.key
     # A whole number and the same as a float are one number.
     assert run(gamma=1).key == run(gamma=1.0).key and run(gamma=1) == run(gamma=1.0)
 
@@ -115,7 +120,7 @@ def test_an_agent_of_ones_own_keeps_its_numbers(tmp_path, monkeypatch):
     assert own[0].key != own[1].key
     write(tmp_path / "hopper.npz", {own[1]: record()})
     assert list(read(tmp_path / "hopper.npz")) == own[1:]
-    assert [len(x.runs) for x in engine.programs(own, engine.Setup())] == [2]
+    assert [len(x.runs) for x in programs.group(own)] == [2]
 
 
 def test_a_field_that_a_file_has_not_is_the_default(tmp_path, monkeypatch):

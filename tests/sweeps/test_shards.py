@@ -1,4 +1,4 @@
-"""Shards of a sweep hold each member once, and merge into the same tables."""
+"""A sweep is a store of runs: in shards, merged or grown, each run is trained once."""
 
 import json
 import shutil
@@ -14,33 +14,40 @@ from hypothesis import strategies as st
 import gasil_jax
 from gasil_jax import merge, sweep
 from gasil_jax.errors import InputError
-from gasil_jax.host import metrics_files, run_folder, run_options
+from gasil_jax.host import metrics_files, run_options
+from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.sweeps import assembly, launch, shards, tables, trained_programs
+from gasil_jax.sweeps import assembly, launch, programs, saved_states, shards, tables
+from gasil_jax.sweeps.plan import Plan, programs_of
+from gasil_jax.sweeps.programs import ProgramFolder
+
+
+def plan_of(points, seeds, algorithm=None):
+    algorithm = algorithm or gasil_jax.algorithm()
+    return Plan("point_mass", Settings(), algorithm, points, seeds)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
-    updates=st.lists(st.integers(1, 3), min_size=1, max_size=6),
+    updates=st.lists(st.integers(1, 9), min_size=1, max_size=6, unique=True),
     num_seeds=st.integers(1, 4),
     count=st.integers(1, 24),
 )
-def test_shards_hold_each_member_once(updates, num_seeds, count):
-    points = [{"discriminator_updates": n, "alpha": 0.1} for n in updates]
-    whole = shards.programs(gasil_jax.algorithm(), points, range(num_seeds))
-    total = len(points) * num_seeds
+def test_shards_hold_each_run_once(updates, num_seeds, count):
+    points = [{"discriminator_updates": 1 + n // 3, "alpha": n / 9} for n in updates]
+    runs = list(plan_of(points, range(num_seeds)).runs.values())
     every = [shards.Shard(number, count) for number in range(1, count + 1)]
-    if count > total:
-        with pytest.raises(InputError, match=f"{total} members"):
-            shards.cut_evenly(whole, every[0])
+    if count > len(runs):
+        with pytest.raises(InputError, match=f"{len(runs)} members"):
+            shards.cut_evenly(runs, every[0])
         return
-    parts = [shards.cut_evenly(whole, shard) for shard in every]
-    sizes = [sum(len(program.members) for program in part) for part in parts]
+    parts = [shards.cut_evenly(runs, shard) for shard in every]
+    sizes = [len(part) for part in parts]
     assert max(sizes) - min(sizes) <= 1
-    seen = [program for part in parts for program in part]
-    members = [(p.number, p.algorithm, member) for p in seen for member in p.members]
-    assert members == [(p.number, p.algorithm, m) for p in whole for m in p.members]
+    whole = programs.group(runs)
+    assert [run for part in parts for run in part] == [r for p in whole for r in p.runs]
     # No more is compiled than cutting must cost.
+    seen = [program for part in parts for program in programs.group(part)]
     assert len(seen) <= len(whole) + count - 1
 
 
@@ -50,21 +57,20 @@ def test_points_that_differ_in_traced_numbers_alone_share_a_program():
         {"discriminator_updates": 20, "alpha": 0.1},
         {"discriminator_updates": 5, "gamma": 0.9},
         {"num_epochs": 3},
+        # The same run as the first one's.
+        {"alpha": 1.0},
     ]
     algorithm = gasil_jax.algorithm(alpha=0.3)
-    first, *others = shards.programs(algorithm, points, [7, 8])
-    assert first.members == ((0, 7), (0, 8), (2, 7), (2, 8))
+    plan = plan_of(points, [7, 8], algorithm)
+    first, *others = programs.group(plan.runs.values())
+    assert plan.labels(first) == {"point": (0, 0, 2, 2), "seed": (7, 8, 7, 8)}
     numbers = [(x["alpha"], x["gamma"]) for x in first.hyperparameters]
     assert numbers == [(1.0, 0.99)] * 2 + [(0.3, 0.9)] * 2
-    assert first.algorithm == algorithm.replace(discriminator_updates=5)
-    assert [x.members for x in others] == [((1, 7), (1, 8)), ((3, 7), (3, 8))]
+    assert [plan.labels(x)["point"] for x in others] == [(1, 1), (3, 3)]
     assert [x.algorithm for x in others] == [
-        algorithm.replace(discriminator_updates=20),
+        algorithm.replace(discriminator_updates=20, alpha=0.1),
         algorithm.replace(num_epochs=3),
     ]
-    (second,) = shards.cut_evenly([first], shards.Shard(2, 2))
-    assert second.members == ((2, 7), (2, 8))
-    assert second.hyperparameters == first.hyperparameters[2:]
 
 
 GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
@@ -74,147 +80,176 @@ SMALL = (
 )
 
 
-def train(folder, shard=None, *arguments):
+def train(folder, shard=None, *arguments, grid=GRID):
     """Write the files of a trained sweep, with metrics that tell members apart."""
-    part = ("--shard", shard) if shard else ()
     options = run_options.parse(
-        sweep.Options, [*SMALL, "--grid", *GRID, *arguments, *part], "x"
+        sweep.Options, [*SMALL, "--grid", *grid, *arguments], "x"
     )
-    folder = folder if shard is None else shards.parse(shard).folder(folder)
-    folder.mkdir(parents=True)
-    points, programs = sweep.plan(options)
+    plan = sweep.make_plan(options)
+    runs = list(plan.runs.values())
     if shard is not None:
-        programs = shards.cut_evenly(programs, shards.parse(shard))
-    run_options.write_config(options, folder, points=points)
-    for program in programs:
-        program_folder = program.folder(folder)
-        program_folder.mkdir(parents=True)
-        labels = dict(zip(trained_programs.LABELS, zip(*program.members)))
-        writer = metrics_files.MetricsWriter(program_folder / "metrics.csv", labels)
-        steps = np.array([100.0, 200.0, 300.0])
-        value = np.array([[10.0 * i + seed] for i, seed in program.members]) + steps
-        zero = np.zeros_like(value)
-        writer.write(
-            {
-                "env_steps": zero + steps,
-                "episode_return": np.where(value % 100 == 12, np.nan, value),
-                "skipped_updates": np.where(value == 220.0, 1.0, 0.0),
-            }
-        )
-        writer.close()
-        trained_programs.write_training(
-            folder,
-            program,
-            env_steps=300 * len(program.members),
-            compile_seconds=1.0,
-            train_seconds=0.5 * len(program.members),
-            device="1 x cpu",
-            device_count=1,
-        )
-    return trained_programs.TrainedPrograms(folder, programs), points
+        runs = shards.cut_evenly(runs, shards.parse(shard))
+    folder.mkdir(parents=True, exist_ok=True)
+    run_options.write_config(options, folder, points=plan.points)
+    for program in programs.group(runs):
+        path = programs_of(folder) / program.name
+        stored = ProgramFolder(program, path, plan.labels(program))
+        with stored.opened():
+            write_metrics(stored)
+            stored.finish(
+                env_steps=300 * len(program.runs),
+                compile_seconds=1.0,
+                train_seconds=0.5 * len(program.runs),
+                device="1 x cpu",
+                device_count=1,
+            )
+    return plan
+
+
+def write_metrics(stored):
+    writer = metrics_files.MetricsWriter(stored.path / "metrics.csv", stored.labels)
+    steps = np.array([100.0, 200.0, 300.0])
+    value = np.array(
+        [
+            [
+                10.0 * (20 * run.algorithm.agent.alpha)
+                + 20 * run.algorithm.agent.discriminator_updates
+                + run.seed
+            ]
+            for run in stored.program.runs
+        ]
+    )
+    value = value + steps
+    zero = np.zeros_like(value)
+    writer.write(
+        {
+            "env_steps": zero + steps,
+            "episode_return": np.where(value % 100 == 61, np.nan, value),
+            "episode_length": zero + 7.0,
+            "skipped_updates": np.where(value == 342.0, 1.0, 0.0),
+        }
+    )
+    writer.close()
 
 
 TABLES = ("results.csv", "curves.npz", "sweep.png", "hyperparameters.png")
 
 
 @pytest.mark.parametrize("count", [1, 5, 12])
-def test_merged_tables_are_those_of_the_whole_sweep(count, tmp_path, capsys):
+def test_tables_of_shards_are_those_of_the_whole_sweep(count, tmp_path, capsys):
     """Five shards of twelve members divide points and programs."""
-    trained, points = train(tmp_path / "whole")
-    results = tables.read(points, range(3), [trained])
-    expected = tables.write(tmp_path / "whole", results)
+    whole = tmp_path / "whole"
+    plan = train(whole)
+    expected = tables.write(whole, tables.read(plan, plan.trained(whole)))
     assert expected["points"][1]["mean"] is None  # never ended
-    assert [point["diverged_seeds"] for point in expected["points"]] == [0, 0, 1, 0]
+    assert [point["diverged_seeds"] for point in expected["points"]] == [1, 0, 0, 1]
     assert expected["env_steps_per_second"] == pytest.approx(600)
-    parts = tmp_path / "parts"
-    for number in range(1, count + 1):
-        train(parts, f"{number}/{count}")
-    assert merge.main([str(parts)]) == 0
+    folders = [tmp_path / f"{number}" for number in range(1, count + 1)]
+    for number, folder in enumerate(folders, start=1):
+        train(tmp_path / "shared", f"{number}/{count}")
+        train(folder, f"{number}/{count}")
+    assert merge.main([str(tmp_path / "shared")]) == 0
     assert "600 steps/s on 1 x cpu" in capsys.readouterr().out
-    # From where they were copied to, too; and merging again is nothing new.
-    apart = [str(path) for path in sorted((parts / "shards").iterdir())]
+    # From folders of their own, too; and merging again is nothing new.
+    apart = tmp_path / "apart"
     for _ in range(2):
-        assert merge.main([*apart, "--out", str(tmp_path / "apart")]) == 0
-    # There is nothing to continue, and the tables must stay.
-    assert sweep.main(["--resume", "--out", str(tmp_path / "apart")]) == 2
-    assert "the tables of shards in other folders" in capsys.readouterr().err
-    for out in (parts, tmp_path / "apart"):
+        assert merge.main([*map(str, folders), "--out", str(apart)]) == 0
+    # The united sweep is one like any other.
+    assert sweep.main(["--resume", "--out", str(apart)]) == 0
+    for out in (tmp_path / "shared", apart):
         for name in TABLES:
-            whole = (tmp_path / "whole" / name).read_bytes()
-            assert (out / name).read_bytes() == whole, name
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), name
         summary = json.loads((out / "summary.json").read_text())
         assert summary["points"] == expected["points"]
-        described = run_folder.read(out)
-        assert described["shard"] is None and described["points"] == tuple(points)
+        saved = saved_states.find(out, saved_states.run_folder.read(out), 1)
+        seeds = [x.program.seeds[i] for x in saved for i in x.indices]
+        assert sorted(seeds) == [0, 1, 2]
 
 
-def test_shards_of_different_sweeps_are_not_merged(tmp_path, capsys):
-    def refused(*arguments):
-        assert merge.main([str(x) for x in arguments]) == 2
-        error = capsys.readouterr().err
-        assert len(error.splitlines()) == 1
-        return error
+def refused(capsys, *arguments):
+    """Return the one line with which a merge is refused."""
+    assert merge.main([str(x) for x in arguments]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
 
-    out = tmp_path / "out"
-    assert "folders is empty" in refused()
-    assert "which holds no shards" in refused(out)
-    first, _ = train(out, "1/3")
-    train(out, "3/3")
-    assert "missing: shards 2/3" in refused(out)
-    train(out, "2/3", "--gamma", "0.9")
-    second = out / "shards" / "2-of-3"
-    assert "gamma was 0.99, is 0.9" in refused(out)
-    shutil.rmtree(second)
-    train(out, "2/3", "--total-steps", "400")
-    assert "total_steps was" in refused(out)
-    shutil.rmtree(second)
-    trained, _ = train(out, "2/3")
-    assert "several folders need --out" in refused(first.folder, second)
-    assert "1/3 is given twice" in refused(out, copy(first.folder), "--out", tmp_path)
+
+def test_different_sweeps_are_not_merged(tmp_path, capsys):
+    first, second, out = tmp_path / "first", tmp_path / "second", tmp_path / "out"
+    assert "folders is empty" in refused(capsys)
+    assert "does not exist" in refused(capsys, out)
+    train(first, "1/2")
+    assert "6 of 12 runs are missing, the first of point" in refused(capsys, first)
+    both = (first, second, "--out", out)
+    for changes, message in (
+        (("--gamma", "0.9"), "gamma was 0.99, is 0.9"),
+        (("--total-steps", "400"), "total_steps was 300, is 400"),
+        (("--reward-delay", "2"), "reward_delay was 1, is 2"),
+    ):
+        train(second, "2/2", *changes)
+        assert message in refused(capsys, *both)
+        shutil.rmtree(second)
+    plan = train(second, "2/2")
+    assert "several folders need --out" in refused(capsys, first, second)
     # Begun and killed; then cut short while it was copied.
-    program_folder = trained.programs[0].folder(second)
-    training = program_folder / "training.json"
-    kept = training.read_text()
+    folder = plan.trained(second)[0].path
+    training, metrics = folder / "training.json", folder / "metrics.csv"
+    kept, rows = training.read_text(), metrics.read_bytes().splitlines(keepends=True)
     training.unlink()
-    assert "not finished: shards 2/3" in refused(out)
+    assert "runs are missing" in refused(capsys, *both)
     training.write_text(kept)
-    metrics = program_folder / "metrics.csv"
-    content = metrics.read_bytes()
-    rows = content.splitlines(keepends=True)
-    for part in (rows[:-1], rows[: 1 + len(trained.programs[0].members)], []):
+    for part in (rows[:-1], rows[:5], []):
         metrics.write_bytes(b"".join(part))
-        assert "metrics.csv is damaged" in refused(out)
-    metrics.write_bytes(content)
-    # Never onto another sweep or anything else.
-    whole = tmp_path / "whole"
-    train(whole)
-    assert "holds other files" in refused(out, "--out", whole)
+        assert "metrics.csv is damaged" in refused(capsys, *both)
+    metrics.write_bytes(b"".join(rows))
+    listed = folder / "program.json"
+    kept = listed.read_text()
+    for text in ("{", '{"experiments": [], "runs": []}', kept.replace("0.99", "0.98")):
+        listed.write_text(text)
+        assert "program.json is damaged" in refused(capsys, *both)
+    listed.write_text(kept)
+    # Never onto anything else.
     (tmp_path / "thesis").mkdir()
     (tmp_path / "thesis" / "results.csv").touch()
-    assert "holds other files" in refused(out, "--out", tmp_path / "thesis")
+    assert "not empty" in refused(capsys, *both[:3], tmp_path / "thesis")
     (tmp_path / "run").mkdir()
     of_a_run = run_options.parse(run_options.Options, SMALL, "x")
     run_options.write_config(of_a_run, tmp_path / "run")
-    assert "holds other files" in refused(out, "--out", tmp_path / "run")
-    assert not (out / "results.csv").exists()
-    assert merge.main([str(out)]) == 0
-    train(out, "1/2")
-    assert "shards of 2 and of 3" in refused(out)
+    assert "a run: it must be of a sweep" in refused(
+        capsys, *both[:3], tmp_path / "run"
+    )
+    assert not out.exists()
+    assert merge.main([str(x) for x in both]) == 0
 
 
-def test_shards_with_different_experts_are_not_merged(tmp_path, capsys):
+def test_two_different_results_of_a_run_are_refused_and_two_equal_ones_are_one(
+    tmp_path, capsys
+):
+    plan = train(tmp_path / "a")
+    train(tmp_path / "b", "1/5")
+    both = [str(tmp_path / "a"), str(tmp_path / "b"), "--out", str(tmp_path / "out")]
+    assert merge.main(both) == 0
+    shutil.rmtree(tmp_path / "out")
+    metrics = plan.trained(tmp_path / "b")[0].path / "metrics.csv"
+    metrics.write_text(metrics.read_text().replace(",7,", ",8,"))
+    capsys.readouterr()
+    assert "has another result than another program" in refused(capsys, *both)
+    assert not (tmp_path / "out").exists()
+
+
+def test_sweeps_with_different_experts_are_not_merged(tmp_path, capsys):
     """On each host the expert's file may be another one."""
     path, out = tmp_path / "expert.npz", tmp_path / "out"
+    folders = [tmp_path / "1", tmp_path / "2"]
     for number, steps in ((1, 5), (2, 6)):
         np.savez(path, observation=np.ones((steps, 4)), action=np.ones((steps, 2)))
-        train(out, f"{number}/2", "--agent", "gail", "--expert", str(path))
-    assert merge.main([str(out)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
+        more = ("--agent", "gail", "--expert", str(path))
+        train(folders[number - 1], f"{number}/2", *more)
+    line = refused(capsys, *folders, "--out", out)
     assert f"expert is '{path}', whose trajectories are not those" in line
-    assert not (out / "results.csv").exists()
-    shutil.rmtree(out / "shards" / "1-of-2")
-    train(out, "1/2", "--agent", "gail", "--expert", str(path))
-    assert merge.main([str(out)]) == 0
+    assert not out.exists()
+    shutil.rmtree(folders[0])
+    train(folders[0], "1/2", *more)
+    assert merge.main([*map(str, folders), "--out", str(out)]) == 0
 
 
 def swapped(rows):
@@ -242,54 +277,20 @@ def longer(rows):
         (swapped, "metrics.csv is damaged: its rows are not in order"),
         (renamed, "metrics.csv is damaged: its rows are not in order"),
         (unlabelled, "metrics.csv is damaged: it has no column seed"),
-        (longer, "was trained with other metrics than point 0, seed 0: mine"),
+        (longer, "was trained with other metrics than point 0, seed 0: "),
     ],
 )
 def test_tables_of_other_members_or_metrics_are_not_merged(
     change, why, tmp_path, capsys
 ):
     train(tmp_path / "parts", "1/2")
-    trained, _ = train(tmp_path / "parts", "2/2")
-    path = trained.programs[0].folder(trained.folder) / "metrics.csv"
+    plan = train(tmp_path / "parts", "2/2")
+    path = plan.trained(tmp_path / "parts")[-1].path / "metrics.csv"
     path.write_text("\n".join([*change(path.read_text().splitlines()), ""]))
     out = tmp_path / "out"
-    assert merge.main([str(tmp_path / "parts"), "--out", str(out)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: ") and line.endswith(why)
+    line = refused(capsys, tmp_path / "parts", "--out", out)
+    assert line.startswith("error: ") and why in line
     assert not out.exists()
-
-
-def test_tables_are_written_anew_when_all_shards_have_gone_on(tmp_path, capsys):
-    for shard in ("1/2", "2/2"):
-        train(tmp_path, shard)
-    assert merge.main([str(tmp_path)]) == 0
-    path = tmp_path / "config.json"
-    merged = path.read_text()
-    for earlier, status in (("200", 0), ("400", 2)):
-        changed = merged.replace('"total_steps": 300', f'"total_steps": {earlier}')
-        assert changed != merged
-        path.write_text(changed)
-        assert merge.main([str(tmp_path)]) == status
-    assert "total_steps was 400, is 300" in capsys.readouterr().err
-
-
-def copy(folder):
-    return shutil.copytree(folder, folder.parent.parent.parent / "copy")
-
-
-def test_whole_and_sharded_sweeps_keep_out_of_each_others_folders(tmp_path, capsys):
-    train(tmp_path / "whole")
-    train(tmp_path / "parts", "1/2")
-    train(tmp_path / "parts", "2/2")
-    assert merge.main([str(tmp_path / "parts")]) == 0
-    more = ["--env", "point_mass", "--grid", *GRID, "--out"]
-    assert sweep.main([*more, str(tmp_path / "whole"), "--shard", "1/2"]) == 2
-    assert "not in shards" in capsys.readouterr().err
-    assert sweep.main(["--resume", "--out", str(tmp_path / "parts")]) == 2
-    assert "continue each of them with --shard and --resume" in capsys.readouterr().err
-    for again in (["--shard", "1/3"], ["--launcher", "local", "--shards", "3"]):
-        assert sweep.main([*more, str(tmp_path / "parts"), *again]) == 2
-        assert "is cut into 2 shards" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -298,93 +299,143 @@ def jobs_to_train(monkeypatch):
     jobs_to_train = []
 
     def interrupted_at_once(options, env, jobs, **_):
-        jobs_to_train.extend(job for job in jobs if not job.finished)
-        raise Interrupted(signal.SIGTERM)
+        if jobs:
+            jobs_to_train.extend(jobs)
+            raise Interrupted(signal.SIGTERM)
 
     monkeypatch.setattr(assembly, "train", interrupted_at_once)
     return jobs_to_train
 
 
-def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
-    trained, _ = train(tmp_path, "1/2")
-    folder = trained.folder
-    more = ["--env", "point_mass", "--grid", *GRID, "--out", str(tmp_path)]
-    same = [*more, "--shard", "1/2"]
-    assert sweep.main(same) == 2
-    error = capsys.readouterr().err
-    assert f"{folder}, which is not empty: " in error and "with --resume" in error
-    assert len(error.splitlines()) == 1
-    assert sweep.main([*same, "--resume", "--gamma", "0.9"]) == 2
+STOPPED = 128 + signal.SIGTERM
+
+
+def test_a_sweep_grows_by_points_and_by_seeds(tmp_path, capsys, jobs_to_train):
+    plan = train(tmp_path)
+    again = ["--resume", "--out", str(tmp_path)]
+    assert sweep.main(again) == 0
+    rows = (tmp_path / "results.csv").read_text().splitlines()
+    assert len(rows) == 1 + 12 and not jobs_to_train
+    # Only what is missing is trained.
+    more = [*again, "--grid", "alpha=0.1,0.5", "--seeds", "4"]
+    assert sweep.main(more) == STOPPED
+    members = [(p, s) for j in jobs_to_train for p, s in zip(*j.stored.labels.values())]
+    points = [*plan.points, {"alpha": 0.1}, {"alpha": 0.5}]
+    # {"alpha": 0.1} has the sweep's own discriminator_updates, which is no point yet.
+    assert sorted(members) == [
+        *((point, 3) for point in range(4)),
+        *((point, seed) for point in (4, 5) for seed in range(4)),
+    ]
+    grown = plan_of(points, range(4), plan.algorithm)
+    for job in jobs_to_train:
+        with job.stored.opened():
+            write_metrics(job.stored)
+            job.stored.finish(
+                env_steps=300,
+                compile_seconds=1.0,
+                train_seconds=1.0,
+                device="1 x cpu",
+                device_count=1,
+            )
+    # The folder keeps its own description until training has begun.
+    assert len(grown.missing(grown.trained(tmp_path))) == 0
+    assert sweep.main(more) == 0
+    assert len((tmp_path / "results.csv").read_text().splitlines()) == 1 + 24
+    assert sweep.main(again) == 0
+    assert len((tmp_path / "results.csv").read_text().splitlines()) == 1 + 24
+    capsys.readouterr()
+    assert sweep.main([*again, "--seeds", "3"]) == 2
+    assert "seeds was 4, is 3" in capsys.readouterr().err
+    assert sweep.main([*again, "--gamma", "0.9"]) == 2
     assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
-    # The shard's own settings are used, and nothing is left to do.
-    of_the_sweep = ["--resume", "--out", str(tmp_path), "--shard", "1/2"]
-    resumed = ([*same, "--resume"], of_the_sweep, ["--resume", "--out", str(folder)])
-    for command in resumed:
+
+
+def test_sweeps_of_other_points_and_seeds_become_one(tmp_path):
+    folders = [tmp_path / name for name in ("a", "b", "c")]
+    train(folders[0], grid=("alpha=0.1,1",))
+    train(folders[1], grid=("alpha=0.5",))
+    train(folders[2], None, "--first-seed", "3", grid=("alpha=0.5,0.1,1",))
+    out = tmp_path / "out"
+    assert merge.main([*map(str, folders), "--out", str(out)]) == 0
+    rows = [x.split(",")[:3] for x in (out / "results.csv").read_text().splitlines()]
+    assert rows[1:] == [
+        [str(point), str(seed), alpha]
+        for point, alpha in enumerate(("0.1", "1.0", "0.5"))
+        for seed in range(6)
+    ]
+
+
+def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
+    plan = train(tmp_path, "1/2")
+    more = ["--env", "point_mass", "--grid", *GRID, "--out", str(tmp_path)]
+    same = [*SMALL, *more, "--shard", "1/2"]
+    assert sweep.main([*same, "--gamma", "0.9"]) == 2
+    assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
+    # The sweep's own settings are used, and nothing is left to do.
+    resumed = ["--resume", "--out", str(tmp_path), "--shard", "1/2"]
+    for command in (same, resumed):
         assert sweep.main(command) == 0
-        assert "shard 1/2 is done" in capsys.readouterr().out
-    # An unfinished program is trained with the shard's members alone. The second
-    # command is the one that the first one prints when it is interrupted.
-    program = trained.programs[-1]
-    (program.folder(folder) / "training.json").unlink()
-    for command in resumed:
-        assert sweep.main(command) == 128 + signal.SIGTERM
-        job = jobs_to_train.pop()
-        assert job.folder == program.folder(folder)
-        assert job.program.members == program.members
-        assert f"gasil_jax.sweep --resume --out {folder}" in capsys.readouterr().err
-    assert not jobs_to_train
+        told = capsys.readouterr().out
+        assert "shard 1/2 is done" in told and "6 of 12 runs" in told
+    # An unfinished program is trained with the shard's members alone. The command is
+    # the one that is printed when it is interrupted.
+    (begun,) = plan.trained(tmp_path)
+    (begun.path / "training.json").unlink()
+    assert sweep.main(same) == 2
+    assert f"training has begun in {begun.path}" in capsys.readouterr().err
+    assert sweep.main(resumed) == STOPPED
+    (job,) = jobs_to_train
+    assert job.stored == begun
+    how = f"gasil_jax.sweep --shard 1/2 --resume --out {tmp_path}"
+    assert how in capsys.readouterr().err
+    jobs_to_train.clear()
     # With other settings than those of the first it is no part of the same sweep.
-    begin = [*more, "--shard", "2/2", "--resume", "--seeds", "3"]
+    begin = [*more, "--shard", "2/2", "--seeds", "3"]
     assert sweep.main(begin) == 2
-    error = capsys.readouterr().err
-    assert "2-of-2 is of another sweep than" in error and "num_envs was 4" in error
+    assert "num_envs was 4" in capsys.readouterr().err
     # A cluster that runs a job again may do so before the job has begun.
-    begin += ["--out", str(tmp_path / "other")]
-    assert sweep.main(begin) == 128 + signal.SIGTERM
-    assert sum(len(job.program.members) for job in jobs_to_train) == 6
+    begin += ["--out", str(tmp_path / "other"), "--resume"]
+    assert sweep.main(begin) == STOPPED
+    assert sum(len(job.program.runs) for job in jobs_to_train) == 6
+
+
+def test_a_shard_keeps_out_of_other_folders(tmp_path, capsys, jobs_to_train):
+    more = [*SMALL, "--grid", *GRID, "--shard", "1/2", "--out"]
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "text.tex").touch()
+    assert sweep.main([*more, str(tmp_path / "thesis")]) == 2
+    assert "is not empty" in capsys.readouterr().err
+    (tmp_path / "run").mkdir()
+    of_a_run = run_options.parse(run_options.Options, SMALL, "x")
+    run_options.write_config(of_a_run, tmp_path / "run")
+    assert sweep.main([*more, str(tmp_path / "run")]) == 2
+    assert "a run: continue it with python -m gasil_jax.run" in capsys.readouterr().err
+    assert not jobs_to_train
+
+
+def test_two_processes_do_not_train_the_same_program(tmp_path, capsys):
+    plan = train(tmp_path)
+    begun = plan.trained(tmp_path)[0]
+    (begun.path / "training.json").unlink()
+    with begun.opened():
+        assert sweep.main(["--resume", "--out", str(tmp_path)]) == 2
+    assert f"{begun.path}, which process" in capsys.readouterr().err
 
 
 def test_shards_need_no_file_of_points_once_one_has_begun(
-    tmp_path, capsys, jobs_to_train, monkeypatch
+    tmp_path, capsys, jobs_to_train
 ):
-    launched = []
-    monkeypatch.setitem(launch.LAUNCHERS, "local", lambda *jobs: launched.append(jobs))
     path, out = tmp_path / "points.json", tmp_path / "out"
     path.write_text('[{"alpha": 0.1}, {"num_epochs": 3}]')
     more = [*SMALL, "--out", str(out), "--points-file"]
-    assert sweep.main([*more, str(path), "--shard", "1/2"]) == 128 + signal.SIGTERM
-    assert jobs_to_train.pop().program.members == ((0, 0), (0, 1), (0, 2))
+    members = lambda: jobs_to_train.pop().stored.labels
+    assert sweep.main([*more, str(path), "--shard", "1/2"]) == STOPPED
+    assert members() == {"point": (0, 0, 0), "seed": (0, 1, 2)}
     path.unlink()
-    launcher = ["--launcher", "local", "--shards", "2", "--resume"]
-    for part in (["--shard", "2/2"], launcher):
-        assert sweep.main([*more, str(tmp_path / "other.json"), *part]) == 2
-        assert "other.json, which can't be read" in capsys.readouterr().err
-    assert sweep.main([*more, str(path), "--shard", "2/2", "--gamma", "0.9"]) == 2
-    assert "is of another sweep" in capsys.readouterr().err
-    assert not jobs_to_train
-    assert sweep.main([*more, str(path), "--shard", "2/2"]) == 128 + signal.SIGTERM
-    (job,) = jobs_to_train
-    assert job.program.members == ((1, 0), (1, 1), (1, 2))
-    assert job.program.algorithm.config.num_epochs == 3
-    assert sweep.main([*more, str(path), *launcher]) == 2
-    assert "not finished: shards 1/2, 2/2" in capsys.readouterr().err
-    assert len(launched) == 1
-
-
-def test_the_first_shard_has_no_expert_to_compare(tmp_path, monkeypatch, jobs_to_train):
-    hashed = []
-    original = run_folder.expert_hash
-
-    def expert_hash(algorithm):
-        hashed.append(algorithm)
-        return original(algorithm)
-
-    monkeypatch.setattr(run_folder, "expert_hash", expert_hash)
-    more = [*SMALL, "--grid", *GRID, "--out", str(tmp_path), "--shard"]
-    for part, count in (("1/2", 1), ("2/2", 3)):
-        assert sweep.main([*more, part]) == 128 + signal.SIGTERM
-        # Each is written to config.json.
-        assert len(hashed) == count
+    assert sweep.main([*more, str(tmp_path / "other.json"), "--shard", "2/2"]) == 2
+    assert "other.json, which can't be read" in capsys.readouterr().err
+    assert sweep.main([*more, str(path), "--shard", "2/2"]) == STOPPED
+    assert members() == {"point": (1, 1, 1), "seed": (0, 1, 2)}
 
 
 def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):
@@ -393,29 +444,23 @@ def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch
         launch.LAUNCHERS, "local", lambda program, jobs, devices: launched.append(jobs)
     )
     out = tmp_path / "out"
-    for number in ("1/2", "2/2"):
-        train(out, number)
-    more = ["--env", "point_mass", "--grid", *GRID, "--launcher", "local"]
-    more += ["--seeds", "3", "--shards", "2"]
+    train(out)
+    more = [*SMALL, "--grid", *GRID, "--launcher", "local", "--shards", "2"]
     assert sweep.main([*more, "--out", str(out)]) == 2
-    assert "continue them with --resume" in capsys.readouterr().err
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "text.tex").touch()
-    for resume in ([], ["--resume"]):
-        assert sweep.main([*more, *resume, "--out", str(tmp_path / "thesis")]) == 2
-        error = capsys.readouterr().err
-        assert "is not empty" in error and "--resume" not in error
+    assert "the run in it with --resume" in capsys.readouterr().err
     assert not launched
-    assert sweep.main([*more, "--resume", "--out", str(out)]) == 0
-    (jobs,) = launched
-    assert list(jobs) == ["shard 1/2", "shard 2/2"]
-    for name, arguments in jobs.items():
-        assert arguments.count("--resume") == 1
-        assert sweep.main(arguments) == 0
-        assert f"{name} is done" in capsys.readouterr().out
+    resumed = ["--resume", "--launcher", "local", "--shards", "2", "--out", str(out)]
+    for command in ([*more, "--resume", "--out", str(out)], resumed):
+        assert sweep.main(command) == 0
+        jobs = launched.pop()
+        assert list(jobs) == ["shard 1/2", "shard 2/2"]
+        for name, arguments in jobs.items():
+            assert arguments.count("--resume") == 1
+            assert sweep.main(arguments) == 0
+            assert f"{name} is done" in capsys.readouterr().out
     # A job continues when it is run again, even if the launch was the first.
     assert sweep.main([*more, "--out", str(tmp_path / "new")]) == 2
-    assert "must hold shards" in capsys.readouterr().err
+    assert "12 of 12 runs are missing" in capsys.readouterr().err
     assert all("--resume" in arguments for arguments in launched[-1].values())
 
 

@@ -1,0 +1,109 @@
+"""A run: the settings that decide its numbers, and a key that identifies it."""
+
+import dataclasses
+import functools
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import ranges
+from gasil_jax.errors import InputError
+from gasil_jax.host import descriptions, json_reader
+from gasil_jax.host.environments import Settings
+
+#: Raise this by hand when a change makes the same settings give different numbers, by
+#: more than rounding. All earlier runs then count as missing. Runs of version 1 had
+#: their environments in step.
+ALGORITHM_VERSION = 2
+
+#: Settings of an environment that compute the same thing in different ways.
+_WAYS = ("physics", "solver")
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """The settings that decide the numbers of one training run.
+
+    The physics engine and the device are not among them, because they compute the same
+    thing in different ways.
+    """
+
+    env: str
+    algorithm: Algorithm
+    seed: int
+    settings: Settings = dataclasses.field(default_factory=Settings)
+    algorithm_version: int = ALGORITHM_VERSION
+
+    def __post_init__(self) -> None:
+        same = {name: getattr(Settings, name) for name in _WAYS}
+        if any(getattr(self.settings, name) != x for name, x in same.items()):
+            settings = dataclasses.replace(self.settings, **same)
+            object.__setattr__(self, "settings", settings)
+
+    @functools.cached_property
+    def _fields(self) -> dict[str, Any]:
+        """All settings but the seed by name, those of the algorithm in "algorithm"."""
+        values = descriptions.describe(self.algorithm)
+        for name, value in values.items():
+            if callable(value):
+                raise InputError(f"{name} is a function: a stored run needs points")
+            if name.endswith("_schedule"):
+                values[name] = [[float(x) for x in point] for point in value]
+        # 1 and 1.0 are the same number, and so the same run.
+        for part in self.algorithm.parts:
+            for name, allowed in ranges(part).items():
+                if values[name] is not None:
+                    values[name] = (int if allowed.whole else float)(values[name])
+        settings = dataclasses.asdict(self.settings)
+        settings["obs_noise"] = float(settings["obs_noise"])
+        if settings["max_episode_steps"] is None:
+            del settings["max_episode_steps"]
+        return {
+            "env": self.env,
+            **{name: x for name, x in settings.items() if name not in _WAYS},
+            "algorithm_version": self.algorithm_version,
+            "algorithm": values,
+        }
+
+    @functools.cached_property
+    def experiment(self) -> str:
+        """All settings but the seed as JSON, which the runs of a curve share."""
+        return json.dumps(self._fields, sort_keys=True)
+
+    @functools.cached_property
+    def key(self) -> str:
+        """A hash of all settings, which identifies the run."""
+        text = f"{self.experiment} {self.seed}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @functools.cached_property
+    def shapes(self) -> str:
+        """The settings that runs of one compiled program share, as JSON."""
+        traced = self.algorithm.hyperparameters
+        algorithm = {
+            name: None if name in traced else value
+            for name, value in self._fields["algorithm"].items()
+        }
+        return json.dumps({**self._fields, "algorithm": algorithm}, sort_keys=True)
+
+    def with_total_steps(self, total_steps: int) -> "Run":
+        """Return the run with another length of training."""
+        algorithm = self.algorithm.replace(total_steps=total_steps)
+        return dataclasses.replace(self, algorithm=algorithm)
+
+
+def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
+    """Return the run whose `Run.experiment`, read from JSON, and seed these are.
+
+    Settings that are newer than the stored run have their defaults.
+
+    Raises:
+      ValueError: if a name is unknown, or a value of another type.
+    """
+    fields = dict(experiment)
+    own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
+    algorithm = descriptions.read(fields.pop("algorithm"))
+    settings = json_reader.as_type(Settings, fields, "settings")
+    return Run(algorithm=algorithm, seed=seed, settings=settings, **own)
