@@ -100,9 +100,10 @@ def test_runs_sweeps_shards_and_fit_take_folders_of_any_name(env, tmp_path):
     arguments = [*SMALL, f"--out={out}", "--grid", "gamma=0.9,0.99", "--shard"]
     for shard in ("1/2", "2/2"):
         assert sweep.main([*arguments, shard]) == 0
-    assert merge.main([str(out)]) == 0
-    state = saved_states.load(out / "shards" / "2-of-2", point=1)[-1]
-    np.testing.assert_array_equal(state.iteration, [PPO.config.num_iterations])
+    assert merge.main([str(out), f"--out={tmp_path / 'united'}"]) == 0
+    for folder in (out, tmp_path / "united"):
+        state = saved_states.load(folder, point=1)[-1]
+        np.testing.assert_array_equal(state.iteration, [PPO.config.num_iterations])
 
 
 def algorithm_of(out):

@@ -18,6 +18,7 @@ from test_resume import finish
 from test_sweep import SMALL
 
 from gasil_jax import sweep
+from gasil_jax.host import run_options
 
 ray = pytest.importorskip("ray")
 
@@ -41,23 +42,24 @@ def process_of(folder):
 
 def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp_path):
     out = tmp_path / "out"
-    shard = out / "shards" / "2-of-2"
-    killed = []
+    killed, programs = [], []
 
     def kill():
-        root = shard / "programs" / "1" / "checkpoints"
-        while not any(path.name.isdecimal() for path in root.glob("*")):
+        begun = "programs/*/checkpoints/[0-9]*"
+        while not (checkpoints := list(out.glob(begun))):
             time.sleep(0.01)
-        killed.append(process_of(shard))
+        programs.append(checkpoints[0].parent.parent)
+        killed.append(process_of(programs[0]))
         os.kill(killed[0], signal.SIGKILL)
 
     thread = threading.Thread(target=kill, daemon=True)
     thread.start()
     arguments = [*LONG, *GRID, "--launcher", "ray", "--shards", "2"]
     assert sweep.main([*arguments, "--out", str(out)]) == 0
-    assert len(killed) == 1 and process_of(shard) != killed[0]
-    first = process_of(out / "shards" / "1-of-2")
-    assert first not in (os.getpid(), killed[0], process_of(shard))
+    (program,) = programs
+    (other,) = {path for path in (out / "programs").iterdir()} - {program}
+    assert len(killed) == 1 and process_of(program) != killed[0]
+    assert process_of(other) not in (os.getpid(), killed[0], process_of(program))
 
     whole = tmp_path / "whole"
     command = [sys.executable, "-m", "gasil_jax.sweep", *LONG, *GRID]
@@ -72,21 +74,25 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
     for name in curves[0]:
         np.testing.assert_array_equal(curves[0][name], curves[1][name])
     # What it had done before it was killed was not done again.
-    beside = list((shard / "programs" / "1").glob("metrics-cut-*.csv"))
+    beside = list(program.glob("metrics-cut-*.csv"))
     assert len(beside) <= 1
     assert not any(path.read_text().startswith("point,") for path in beside)
     arguments[arguments.index("ray")] = "local"
-    before = {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")}
+    before = {p: p.stat().st_mtime_ns for p in (out / "programs").rglob("*")}
     assert sweep.main([*arguments, "--out", str(out)]) == 2
     assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 0
-    assert {p: p.stat().st_mtime_ns for p in (out / "shards").rglob("*")} == before
+    assert {p: p.stat().st_mtime_ns for p in (out / "programs").rglob("*")} == before
 
 
 def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
-    """A file stands where the folder of the shard must be made."""
+    """A file stands where the folder of the programs must be made."""
     out = tmp_path / "out"
-    (out / "shards").mkdir(parents=True)
-    (out / "shards" / "1-of-1").touch()
-    arguments = [*SMALL, "--grid", "alpha=1", "--launcher", "ray", "--shards", "1"]
-    assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 2
+    arguments = [*SMALL, "--grid", "alpha=1", "--out", str(out)]
+    options = run_options.parse(sweep.Options, arguments, "x")
+    plan = sweep.make_plan(options)
+    out.mkdir()
+    run_options.write_config(options, out, points=plan.points)
+    (out / "programs").touch()
+    arguments += ["--launcher", "ray", "--shards", "1", "--resume"]
+    assert sweep.main(arguments) == 2
     assert "shard 1/1 (status 2) refused" in capsys.readouterr().err
