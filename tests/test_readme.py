@@ -50,7 +50,6 @@ NOT_RUN = {
     "python -m experiments profile": "it measures for minutes",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
-    "python -m gasil_jax.merge": "tests/sweeps/test_shards.py merges shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
     "python -m gasil_jax.sweep --env my_tasks:Line": "a test below trains it",
 }
@@ -166,11 +165,9 @@ def shard_of(call):
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
     """In a real shell, with stand-ins for the schedulers and for Python."""
     shell, slurm = BASH[1:]
-    *trained, merged = calls_of(shell, tmp_path)
-    assert sorted(shard_of(call) for call in trained) == [
+    assert sorted(shard_of(call) for call in calls_of(shell, tmp_path)) == [
         (number, 4, "OUT", False) for number in range(1, 5)
     ]
-    assert merged == ["-m", "gasil_jax.merge", "OUT"]
 
     first, last = map(int, re.search(r"--array=(\d+)-(\d+)", slurm).groups())
     for index in (first, last):
