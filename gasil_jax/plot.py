@@ -14,6 +14,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.plotting import COLORS
 from gasil_jax.host import command_line, metrics_files, output_file, run_folder
+from gasil_jax.sweeps import saved_states
 
 _STYLES = ("-", "--", "-.", ":")
 
@@ -23,13 +24,15 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of the runs. Each run is a separate curve, even if runs differ only
-        in their seeds.
+      runs: folders of runs and sweeps. Each is a separate curve, even if they differ
+        only in their seeds.
+      point: number of a sweep's point in results.csv; default the best by mean.
       out: image file to write: PNG, PDF or SVG.
       labels: labels of the runs; default "ENVIRONMENT, AGENT".
     """
 
     runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional]
+    point: int | None = None
     out: pathlib.Path = pathlib.Path("curves.png")
     labels: tuple[str, ...] = ()
 
@@ -55,49 +58,75 @@ class Curves(NamedTuple):
     evaluations: Mapping[str, np.ndarray] | None
 
 
-def read(folder: pathlib.Path, label: str | None = None) -> Curves:
-    """Return the curves of a run, which need not be finished.
+def read(
+    folder: pathlib.Path, label: str | None = None, point: int | None = None
+) -> Curves:
+    """Return the curves of a run, or of a sweep's point, which need not be finished.
+
+    Args:
+      folder: folder of the run or sweep.
+      label: label in the legend; default the environment and the agent.
+      point: number of a sweep's point; default the best by mean.
 
     Raises:
       InputError: if it is not the folder of a run, or if no episode has ended in it.
     """
-    env, agent, num_seeds = _names(folder)
-    read_table = lambda name, column: metrics_files.read_metrics(
-        folder / name, ("seed",), num_seeds, (column,), unfinished=True
-    )
-    evaluations = None
-    if (folder / "evaluations.csv").is_file():
-        evaluations = read_table("evaluations.csv", "mean") or None
-    path = folder / "metrics.csv"
-    metrics = read_table("metrics.csv", "episode_return") if path.is_file() else {}
+    env, agent, saved = _saved(folder, point)
+    metrics = _read_tables(saved, "metrics.csv", "episode_return")
     if not metrics:
-        raise InputError(f"{path} has no curves to draw yet")
+        raise InputError(f"{folder} has no curves to draw yet")
     steps, returns = metrics["env_steps"][0], metrics["episode_return"]
     env_steps, means = plotting.binned_returns(steps, returns)
     if not len(env_steps):
-        raise InputError(f"{path}: not every seed has ended an episode")
+        raise InputError(f"{folder}: not every seed has ended an episode")
     return Curves(
         env=env,
         label=label or f"{env}, {agent}",
         env_steps=env_steps,
         returns=means,
         final=metrics_files.final_returns(returns),
-        evaluations=evaluations,
+        evaluations=_read_tables(saved, "evaluations.csv", "mean") or None,
     )
 
 
-def _names(folder: pathlib.Path) -> tuple[str, str, int]:
-    """Return the environment's and the agent's name, and the number of seeds."""
+#: A folder with tables, the number of members in them, and the members to draw.
+_Members = tuple[pathlib.Path, int, Sequence[int]]
+
+
+def _saved(
+    folder: pathlib.Path, point: int | None
+) -> tuple[str, str, Sequence[_Members]]:
+    """Return the environment's and the agent's name, and where the tables are."""
     if (folder / run_folder.FIT).is_file():
         fit = run_folder.read_fit(folder)
-        return fit["env"], fit["agent"], len(fit["seeds"])
+        count = len(fit["seeds"])
+        return fit["env"], fit["agent"], [(folder, count, range(count))]
     run = run_folder.read(folder)
-    if "points" in run:
-        raise InputError(
-            f"run is {folder}, a sweep: its plots are sweep.png and "
-            "hyperparameters.png, and its curves are in curves.npz"
-        )
-    return run["env"], run["algorithm"].agent.name, run["seeds"]
+    saved = [
+        (x.root.parent, len(x.program.runs), x.indices)
+        for x in saved_states.find(folder, run, point)
+    ]
+    return run["env"], run["algorithm"].agent.name, saved
+
+
+def _read_tables(
+    saved: Sequence[_Members], name: str, column: str
+) -> dict[str, np.ndarray]:
+    """Return the columns of tables for all members, as far as all of them have come.
+
+    They are none if a table is missing or has no rows yet.
+    """
+    if not all((folder / name).is_file() for folder, _, _ in saved):
+        return {}
+    read = lambda folder, count: metrics_files.read_metrics(
+        folder / name, (), count, (column,), unfinished=True
+    )
+    every = [(read(folder, count), indices) for folder, count, indices in saved]
+    if not all(columns for columns, _ in every):
+        return {}
+    length = min(len(columns["env_steps"][0]) for columns, _ in every)
+    rows = lambda x: [columns[x][list(i), :length] for columns, i in every]
+    return {x: np.concatenate(rows(x)) for x in ("env_steps", column)}
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:
@@ -178,7 +207,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{len(options.runs)} runs"
         )
     output_file.check(options.out, (".png", ".pdf", ".svg"))
-    runs = [read(*pair) for pair in zip(options.runs, labels, strict=True)]
+    runs = [
+        read(run, label, options.point)
+        for run, label in zip(options.runs, labels, strict=True)
+    ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial)

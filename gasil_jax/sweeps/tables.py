@@ -11,8 +11,9 @@ import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.host import metrics_files, output_file
+from gasil_jax.host import command_line, metrics_files, output_file, policy_file
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
+from gasil_jax.sweeps import saved_states
 from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.programs import ProgramFolder
@@ -130,7 +131,8 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     """Write results.csv, curves.npz, summary.json and the plots; return the summary.
 
     hyperparameters.png is written only if a hyperparameter varies among the points that
-    have a final return.
+    have a final return, and policy.npz, with the policies of the best point by mean,
+    only if there is one.
 
     Args:
       folder: folder to write to.
@@ -141,13 +143,27 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
         np.savez_compressed(partial, **results.curves)
     summary = _summary(results)
     metrics_files.write_json(folder / "summary.json", summary)
+    best = summary["best_by_mean"]
     with output_file.atomic(folder / "sweep.png") as partial:
-        final, best = results.finals["final_return"], summary["best_by_mean"]
+        final = results.finals["final_return"]
         plotting.final_returns(partial, _labels(results.plan.points), final, best=best)
     if results.varied:
         with output_file.atomic(folder / "hyperparameters.png") as partial:
             _draw_hyperparameters(partial, results, summary)
+    if best is not None:
+        _write_policies(folder, results, best)
     return summary
+
+
+def _write_policies(folder: pathlib.Path, results: Results, point: int) -> None:
+    """Write policy.npz with the policies of a point, if its checkpoints are there."""
+    try:
+        env, _, seeds, states = saved_states.load(folder, point=point)
+    except InputError as error:
+        command_line.note(f"policy.npz is not written: {error}")
+    else:
+        final = results.finals["final_return"][point]
+        policy_file.save(folder / "policy.npz", states, env, seeds, final)
 
 
 def _write_results(path: pathlib.Path, results: Results) -> None:

@@ -12,7 +12,7 @@ import pytest
 from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
-from gasil_jax import evaluate, merge, run, sweep
+from gasil_jax import evaluate, merge, numpy_policy, plot, policy, run, sweep
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.host import run_folder, run_options
@@ -248,6 +248,15 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
     assert all(curves[name].shape == (4, 2, 2) for name in curves)
     assert summary["env_steps_per_second"] > 0
     assert summary["device_count"] == jax.local_device_count()
+
+    # The commands take it as they take a run, and its best policies are beside it.
+    drawn = plot.read(out, point=1)
+    assert drawn.final == pytest.approx([result["0"], result["1"]], rel=1e-3)
+    best_seed = max(range(2), key=lambda seed: curves["episode_return"][0, seed, -1])
+    env, _, _, states = saved_states.load(out, seed=best_seed)
+    expected = policy.weights(states, env)
+    for name, weight in numpy_policy.read(out, best_seed).items():
+        np.testing.assert_allclose(weight, np.squeeze(expected[name]), rtol=1e-6)
 
     # A half of the points has a program for itself, of the same shapes.
     parts = tmp_path / "parts"
