@@ -61,7 +61,7 @@ def init_member(
 
 
 def advance_members(
-    env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array
+    env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
 
@@ -70,13 +70,16 @@ def advance_members(
       algorithm: the algorithm of all members.
       states: the members' training states, (members, ...) each leaf.
       num_iterations: the number of iterations, int32 ().
+      data: the agent's data, which the members share.
 
     Returns:
       The new states, and metrics (members, chunk). The first `num_iterations` columns
       are filled and the others are NaN.
     """
     # A jitted function is traced once for both uses, which saves seconds.
-    step = jax.jit(jax.vmap(lambda state: train.iterate(env, algorithm, state)))
+    step = jax.jit(
+        jax.vmap(lambda state: train.iterate(env, algorithm, state, data=data))
+    )
     chunk = chunk_size(algorithm.config)
     metrics = jax.tree.map(
         lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype),
@@ -182,9 +185,16 @@ class Members:
     def advance(self) -> Any:
         """`advance_members`, jitted and sharded; it reuses the memory of its input."""
         advance = functools.partial(advance_members, self.env, self.algorithm)
-        return jax.jit(self._shard(advance, (P("members"), P())), donate_argnums=0)
+        specs = P("members"), P(), P()
+        return jax.jit(self._shard(advance, specs), donate_argnums=0)
 
-    def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
+    @functools.cached_property
+    def data(self) -> Any:
+        """The agent's data, once on each device."""
+        everywhere = NamedSharding(self.sharding.mesh, P())
+        return jax.device_put(self.algorithm.agent.data(), everywhere)
+
+    def compile(self, states: Any = None) -> tuple[Any, Callable[..., Any]]:
         """Return the states to start from, and the compiled `advance`.
 
         Args:
@@ -194,7 +204,8 @@ class Members:
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
-        compiled = _in_thread(lambda: self.advance.lower(shapes, np.int32(0)).compile())
+        lower = lambda: self.advance.lower(shapes, np.int32(0), self.data)
+        compiled = _in_thread(lambda: lower().compile())
         # The first states have a program of their own, which takes seconds too.
         first = _in_thread(
             lambda: jax.block_until_ready(
@@ -212,7 +223,7 @@ class Members:
         return jax.jit(self._shard(jax.vmap(function), P("members")))
 
     def train(
-        self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
+        self, advance: Callable[..., Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
         """Train for some iterations, at most `chunk`.
 
@@ -226,7 +237,7 @@ class Members:
           The states after it, and the metrics, (members, iterations) each. "env_steps"
           holds whole numbers.
         """
-        states, metrics = advance(states, np.int32(count))
+        states, metrics = advance(states, np.int32(count), self.data)
         metrics = {
             name: np.asarray(value)[: self.num_members, :count]
             for name, value in metrics.items()

@@ -13,6 +13,8 @@ import time
 from collections.abc import Iterator, Mapping
 from typing import IO, Any, NamedTuple, Required, TypedDict
 
+import jax
+
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
@@ -25,7 +27,6 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
-from gasil_jax.imitation import expert
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
@@ -393,11 +394,10 @@ def expert_hash(algorithm: Algorithm) -> dict[str, str]:
     Raises:
       ValueError: if the expert can't be read.
     """
-    source = getattr(algorithm.agent, "expert", None)
-    if not isinstance(source, str):
+    if getattr(algorithm.agent, "expert", None) is None:
         return {}
     digest = hashlib.sha256()
-    for values in expert.load(source):
+    for values in jax.tree.leaves(algorithm.agent.data()):
         digest.update(values.tobytes())
     return {EXPERT_HASH: digest.hexdigest()}
 
