@@ -6,6 +6,7 @@ alone, not from the members beside it or from the device it runs on.
 
 import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
@@ -19,7 +20,8 @@ from jax.sharding import PartitionSpec as P
 
 from gasil_jax import checks, train
 from gasil_jax.algorithms import Algorithm, check_numbers
-from gasil_jax.config import Config
+from gasil_jax.config import Config, Range
+from gasil_jax.errors import refusal
 
 T = TypeVar("T")
 
@@ -29,9 +31,13 @@ def member(states: Any, index: int) -> Any:
 
     Raises:
       IndexError: if there is no such entry. JAX alone would return the last one.
+      ValueError: if the index is no whole number.
     """
+    traced = isinstance(index, jax.Array) and jnp.issubdtype(index.dtype, np.integer)
+    if index not in Range(-math.inf, whole=True) and not traced:
+        raise refusal("index", index, "a whole number")
     count = jax.tree.leaves(states)[0].shape[0]
-    if not isinstance(index, jax.Array) and not -count <= index < count:
+    if not traced and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
 

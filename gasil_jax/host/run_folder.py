@@ -17,7 +17,7 @@ import jax
 
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.errors import InputError, NotImportable, refusal
 from gasil_jax.host import (
     command_line,
     descriptions,
@@ -338,10 +338,10 @@ _MOST_SEEDS = 2**20
 def check_seeds(seeds: int, first_seed: int) -> None:
     """Raise `InputError` if the number of seeds or the first seed is out of range."""
     if not 1 <= seeds <= _MOST_SEEDS:
-        raise InputError(f"seeds is {seeds}: it must be from 1 to {_MOST_SEEDS:,}")
+        raise refusal("seeds", seeds, f"from 1 to {_MOST_SEEDS:,}")
     last = 2**32 - seeds
     if not 0 <= first_seed <= last:
-        raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
+        raise refusal("first_seed", first_seed, f"from 0 to {last}")
 
 
 def seeds_of(description: Mapping[str, Any]) -> range:
