@@ -162,7 +162,10 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     Raises:
       ValueError: if they are none, not different or out of range.
     """
-    if jax.dtypes.issubdtype(getattr(seeds, "dtype", object), np.integer):
+    if (
+        isinstance(seeds, np.generic | np.ndarray | jax.Array)
+        and seeds.dtype.kind in "iu"
+    ):
         seeds = np.asarray(seeds).tolist()
     allowed = Range(0, 2**32 - 1, whole=True)
     if isinstance(seeds, Sequence):
