@@ -292,7 +292,7 @@ def validate_config(config: Config) -> None:
     # The number of iterations is an int32, so there may be more steps than that.
     validate_number("batch_steps", config.batch_steps, _COUNT)
     most = _LARGEST_COUNT * config.batch_steps
-    validate_number("total_steps", config.total_steps, _COUNT, most)
+    validate_number("total_steps", config.total_steps, _COUNT, most=most)
     rest = config.replace(total_steps=min(config.total_steps, _LARGEST_COUNT))
     validate(rest, config.total_steps)
     for size in ("num_envs", "minibatch_size"):
@@ -306,7 +306,7 @@ def validate_switch(name: str, value: Any) -> None:
 
 
 def validate_number(
-    name: str, value: Any, allowed: Range, most: float = _LARGEST_COUNT
+    name: str, value: Any, allowed: Range, *, most: float = _LARGEST_COUNT
 ) -> None:
     """Raise `ValueError` unless a value is a number in the range, or traced."""
     if shape := getattr(value, "shape", ()):

@@ -210,8 +210,8 @@ class Members:
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
-        lower = lambda: self.advance.lower(shapes, np.int32(0), self.data)
-        compiled = _in_thread(lambda: lower().compile())
+        arguments = shapes, np.int32(0), self.data
+        compiled = _in_thread(lambda: self.advance.lower(*arguments).compile())
         # The first states have a program of their own, which takes seconds too.
         first = _in_thread(
             lambda: jax.block_until_ready(

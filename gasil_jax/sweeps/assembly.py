@@ -53,6 +53,15 @@ class Job:
     finished: bool = False
 
     @property
+    def members(self) -> dict[str, dict[str, Any]]:
+        """What each member has of its own, by its label, POINT-SEED or SEED."""
+        labels = zip(*self.labels.values(), strict=True)
+        return {
+            "-".join(map(str, label)): {**numbers, **dict(zip(self.labels, label))}
+            for label, numbers in zip(labels, self.program.hyperparameters, strict=True)
+        }
+
+    @property
     def env_steps(self) -> int:
         """The number of environment steps over all members."""
         config = self.program.algorithm.config
@@ -170,6 +179,7 @@ def train(
                         run_name=job.name,
                         # The points of a program may change settings of the algorithm.
                         config=described(options, job.program.algorithm),
+                        members=job.members,
                     )
                 members = make_members(
                     env,

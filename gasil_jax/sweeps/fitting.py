@@ -88,7 +88,8 @@ def fit(
       checkpoint_every: environment steps per seed between two checkpoints, rounded up
         to whole iterations; default a checkpoint every ten minutes and at the end.
       evaluate_every: environment steps per seed between two evaluations of the policy's
-        mean action, rounded up to whole iterations; default none.
+        mean action, rounded up to whole iterations; the untrained and the last policy
+        are evaluated too. Default none.
       evaluate_episodes: number of episodes of each seed in an evaluation.
       callback: gets a `FitProgress` after each chunk, on the host. Training ends there
         if it returns true; a checkpoint is written, from which it can be resumed.
