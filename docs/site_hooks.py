@@ -1,5 +1,6 @@
 """What MkDocs does beside its plugins: formulas, notebooks, pages of results."""
 
+import base64
 import html
 import json
 import logging
@@ -15,6 +16,8 @@ _LOG = logging.getLogger("mkdocs.hooks.site")
 _FORMULA = re.compile(
     r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL
 )
+#: A picture and where it is.
+_PICTURE = re.compile(r'(<img [^>]*src="([^"]*)"[^>]*>)')
 #: TeX's spaces that the converter leaves out: around a function's name, and none behind
 #: a minus that is a sign.
 _SPACES = (
@@ -38,8 +41,12 @@ def _mathml(match: re.Match[str]) -> str:
 
 
 def on_page_content(content: str, page: Any, **_: Any) -> str:
-    """Turn a page's TeX into MathML, which browsers draw without a script."""
+    """Turn a page's TeX into MathML, and link each picture to its file.
+
+    Browsers draw MathML without a script. Many panels can be read in full size only.
+    """
     content = _FORMULA.sub(_mathml, content)
+    content = _PICTURE.sub(r'<a href="\2">\1</a>', content)
     for formula in re.findall(r"<math.*?</math>", content, re.DOTALL):
         if "\\" in formula:  # as the converter writes what it does not know
             _LOG.warning("%s: a formula that is not known: %s", page.url, formula)
@@ -47,7 +54,7 @@ def on_page_content(content: str, page: Any, **_: Any) -> str:
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
-    """Make a page of each notebook, without what its code prints and draws."""
+    """Make a page of each notebook, with what its code has printed and drawn."""
     docs = pathlib.Path(config.docs_dir)
     for path in docs.glob("examples/*.ipynb"):
         parts = []
@@ -55,6 +62,15 @@ def on_files(files: Any, config: Any, **_: Any) -> Any:
             text = "".join(cell["source"])
             is_code = cell["cell_type"] == "code"
             parts.append(f"```python\n{text}\n```" if is_code else text)
+            for output in cell.get("outputs", ()):
+                if "text" in output:
+                    parts.append(f"```text\n{''.join(output['text'])}```")
+                else:
+                    name = f"{path.stem}-{len(parts)}.png"
+                    picture = base64.b64decode(output["data"]["image/png"])
+                    uri = (path.parent / name).relative_to(docs).as_posix()
+                    files.append(File.generated(config, uri, content=picture))
+                    parts.append(f"![output of the code above]({name})")
         page = path.relative_to(docs).with_suffix(".md").as_posix()
         files.append(File.generated(config, page, content="\n\n".join(parts)))
     return files

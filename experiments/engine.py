@@ -254,13 +254,15 @@ def record(
         finite = [values[np.isfinite(values)] for values in finite]
         return np.array([x.mean() if len(x) else np.nan for x in finite])
 
+    # That of the untrained policy is not stored.
+    scores = {x: y[evaluations["env_steps"] > 0] for x, y in evaluations.items()}
     return Record(
         env_steps=np.array([steps[part[-1]] for part in parts]),
         episode_return=means("episode_return"),
         episode_length=means("episode_length"),
         provenance=provenance,
-        evaluation_steps=evaluations.get("env_steps", np.empty(0)),
-        evaluation_return=evaluations.get("mean", np.empty(0)),
+        evaluation_steps=scores.get("env_steps", np.empty(0)),
+        evaluation_return=scores.get("mean", np.empty(0)),
     )
 
 

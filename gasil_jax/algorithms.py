@@ -9,12 +9,12 @@ from gasil_jax.config import (
     Config,
     check_declared,
     names,
-    refusal,
     traced_names,
     validate,
     validate_config,
+    validate_switch,
 )
-from gasil_jax.errors import unknown
+from gasil_jax.errors import refusal, unknown
 from gasil_jax.imitation import AGENTS, Agent, agents_with
 from gasil_jax.rewards import REWARD_MODELS, RewardModel
 
@@ -82,8 +82,7 @@ class Algorithm:
 
     def _with(self, model: type[RewardModel], is_on: Any) -> "Algorithm":
         """Return a copy with or without a model, in the order of `REWARD_MODELS`."""
-        if not isinstance(is_on, bool):
-            raise refusal(model.switch, is_on, "True or False")
+        validate_switch(model.switch, is_on)
         others = [x for x in self.rewards if not isinstance(x, model)]
         if (len(others) < len(self.rewards)) == is_on:
             return self
@@ -117,7 +116,7 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
       ValueError: if a name is unknown.
     """
     if not isinstance(agent, str) or agent not in AGENTS:
-        raise ValueError(unknown("agent", str(agent), tuple(AGENTS)))
+        raise ValueError(unknown("agent", agent, tuple(AGENTS)))
     return Algorithm(AGENTS[agent]()).replace(**settings)
 
 

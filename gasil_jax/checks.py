@@ -10,6 +10,7 @@ from gasil_envs import own_code, own_environment
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.context import Sizes
+from gasil_jax.errors import refusal, shown
 
 
 def check_environment(env: Any) -> None:
@@ -46,8 +47,8 @@ def _check_interface(env: Any) -> None:
     for name in own_environment.INTERFACE:
         if not hasattr(env, name):
             raise ValueError(
-                f"env is {env!r}, which has no {name}: it must be an environment with "
-                "Brax's interface, as gasil_jax.make_env gives"
+                f"env is {shown(env)}, which has no {name}: it must be an environment "
+                "with Brax's interface, as gasil_jax.make_env gives"
             )
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
@@ -82,7 +83,7 @@ def check_key(key: Any) -> None:
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not typed and dtype != jnp.uint32:
-        raise ValueError(f"key is {key!r}: it must be like jax.random.key(0)")
+        raise refusal("key", key, "like jax.random.key(0)")
     if typed and key.shape:
         raise ValueError(
             f"key has shape {key.shape}: it must be a single key (to train with "

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 from flax import struct
 
-from gasil_jax.errors import unknown
+from gasil_jax.errors import refusal, unknown
 
 #: A factor that multiplies a number, as a function of environment steps. Either an
 #: Optax schedule (any pure function of the steps) or (steps, factor) points, linear
@@ -48,13 +48,8 @@ class Range(NamedTuple):
 
     def __contains__(self, value: object) -> bool:
         """Return whether a value is a number in the range; a bool is not."""
-        # NumPy's integers are not `int`, but `bool` is.
-        kind = numbers.Integral if self.whole else numbers.Real
-        if not isinstance(value, kind) or isinstance(value, bool):
-            return False
-        try:
-            number = float(value)
-        except OverflowError:  # a whole number that is too large for a float
+        number = _as_float(value)
+        if number is None or (self.whole and not isinstance(value, numbers.Integral)):
             return False
         if self.excludes_low:
             # JAX computes in float32, and takes its subnormal numbers as 0.
@@ -71,6 +66,18 @@ class Range(NamedTuple):
         least += " in float32" if self.excludes_low else " or more"
         most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"
         return f"{least} and {most}"
+
+
+def _as_float(value: Any) -> float | None:
+    """Return a real number, infinite if it is too large; None if it is no number."""
+    # NumPy's integers are not `int`, but `bool` is, and NumPy's durations are integers.
+    is_real = isinstance(value, numbers.Real)
+    if not is_real or isinstance(value, bool | np.timedelta64):
+        return None
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 _COUNT = Range(1, whole=True)
@@ -256,8 +263,8 @@ def validate(settings: Any, total_steps: int) -> None:
         value, allowed = getattr(settings, field.name), field.metadata["allowed"]
         if "range" in allowed and not (value is None and field.default is None):
             validate_number(field.name, value, allowed["range"])
-        elif "switch" in allowed and not isinstance(value, bool):
-            raise refusal(field.name, value, "True or False")
+        elif "switch" in allowed:
+            validate_switch(field.name, value)
         elif "choices" in allowed:
             if not isinstance(value, str):
                 raise refusal(field.name, value, "a string")
@@ -285,24 +292,21 @@ def validate_config(config: Config) -> None:
     # The number of iterations is an int32, so there may be more steps than that.
     validate_number("batch_steps", config.batch_steps, _COUNT)
     most = _LARGEST_COUNT * config.batch_steps
-    validate_number("total_steps", config.total_steps, _COUNT, most)
+    validate_number("total_steps", config.total_steps, _COUNT, most=most)
     rest = config.replace(total_steps=min(config.total_steps, _LARGEST_COUNT))
     validate(rest, config.total_steps)
     for size in ("num_envs", "minibatch_size"):
         _validate_divides(size, getattr(config, size), config.batch_steps)
 
 
-def refusal(name: str, value: Any, allowed: object) -> ValueError:
-    """Return the error for a value that is not allowed, in one line."""
-    # The repr of NumPy's numbers also names their type.
-    is_number = isinstance(value, numbers.Number)
-    # The repr of an array may have several lines.
-    shown = value if is_number else " ".join(repr(value).split())
-    return ValueError(f"{name} is {shown}: it must be {allowed}")
+def validate_switch(name: str, value: Any) -> None:
+    """Raise `ValueError` unless a value is true or false."""
+    if not isinstance(value, bool):
+        raise refusal(name, value, "True or False")
 
 
 def validate_number(
-    name: str, value: Any, allowed: Range, most: float = _LARGEST_COUNT
+    name: str, value: Any, allowed: Range, *, most: float = _LARGEST_COUNT
 ) -> None:
     """Raise `ValueError` unless a value is a number in the range, or traced."""
     if shape := getattr(value, "shape", ()):
@@ -312,13 +316,13 @@ def validate_number(
         )
     if isinstance(value, jax.core.Tracer):
         return
-    if isinstance(value, np.ndarray | jax.Array):
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
         value = value.item()
     if isinstance(value, str):
         raise refusal(name, value, "a number")
     most = most if allowed.whole else _LARGEST_FLOAT
-    is_real = isinstance(value, numbers.Real)
-    if is_real and value > most and math.isinf(allowed.high):
+    if (_as_float(value) or 0.0) > most and math.isinf(allowed.high):
         raise refusal(name, value, f"{allowed}, at most {most:g}")
     if value not in allowed:
         raise refusal(name, value, allowed)

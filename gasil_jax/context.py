@@ -46,6 +46,7 @@ class Context(struct.PyTreeNode):
       config: the settings of the loop and of PPO, with their numbers in this iteration.
       policy: (params, normalized observation) -> mean, log standard deviation.
       value: (params, normalized observation) -> value.
+      data: what the agent's `data` returns.
     """
 
     rollout: Rollout
@@ -56,3 +57,4 @@ class Context(struct.PyTreeNode):
     config: Config
     policy: Callable[..., tuple[jax.Array, jax.Array]] = struct.field(pytree_node=False)
     value: Callable[..., jax.Array] = struct.field(pytree_node=False)
+    data: Any = ()

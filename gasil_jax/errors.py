@@ -1,8 +1,10 @@
 """The error for bad input, and its wording. Every layer may import this module."""
 
 import difflib
+import numbers
 import shlex
 from collections.abc import Sequence
+from typing import Any
 
 
 class InputError(ValueError):
@@ -11,6 +13,22 @@ class InputError(ValueError):
 
 class NotImportable(InputError):
     """A MODULE:NAME that can't be imported here."""
+
+
+def refusal(name: str, value: Any, allowed: object) -> InputError:
+    """Return the error for a value that is not allowed."""
+    return InputError(f"{name} is {shown(value)}: it must be {allowed}")
+
+
+def shown(value: Any) -> str:
+    """Return a value in one line that is not long, whatever it is."""
+    try:
+        # The repr of NumPy's numbers also names their type.
+        show = str if isinstance(value, numbers.Number) else repr
+        text = " ".join(show(value).split())
+    except Exception:  # It may be an object of the user's, or a number of 5,000 digits.
+        text = f"of type {type(value).__name__}"
+    return text if len(text) < 300 else f"{text[:300]}..."
 
 
 def nearest(name: str, allowed: Sequence[str]) -> str | None:
@@ -24,17 +42,18 @@ def nearest(name: str, allowed: Sequence[str]) -> str | None:
 
 
 def unknown(
-    kind: str, name: str, allowed: Sequence[str], *, forms: Sequence[str] = ()
+    kind: str, name: Any, allowed: Sequence[str], *, forms: Sequence[str] = ()
 ) -> str:
     """Return the error message for a name that is not among the allowed ones.
 
     Args:
       kind: the kind of thing that is named, such as "agent".
-      name: the unknown name.
+      name: the unknown name, or a value that is no string.
       allowed: the names that exist.
       forms: the forms of other allowed names, such as MODULE:NAME.
     """
-    return f"{kind} {name!r} is unknown: {did_you_mean(name, allowed, forms)}"
+    text = name if isinstance(name, str) else shown(name)
+    return f"{kind} {shown(text)} is unknown: {did_you_mean(text, allowed, forms)}"
 
 
 def did_you_mean(name: str, allowed: Sequence[str], forms: Sequence[str] = ()) -> str:

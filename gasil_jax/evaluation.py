@@ -10,9 +10,10 @@ from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import checks, policy, train
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import Range
+from gasil_jax.config import Range, validate_switch
+from gasil_jax.errors import refusal
 
-_EPISODES = Range(1, 2**31 - 1, whole=True)
+_COUNT = Range(1, 2**31 - 1, whole=True)
 
 
 @full_precision
@@ -79,8 +80,10 @@ def run_episodes(
       ValueError: as in `evaluate`.
     """
     checks.check_key(key)
-    if num_episodes not in _EPISODES:
-        raise ValueError(f"num_episodes is {num_episodes!r}: it must be {_EPISODES}")
+    for name, value in (("num_episodes", num_episodes), ("num_steps", num_steps)):
+        if value not in _COUNT:
+            raise refusal(name, value, _COUNT)
+    validate_switch("deterministic", deterministic)
     reset_key, act_key = jax.random.split(key)
 
     def step(carry: Any, key: jax.Array) -> Any:

@@ -15,6 +15,7 @@ the last is followed by tanh; the output is the mean of a Gaussian.
 """
 
 import json
+import numbers
 import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -22,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import npz
-from gasil_jax.errors import unknown
+from gasil_jax.errors import refusal, shown, unknown
 
 #: Folder of the trained policies that come with the package, and how they are named.
 ZOO, ZOO_PREFIX = pathlib.Path(__file__).with_name("zoo"), "zoo:"
@@ -39,10 +40,14 @@ def zoo() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in ZOO.glob("*.npz")))
 
 
+def _is_path(path: Any) -> bool:
+    return isinstance(path, str | pathlib.PurePath)
+
+
 def _file(path: str | pathlib.Path) -> pathlib.Path:
     """Return the file of a saved policy."""
-    if not isinstance(path, str | pathlib.PurePath):
-        raise ValueError(f"path is {path!r}: it must be a string or a pathlib.Path")
+    if not _is_path(path):
+        raise refusal("path", path, "a string or a pathlib.Path")
     if str(path).startswith(ZOO_PREFIX):
         name = str(path).removeprefix(ZOO_PREFIX)
         if name not in zoo():
@@ -65,12 +70,9 @@ def about(name: str | pathlib.Path) -> dict[str, Any]:
     Raises:
       ValueError: if there is no such policy.
     """
-    name = str(name)
-    if not name.startswith(ZOO_PREFIX):
-        raise ValueError(
-            f"name is {name!r}: it must be zoo:NAME, with NAME one of "
-            f"{', '.join(zoo())}"
-        )
+    if not _is_path(name) or not str(name).startswith(ZOO_PREFIX):
+        allowed = f"zoo:NAME, with NAME one of {', '.join(zoo())}"
+        raise refusal("name", name, allowed)
     path = _file(name)
     try:
         stored = dict(json.loads(str(npz.read(path)["about"])))
@@ -121,23 +123,28 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
       ValueError: if it is not a saved policy, or has no such seed.
     """
     path = _file(path)
+    name = " ".join(str(path).splitlines())
     if not path.exists():
         raise ValueError(
-            f"{path} does not exist: it must be a finished run's folder or its "
+            f"{name} does not exist: it must be a finished run's folder or its "
             f"policy.npz, or {ZOO_PREFIX}NAME"
         )
     try:
         arrays = _read(path)
     except ValueError as error:
-        raise ValueError(f"{path} is not a saved policy ({error})") from None
+        raise ValueError(f"{name} is not a saved policy ({error})") from None
     seeds = arrays.pop("seeds").tolist()
     returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
     shared = {name: arrays.pop(name) for name in _SHARED}
     if seed is None:
         seed = seeds[int(np.argmax(returns))]
-    if seed not in seeds:
+    # A list also has numbers that are equal, such as True and 1.0.
+    whole = isinstance(seed, numbers.Integral) and not isinstance(
+        seed, bool | np.timedelta64
+    )
+    if not whole or seed not in seeds:
         listed = ", ".join(map(str, seeds))
-        raise ValueError(f"seed is {seed}: {path} has a policy of {listed}")
+        raise ValueError(f"seed is {shown(seed)}: {name} has a policy of {listed}")
     index = seeds.index(seed)
     weights = {name: value[index] for name, value in arrays.items()} | shared
     # JAX takes no numbers of another byte order. Limits may be infinite.

@@ -30,12 +30,12 @@ from typing import Any, NamedTuple
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
-from gasil_jax.errors import unknown
+from gasil_jax.errors import refusal, unknown
 from gasil_jax.imitation import AGENTS, Agent
 
 #: The preset that runs start from if none is named.
 DEFAULT = "tuned"
-_DELAYS = Range(1, whole=True)
+_COUNT = Range(1, 2**31 - 1, whole=True)
 Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
 Rows = Mapping[tuple[str, str], Overrides]
@@ -159,7 +159,7 @@ def names() -> tuple[str, ...]:
 def check(name: str) -> None:
     """Raise `ValueError` unless there is a preset of this name."""
     if not isinstance(name, str) or name not in PRESETS:
-        raise ValueError(unknown("preset", str(name), names()))
+        raise ValueError(unknown("preset", name, names()))
 
 
 def preset(
@@ -192,12 +192,14 @@ def preset(
     check(name)
     kind = AGENTS.get(agent, agent) if isinstance(agent, str) else agent
     if not (isinstance(kind, type) and issubclass(kind, Agent)):
-        raise ValueError(unknown("agent", str(agent), tuple(AGENTS)))
-    if reward_delay not in _DELAYS:
-        raise ValueError(f"reward_delay is {reward_delay!r}: it must be {_DELAYS}")
+        raise ValueError(unknown("agent", agent, tuple(AGENTS)))
+    if reward_delay not in _COUNT:
+        raise refusal("reward_delay", reward_delay, _COUNT)
+    if action_size is not None and action_size not in _COUNT:
+        raise refusal("action_size", action_size, _COUNT)
     ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
-        raise ValueError(unknown("env", str(env), ours, forms=others))
+        raise ValueError(unknown("env", env, ours, forms=others))
     if name == "scaled" and kind.name == "ppo" and action_size is not None:
         row = scaled(action_size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)

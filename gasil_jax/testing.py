@@ -27,7 +27,7 @@ def example_context(env: Any, algorithm: Algorithm, key: jax.Array) -> Context:
     """
     checks.check_environment(env)
     checks.check(env, algorithm)
-    state = train.init(env, algorithm, key)
+    state, data = train.init(env, algorithm, key), algorithm.agent.data()
     algorithm = schedules.at(algorithm, state.hyperparameters, state.iteration)
     keys = train.Keys(*jax.random.split(state.key, 6))
-    return train.collect(env, algorithm, state, keys).context
+    return train.collect(env, algorithm, state, keys=keys, data=data).context

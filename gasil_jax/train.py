@@ -233,7 +233,7 @@ def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
 
 @full_precision
 def iterate(
-    env: Any, algorithm: Algorithm, state: TrainState
+    env: Any, algorithm: Algorithm, state: TrainState, *, data: Any = None
 ) -> tuple[TrainState, Metrics]:
     """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
 
@@ -242,6 +242,8 @@ def iterate(
       algorithm: the algorithm that `init` was given. Its numbers do not matter: the
         state has its own, which may be replaced.
       state: the state before the iteration.
+      data: what `algorithm.agent.data()` returns; if it is not given, it is read while
+        this is traced, and is a constant of the program.
 
     Returns:
       The next state, and metrics, float32 () each; means over the whole episodes that
@@ -254,9 +256,10 @@ def iterate(
         too few or too many values, or a wrong shape or dtype.
     """
     _check_state(env, algorithm, state)
+    data = algorithm.agent.data() if data is None else data
     algorithm = schedules.at(algorithm, state.hyperparameters, state.iteration)
     keys = Keys(*jax.random.split(state.key, 6))
-    experience = collect(env, algorithm, state, keys)
+    experience = collect(env, algorithm, state, keys=keys, data=data)
     return learn(algorithm, state, experience, keys=keys)
 
 
@@ -294,7 +297,7 @@ class Experience(NamedTuple):
 
 
 def collect(
-    env: Any, algorithm: Algorithm, state: TrainState, keys: Keys
+    env: Any, algorithm: Algorithm, state: TrainState, *, keys: Keys, data: Any
 ) -> Experience:
     """Sample policy trajectories, and make the rewards to learn from.
 
@@ -303,6 +306,7 @@ def collect(
       algorithm: with its numbers in this iteration.
       state: the state before the iteration.
       keys: the iteration's keys, of which `act` and `rewards` are consumed.
+      data: the agent's data.
     """
     config = algorithm.config
     environments, batch = sample_trajectories(env, config, state, key=keys.act)
@@ -317,6 +321,7 @@ def collect(
         config=config,
         policy=policy.apply,
         value=value.apply,
+        data=jax.tree.map(jnp.asarray, data),
     )
     metrics: Metrics = {}
     states, healthy = [], jnp.bool_(True)
@@ -581,7 +586,10 @@ class Train(Protocol):
     """The type of the function that `make_train` returns."""
 
     def __call__(
-        self, key: jax.Array, hyperparameters: Mapping[str, Any] | None = None
+        self,
+        key: jax.Array,
+        hyperparameters: Mapping[str, Any] | None = None,
+        data: Any = None,
     ) -> tuple[TrainState, Metrics]:
         """Return the last state, and metrics (iterations,); consumes the key."""
 
@@ -595,9 +603,10 @@ def make_train(env: Any, algorithm: Algorithm) -> Train:
       algorithm: how to learn: an agent, models of rewards, and the config.
 
     Returns:
-      ``train(key, hyperparameters=None) -> (TrainState, Metrics)``. The key is
-      consumed; hyperparameters are numbers by name, such as ``{"alpha": 0.2}``, and the
-      algorithm has the others; metrics are float32 (iterations,) each.
+      ``train(key, hyperparameters=None, data=None) -> (TrainState, Metrics)``. The key
+      is consumed; hyperparameters are numbers by name, such as ``{"alpha": 0.2}``, and
+      the algorithm has the others; data is as in `iterate`; metrics are float32
+      (iterations,) each.
 
     Raises:
       ValueError: if the algorithm can't train in the environment; nothing is compiled.
@@ -606,10 +615,12 @@ def make_train(env: Any, algorithm: Algorithm) -> Train:
     checks.check(env, algorithm)
 
     def train(
-        key: jax.Array, hyperparameters: Mapping[str, Any] | None = None
+        key: jax.Array,
+        hyperparameters: Mapping[str, Any] | None = None,
+        data: Any = None,
     ) -> tuple[TrainState, Metrics]:
         return jax.lax.scan(
-            lambda state, _: iterate(env, algorithm, state),
+            lambda state, _: iterate(env, algorithm, state, data=data),
             init(env, algorithm, key, hyperparameters),
             length=algorithm.config.num_iterations,
         )

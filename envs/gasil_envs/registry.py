@@ -11,6 +11,7 @@ from typing import Any
 import brax.envs
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs import Env, Wrapper
 
 from gasil_envs import locomotion, own_environment, point_mass, wrappers
@@ -54,6 +55,15 @@ BRAX = "brax:"
 _EPISODE_LENGTH = 1000
 
 
+def _refusal(name: str, value: Any, allowed: str) -> ValueError:
+    """Return the error for a value that is not allowed, in one short line."""
+    try:
+        shown = " ".join(repr(value).split())[:300]
+    except Exception:  # It may be an object of the user's, or a number of 5,000 digits.
+        shown = f"of type {type(value).__name__}"
+    return ValueError(f"{name} is {shown}: it must be {allowed}")
+
+
 def _refuse_unknown(
     kind: str, name: Any, allowed: Iterable[str], *, forms: Iterable[str] = ()
 ) -> None:
@@ -68,9 +78,10 @@ def _refuse_unknown(
     allowed = tuple(allowed)
     listed = ", ".join((*allowed, *forms))
     if not isinstance(name, str):
-        raise ValueError(f"{kind} is {name!r}: it must be one of {listed}")
+        raise _refusal(kind, name, f"one of {listed}")
     if name in allowed:
         return
+    name = name[:300]
     # The prefix, which all names have, must not make them similar.
     bare = {x.removeprefix(BRAX): x for x in allowed}
     given = name.removeprefix(BRAX).lower()  # Gymnasium writes "Hopper-v5".
@@ -150,9 +161,12 @@ def _build_of_brax(name: str) -> Env:
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
     """Return whether a value is a whole number from `low` to `high`; a bool is not."""
-    # NumPy's integers are not `int`, but `bool` is.
-    whole = isinstance(value, numbers.Integral) and not isinstance(value, bool)
-    return whole and low <= value <= high
+    return _is_number(value, numbers.Integral) and low <= value <= high
+
+
+def _is_number(value: Any, kind: type) -> bool:
+    # NumPy's integers are not `int`, but `bool` is, and NumPy's durations are integers.
+    return isinstance(value, kind) and not isinstance(value, bool | np.timedelta64)
 
 
 def check(name: str, settings: Settings) -> None:
@@ -176,20 +190,14 @@ def check(name: str, settings: Settings) -> None:
             f"{settings.physics!r}"
         )
     if not isinstance(settings.terminal_limits, bool):
-        raise ValueError(
-            f"terminal_limits is {settings.terminal_limits!r}: it must be True or False"
-        )
+        raise _refusal("terminal_limits", settings.terminal_limits, "True or False")
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
-        raise ValueError(
-            f"reward_delay is {delay!r}: it must be a whole number, from 1 to "
-            f"{2**31 - 1}"
-        )
+        raise _refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
     # Numbers are float32.
-    real = isinstance(noise, numbers.Real) and not isinstance(noise, bool)
-    if not (real and 0.0 <= noise <= 3.4e38):
-        raise ValueError(f"obs_noise is {noise!r}: it must be finite and 0 or more")
+    if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
+        raise _refusal("obs_noise", noise, "finite and 0 or more")
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:
@@ -234,10 +242,8 @@ def make(name: str, **settings: Any) -> Env:
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.max_episode_steps is not None:
         if not _is_whole(chosen.max_episode_steps, 1, limit):
-            raise ValueError(
-                f"max_episode_steps is {chosen.max_episode_steps!r}: it must be a "
-                f"whole number from 1 to {limit}, the environment's own limit"
-            )
+            own_limit = f"a whole number from 1 to {limit}, the environment's own limit"
+            raise _refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
         limit = int(chosen.max_episode_steps)
     env = wrappers.EpisodeLimit(env, limit, terminal=chosen.terminal_limits)
     if chosen.reward_delay > 1:

@@ -83,17 +83,26 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
             link.symlink_to(folder.absolute().parent, target_is_directory=True)
             with ocp.StandardCheckpointer() as checkpointer:
                 yield checkpointer, link / folder.name
-    except ValueError as error:
+    except (ValueError, OSError) as error:
         # TensorStore's message is long, and names the other path.
-        if number := re.search(r"os_error_code='(\d+)'", str(error)):
-            code = int(number[1])
-            raise OSError(code, os.strerror(code)) from None
+        if codes := re.findall(r"os_error_code='(\d+)'", "".join(_chain(error))):
+            raise OSError(int(codes[0]), os.strerror(int(codes[0]))) from None
         raise
     else:
         # After an error threads that are left still report.
         sys.unraisablehook = before
     finally:
         logger.setLevel(level)
+
+
+def _chain(error: BaseException | None) -> list[str]:
+    """Return the messages of an error and of those that led to it, the first one first.
+
+    Orbax cleans up behind its own failure, and that may fail in its turn.
+    """
+    if error is None:
+        return []
+    return [*_chain(error.__cause__ or error.__context__), str(error)]
 
 
 def _is_news(record: logging.LogRecord) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, get_type_hints
 from gasil_envs import own_code
 from gasil_jax.algorithms import Algorithm, check
 from gasil_jax.config import names
-from gasil_jax.errors import InputError, NotImportable, unknown
+from gasil_jax.errors import InputError, NotImportable, refusal, unknown
 from gasil_jax.host import json_reader
 from gasil_jax.imitation import AGENTS, Agent
 from gasil_jax.rewards import REWARD_MODELS
@@ -25,7 +25,7 @@ def find_agent(name: Any) -> type[Agent]:
       ValueError: if the name is unknown, or if it names no agent.
     """
     if not isinstance(name, str):
-        raise ValueError(f"agent is {name!r}: it must be a string")
+        raise refusal("agent", name, "a string")
     if ":" not in name:
         if name not in AGENTS:
             raise ValueError(

@@ -165,7 +165,7 @@ class _Tables:
         trackers: Sequence[Tracker],
         record: Mapping[str, Any] | None,
     ):
-        self._labels, self._trackers = labels, trackers
+        self._trackers = trackers
         # The finite returns since the last record, after an empty array.
         self._returns = [np.empty(0, np.float32)]
         self.score: float | None = None
@@ -187,7 +187,7 @@ class _Tables:
     def write(self, metrics: _Columns) -> None:
         """Write and log the metrics of a chunk, (members, iterations) each."""
         self._metrics.write(metrics)
-        log(self._trackers, self._labels, metrics)
+        log(self._trackers, metrics)
         returns = metrics["episode_return"]
         self._returns.append(returns[np.isfinite(returns)])
 
@@ -230,7 +230,7 @@ class _Tables:
 
 
 def _restored(
-    members: Members, root: pathlib.Path, progress: Progress, tables: Sequence[str]
+    members: Members, root: pathlib.Path, progress: Progress, *, tables: Sequence[str]
 ) -> tuple[_Training, Mapping[str, Any] | None]:
     """Return the training after the newest undamaged checkpoint, and its record.
 
@@ -292,6 +292,7 @@ def _save(
     checkpoints: PeriodicCheckpoints,
     training: _Training,
     tables: _Tables,
+    *,
     progress: Progress,
 ) -> None:
     """Write the tables to the disk, and a checkpoint if any are kept."""
@@ -343,7 +344,7 @@ def drive(
     """
     root = folder / "checkpoints"
     names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
-    training, record = _restored(members, root, progress, names)
+    training, record = _restored(members, root, progress, tables=names)
     with command_line.input_checked():
         tables = _Tables(
             members,
@@ -368,6 +369,10 @@ def drive(
 
     progress.phase("training", steps_of(first))
     started, stopped, warned = time.monotonic(), False, False
+    # A checkpoint from before the first iteration may have a score already.
+    has_scores = record is not None and record.get("evaluations_size")
+    if first == 0 and interruption.signal is None and not has_scores:
+        tables.evaluate(training, progress)
     while training.left and not stopped and interruption.signal is None:
         done = training.done
         most = min(checkpoints.iterations_left(done), tables.iterations_left(done))
@@ -382,13 +387,13 @@ def drive(
             )
         scores = tables.evaluate(training, progress)
         if checkpoints.is_due(training.done, tables.score):
-            _save(checkpoints, training, tables, progress)
+            _save(checkpoints, training, tables, progress=progress)
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
     train_seconds = time.monotonic() - started
     unsaved = None
     try:
-        _save(checkpoints, training, tables, progress)
+        _save(checkpoints, training, tables, progress=progress)
     except checkpoint.WriteError as error:
         unsaved = error
     with progress.aside("closing the trackers"):

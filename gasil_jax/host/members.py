@@ -6,6 +6,7 @@ alone, not from the members beside it or from the device it runs on.
 
 import dataclasses
 import functools
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
@@ -19,7 +20,8 @@ from jax.sharding import PartitionSpec as P
 
 from gasil_jax import checks, train
 from gasil_jax.algorithms import Algorithm, check_numbers
-from gasil_jax.config import Config
+from gasil_jax.config import Config, Range
+from gasil_jax.errors import refusal
 
 T = TypeVar("T")
 
@@ -29,9 +31,13 @@ def member(states: Any, index: int) -> Any:
 
     Raises:
       IndexError: if there is no such entry. JAX alone would return the last one.
+      ValueError: if the index is no whole number.
     """
+    traced = isinstance(index, jax.Array) and jnp.issubdtype(index.dtype, np.integer)
+    if index not in Range(-math.inf, whole=True) and not traced:
+        raise refusal("index", index, "a whole number")
     count = jax.tree.leaves(states)[0].shape[0]
-    if not isinstance(index, jax.Array) and not -count <= index < count:
+    if not traced and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
 
@@ -61,7 +67,7 @@ def init_member(
 
 
 def advance_members(
-    env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array
+    env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
 
@@ -70,13 +76,16 @@ def advance_members(
       algorithm: the algorithm of all members.
       states: the members' training states, (members, ...) each leaf.
       num_iterations: the number of iterations, int32 ().
+      data: the agent's data, which the members share.
 
     Returns:
       The new states, and metrics (members, chunk). The first `num_iterations` columns
       are filled and the others are NaN.
     """
     # A jitted function is traced once for both uses, which saves seconds.
-    step = jax.jit(jax.vmap(lambda state: train.iterate(env, algorithm, state)))
+    step = jax.jit(
+        jax.vmap(lambda state: train.iterate(env, algorithm, state, data=data))
+    )
     chunk = chunk_size(algorithm.config)
     metrics = jax.tree.map(
         lambda x: jnp.full((x.shape[0], chunk), jnp.nan, x.dtype),
@@ -182,9 +191,16 @@ class Members:
     def advance(self) -> Any:
         """`advance_members`, jitted and sharded; it reuses the memory of its input."""
         advance = functools.partial(advance_members, self.env, self.algorithm)
-        return jax.jit(self._shard(advance, (P("members"), P())), donate_argnums=0)
+        specs = P("members"), P(), P()
+        return jax.jit(self._shard(advance, specs), donate_argnums=0)
 
-    def compile(self, states: Any = None) -> tuple[Any, Callable[[Any, Any], Any]]:
+    @functools.cached_property
+    def data(self) -> Any:
+        """The agent's data, once on each device."""
+        everywhere = NamedSharding(self.sharding.mesh, P())
+        return jax.device_put(self.algorithm.agent.data(), everywhere)
+
+    def compile(self, states: Any = None) -> tuple[Any, Callable[..., Any]]:
         """Return the states to start from, and the compiled `advance`.
 
         Args:
@@ -194,7 +210,8 @@ class Members:
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
-        compiled = _in_thread(lambda: self.advance.lower(shapes, np.int32(0)).compile())
+        arguments = shapes, np.int32(0), self.data
+        compiled = _in_thread(lambda: self.advance.lower(*arguments).compile())
         # The first states have a program of their own, which takes seconds too.
         first = _in_thread(
             lambda: jax.block_until_ready(
@@ -212,7 +229,7 @@ class Members:
         return jax.jit(self._shard(jax.vmap(function), P("members")))
 
     def train(
-        self, advance: Callable[[Any, Any], Any], states: Any, first: int, count: int
+        self, advance: Callable[..., Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
         """Train for some iterations, at most `chunk`.
 
@@ -226,7 +243,7 @@ class Members:
           The states after it, and the metrics, (members, iterations) each. "env_steps"
           holds whole numbers.
         """
-        states, metrics = advance(states, np.int32(count))
+        states, metrics = advance(states, np.int32(count), self.data)
         metrics = {
             name: np.asarray(value)[: self.num_members, :count]
             for name, value in metrics.items()

@@ -17,7 +17,7 @@ import numpy as np
 from gasil_jax.evaluation import evaluate
 from gasil_jax.host import metrics_files
 from gasil_jax.host.members import Members
-from gasil_jax.host.trackers import Tracker, log_evaluation
+from gasil_jax.host.trackers import Tracker
 from gasil_jax.train import TrainState
 
 #: Columns of evaluations.csv after those that identify the members.
@@ -31,7 +31,7 @@ class EvaluationSchedule(NamedTuple):
 
     Attributes:
       every: environment steps per seed between two evaluations, rounded up to whole
-        iterations; the final policy is always evaluated.
+        iterations; the untrained and the final policy are always evaluated.
       num_episodes: number of episodes of each policy, in fresh environments.
     """
 
@@ -91,7 +91,7 @@ class PeriodicEvaluation:
 
         self.seconds = 0.0
         self._interval = math.ceil(schedule.every / members.config.batch_steps)
-        self._members, self._labels, self._trackers = members, labels, trackers
+        self._members, self._trackers = members, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
         self._writer = metrics_files.MetricsWriter(path, labels, size, columns=COLUMNS)
@@ -127,7 +127,8 @@ class PeriodicEvaluation:
             "length": length.mean(axis=1),
         }
         self._writer.write({name: x[:, None] for name, x in scores.items()})
-        log_evaluation(self._trackers, self._labels, scores)
+        for tracker in self._trackers:
+            tracker.log(int(scores["env_steps"][0]), {"evaluation": scores["mean"]})
         self.seconds += time.monotonic() - started
         return scores
 

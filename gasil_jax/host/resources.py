@@ -33,11 +33,13 @@ class Need(NamedTuple):
       state: size of its `TrainState`, which is the size of a checkpoint.
       memory: memory during training.
       largest_part: what most of the memory is for, in words.
+      shared: memory of what all runs on a device share, the agent's data.
     """
 
     state: int
     memory: int
     largest_part: str
+    shared: int = 0
 
 
 def _size(tree: Any) -> int:
@@ -61,6 +63,7 @@ def need(env: Any, algorithm: Algorithm) -> Need:
     # come after the batch's other uses, and one after the other.
     learned = _size(state.agent) + _size(state.actor_critic)
     memory = _size(state) + learned + max(batches, *steps.values())
+    data = _size(jax.eval_shape(algorithm.agent.data))
     episodes = (state.environments, state.history, state.rewards)
     parts = {
         f"batches, with batch_steps {config.batch_steps}": batches,
@@ -68,10 +71,12 @@ def need(env: Any, algorithm: Algorithm) -> Need:
         f"the state of agent {algorithm.agent.name!r}{_of_buffer(algorithm)}": (
             2 * _size(state.agent)
         ),
+        f"the data of agent {algorithm.agent.name!r}": data,
         "networks": 2 * _size(state.actor_critic),
         **steps,
     }
-    return Need(_size(state), memory, max(parts, key=lambda part: parts[part]))
+    largest = max(parts, key=lambda part: parts[part])
+    return Need(_size(state), memory, largest, data)
 
 
 def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
@@ -198,13 +203,14 @@ def check_memory(
       ValueError: if it does not fit; the message gives the sizes.
     """
     one, used = need(env, algorithm), devices[:num_members]
-    required, free = _padded(num_members, used) * one.memory, available(used)
-    if free is not None and required > free:
+    required = _padded(num_members, used) * one.memory + len(used) * one.shared
+    if (free := available(used)) is not None and required > free:
         # Each device trains the same number of members.
-        fit = free // len(used) // one.memory * len(used)
+        fit = max(0, free // len(used) - one.shared) // one.memory * len(used)
         if fit == 0:
+            alone = _in_words(one.memory + one.shared)
             raise ValueError(
-                f"a single seed needs about {_in_words(one.memory)} of memory, and "
+                f"a single seed needs about {alone} of memory, and "
                 f"{_in_words(free)} are free: most is for {one.largest_part}"
             )
         config = algorithm.config

@@ -13,9 +13,11 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from typing import IO, Any, NamedTuple, Required, TypedDict
 
+import jax
+
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.errors import InputError, NotImportable, refusal
 from gasil_jax.host import (
     command_line,
     descriptions,
@@ -25,7 +27,6 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import unwritable
-from gasil_jax.imitation import expert
 
 _LOCK = ".lock"
 _PROBE = ".writable-"
@@ -337,10 +338,10 @@ _MOST_SEEDS = 2**20
 def check_seeds(seeds: int, first_seed: int) -> None:
     """Raise `InputError` if the number of seeds or the first seed is out of range."""
     if not 1 <= seeds <= _MOST_SEEDS:
-        raise InputError(f"seeds is {seeds}: it must be from 1 to {_MOST_SEEDS:,}")
+        raise refusal("seeds", seeds, f"from 1 to {_MOST_SEEDS:,}")
     last = 2**32 - seeds
     if not 0 <= first_seed <= last:
-        raise InputError(f"first_seed is {first_seed}: it must be from 0 to {last}")
+        raise refusal("first_seed", first_seed, f"from 0 to {last}")
 
 
 def seeds_of(description: Mapping[str, Any]) -> range:
@@ -398,11 +399,10 @@ def expert_hash(algorithm: Algorithm) -> dict[str, str]:
     Raises:
       ValueError: if the expert can't be read.
     """
-    source = getattr(algorithm.agent, "expert", None)
-    if not isinstance(source, str):
+    if getattr(algorithm.agent, "expert", None) is None:
         return {}
     digest = hashlib.sha256()
-    for values in expert.load(source):
+    for values in jax.tree.leaves(algorithm.agent.data()):
         digest.update(values.tobytes())
     return {EXPERT_HASH: digest.hexdigest()}
 

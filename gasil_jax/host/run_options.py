@@ -68,7 +68,8 @@ class Options:
         with the best evaluation or, without evaluate_every, with the best returns.
       evaluate_every: environment steps per seed between two evaluations of the
         policy's mean action in fresh environments, rounded up to whole iterations;
-        by default none. The scores are undelayed returns, in evaluations.csv.
+        by default none. The untrained policy is evaluated too. The scores are undelayed
+        returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and

@@ -1,9 +1,9 @@
 """Log metrics to TensorBoard and Weights & Biases, besides metrics.csv.
 
-A tracker gets the metrics that metrics.csv gets. "mean/NAME" is a metric's mean over
-the members, and "episode_return/LABEL" is the return of one member. "evaluation/mean"
-and "evaluation/LABEL" are mean returns of an evaluation, over all members and of one
-member. Steps are environment steps per member.
+A tracker gets the metrics that metrics.csv gets, and as "evaluation" the mean return of
+an evaluation. Steps are environment steps per member. Weights & Biases has a run for
+each member, and groups them. TensorBoard has one run: "mean/NAME" is a metric's mean
+over the members, "episode_return/LABEL" and "evaluation/LABEL" are those of one member.
 """
 
 import contextlib
@@ -21,61 +21,85 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line
 
+_Config = Mapping[str, Any]
+#: What each member has of its own, by its label.
+_Members = Mapping[str, _Config]
+
 
 class Tracker(Protocol):
-    """A destination for scalars."""
+    """A destination for metrics."""
 
-    def log(self, step: int, scalars: Mapping[str, float]) -> None:
-        """Log the scalars of one iteration."""
+    def log(self, step: int, metrics: Mapping[str, np.ndarray]) -> None:
+        """Log metrics of one iteration, (members,) each; NaN where there is none."""
 
     def close(self) -> None:
         """Write everything that is still buffered, and close."""
 
 
 class _TensorBoard:
-    def __init__(self, folder: pathlib.Path, name: str, config: Mapping[str, Any]):
+    def __init__(
+        self, folder: pathlib.Path, name: str, config: _Config, members: _Members
+    ):
         import tensorboardX
 
         del name  # TensorBoard names a run by its folder.
+        self._labels = tuple(members)
         self._writer = tensorboardX.SummaryWriter(str(folder / "tensorboard"))
         self._writer.add_text("config", f"```\n{_as_text(config)}\n```")
 
-    def log(self, step: int, scalars: Mapping[str, float]) -> None:
-        for name, value in scalars.items():
-            self._writer.add_scalar(name, value, step)
+    def log(self, step: int, metrics: Mapping[str, np.ndarray]) -> None:
+        for name, values in metrics.items():
+            if np.isfinite(values).any():
+                mean = float(values[np.isfinite(values)].mean())
+                self._writer.add_scalar(f"mean/{name}", mean, step)
+            if name in ("episode_return", "evaluation"):
+                for label, value in zip(self._labels, values, strict=True):
+                    if np.isfinite(value):
+                        self._writer.add_scalar(f"{name}/{label}", float(value), step)
 
     def close(self) -> None:
         self._writer.close()
 
 
 class _WeightsAndBiases:
-    def __init__(self, folder: pathlib.Path, name: str, config: Mapping[str, Any]):
+    def __init__(
+        self, folder: pathlib.Path, name: str, config: _Config, members: _Members
+    ):
         import wandb
 
         # A continued run is the same run in Weights & Biases, even with more steps.
+        identifier = _identifier(folder / "wandb-id")
         try:
-            self._run = wandb.init(
-                # By itself it would ask for a key while the run begins.
-                mode="offline" if _lacks_key() else None,
-                project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
-                name=name,
-                dir=str(folder),
-                id=_identifier(folder / "wandb-id"),
-                resume="allow",
-                config=dict(config),
-                allow_val_change=True,
-            )
+            self._runs = [
+                wandb.init(
+                    # By itself it would ask for a key while the run begins.
+                    mode="offline" if _lacks_key() else None,
+                    project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
+                    group=os.environ.get("WANDB_RUN_GROUP", name),
+                    name=f"{name}-{label}",
+                    dir=str(folder),
+                    id=f"{identifier}-{label}",
+                    resume="allow",
+                    config={**config, **own},
+                    allow_val_change=True,
+                    reinit="create_new",
+                )
+                for label, own in members.items()
+            ]
         except wandb.errors.Error as error:
             raise InputError(
                 f"log is 'wandb', which can't start: {' '.join(str(error).split())} "
                 "(solve that, or set WANDB_MODE=offline, and continue with --resume)"
             ) from None
 
-    def log(self, step: int, scalars: Mapping[str, float]) -> None:
-        self._run.log(dict(scalars), step=step)
+    def log(self, step: int, metrics: Mapping[str, np.ndarray]) -> None:
+        for index, run in enumerate(self._runs):
+            own = {name: float(values[index]) for name, values in metrics.items()}
+            run.log({x: y for x, y in own.items() if np.isfinite(y)}, step=step)
 
     def close(self) -> None:
-        self._run.finish()
+        for run in self._runs:
+            run.finish()
 
 
 def _lacks_key() -> bool:
@@ -102,7 +126,7 @@ def _identifier(path: pathlib.Path) -> str:
     return path.read_text()
 
 
-def _as_text(config: Mapping[str, Any]) -> str:
+def _as_text(config: _Config) -> str:
     return "\n".join(f"{name}: {value}" for name, value in config.items())
 
 
@@ -142,7 +166,8 @@ def make(
     folder: pathlib.Path,
     *,
     run_name: str,
-    config: Mapping[str, Any],
+    config: _Config,
+    members: _Members,
 ) -> list[Tracker]:
     """Return the trackers of a run.
 
@@ -151,50 +176,18 @@ def make(
       folder: folder of the run, or of a program of a sweep.
       run_name: name that the run has in the trackers.
       config: settings to show with the run.
+      members: those that each member has of its own, such as its seed, by its label.
 
     Raises:
       InputError: if a tracker can't start.
     """
-    return [TRACKERS[name][1](folder, run_name, config) for name in names]
+    kinds = [TRACKERS[name][1] for name in names]
+    return [kind(folder, run_name, config, members) for kind in kinds]
 
 
-def log(
-    trackers: Sequence[Tracker],
-    labels: Mapping[str, Sequence[Any]],
-    metrics: Mapping[str, np.ndarray],
-) -> None:
+def log(trackers: Sequence[Tracker], metrics: Mapping[str, np.ndarray]) -> None:
     """Log a chunk of metrics, (members, iterations) each, to all trackers."""
     for index, step in enumerate(metrics["env_steps"][0] if trackers else ()):
-        scalars = {}
-        for name, values in metrics.items():
-            column = values[:, index][np.isfinite(values[:, index])]
-            if column.size and name != "env_steps":
-                scalars[f"mean/{name}"] = float(column.mean())
-        returns = metrics["episode_return"][:, index]
-        scalars |= _by_member("episode_return", labels, returns)
+        now = {name: x[:, index] for name, x in metrics.items() if name != "env_steps"}
         for tracker in trackers:
-            tracker.log(int(step), scalars)
-
-
-def log_evaluation(
-    trackers: Sequence[Tracker],
-    labels: Mapping[str, Sequence[Any]],
-    scores: Mapping[str, np.ndarray],
-) -> None:
-    """Log the scores of an evaluation, (members,) each, to all trackers."""
-    mean = {"evaluation/mean": float(scores["mean"].mean())}
-    scalars = mean | _by_member("evaluation", labels, scores["mean"])
-    for tracker in trackers:
-        tracker.log(int(scores["env_steps"][0]), scalars)
-
-
-def _by_member(
-    name: str, labels: Mapping[str, Sequence[Any]], values: np.ndarray
-) -> dict[str, float]:
-    """Return the finite ones of the values (members,), as NAME/LABEL of the member."""
-    members = zip(*labels.values(), strict=True)
-    return {
-        f"{name}/{'-'.join(map(str, member))}": float(value)
-        for member, value in zip(members, values, strict=True)
-        if np.isfinite(value)
-    }
+            tracker.log(int(step), now)

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from gasil_jax import learner, normalization
@@ -387,6 +388,11 @@ class GAIL(ShapedRewardAgent):
         """Raise `ValueError` unless there is an expert that fits the environment."""
         expert.check(self.expert, sizes.observation, sizes.action)
 
+    def data(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the expert's observations (steps, obs) and actions (steps, action)."""
+        assert self.expert is not None  # Ensured by `check`.
+        return expert.load(self.expert)
+
     def init(self, key: jax.Array, sizes: Sizes) -> Learner:
         """Return an untrained discriminator."""
         return self.init_discriminator(key, sizes)
@@ -395,12 +401,11 @@ class GAIL(ShapedRewardAgent):
         self, state: Learner, context: Context, key: jax.Array
     ) -> tuple[Learner, jax.Array, Metrics]:
         """Train the discriminator (equation 8), and reward with it alone."""
-        assert self.expert is not None  # Ensured by `check`.
-        observation, action = expert.load(self.expert)
+        observation, action = context.data
 
         def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
             rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
-            return jnp.asarray(observation)[rows], jnp.asarray(action)[rows]
+            return observation[rows], action[rows]
 
         source = Source(sample, jnp.bool_(True))
         state, bonus, metrics = self.update_and_score(state, source, context, key)

@@ -48,6 +48,14 @@ class Agent(struct.PyTreeNode):
     def check(self, sizes: Sizes) -> None:
         """Raise `ValueError`, before anything compiles, if the agent can't run."""
 
+    def data(self) -> Any:
+        """Return arrays that all runs of a program share, such as an expert's steps.
+
+        They are read once, before anything compiles, and reach the agent's functions as
+        `Context.data`. A device holds them once, and a checkpoint not at all.
+        """
+        return ()
+
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
         """Return the state before the first batch; consumes the key."""
         return ()

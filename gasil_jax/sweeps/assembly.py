@@ -53,6 +53,16 @@ class Job:
         """The program."""
         return self.stored.program
 
+    @property
+    def members(self) -> dict[str, dict[str, Any]]:
+        """What each member has of its own, by its label, POINT-SEED or SEED."""
+        names, numbers = self.stored.labels, self.program.hyperparameters
+        labels = zip(*names.values(), strict=True)
+        return {
+            "-".join(map(str, label)): {**own, **dict(zip(names, label))}
+            for label, own in zip(labels, numbers, strict=True)
+        }
+
 
 def prepare(
     options: Options, programs: Sequence[Program], folders: Sequence[pathlib.Path] = ()
@@ -163,6 +173,7 @@ def train(
                         folder,
                         run_name=job.name,
                         config=described(options, _shared(program, options)),
+                        members=job.members,
                     )
                 members = make_members(
                     env, program.algorithm, program.seeds, program.hyperparameters

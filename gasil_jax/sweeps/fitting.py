@@ -13,7 +13,8 @@ import numpy as np
 
 from gasil_jax import checks
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import Range
+from gasil_jax.config import Range, validate_switch
+from gasil_jax.errors import refusal
 from gasil_jax.host import (
     descriptions,
     driver,
@@ -87,7 +88,8 @@ def fit(
       checkpoint_every: environment steps per seed between two checkpoints, rounded up
         to whole iterations; default a checkpoint every ten minutes and at the end.
       evaluate_every: environment steps per seed between two evaluations of the policy's
-        mean action, rounded up to whole iterations; default none.
+        mean action, rounded up to whole iterations; the untrained and the last policy
+        are evaluated too. Default none.
       evaluate_episodes: number of episodes of each seed in an evaluation.
       callback: gets a `FitProgress` after each chunk, on the host. Training ends there
         if it returns true; a checkpoint is written, from which it can be resumed.
@@ -106,8 +108,10 @@ def fit(
         ("evaluate_every", evaluate_every),
         ("evaluate_episodes", evaluate_episodes),
     ):
-        if value is not None and value not in _COUNT:
-            raise ValueError(f"{name} is {value!r}: it must be {_COUNT}")
+        default = value is None and name != "evaluate_episodes"
+        if value not in _COUNT and not default:
+            raise refusal(name, value, _COUNT)
+    validate_switch("resume", resume)
     if folder is None and (resume or checkpoint_every is not None):
         name = "resume" if resume else "checkpoint_every"
         raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")
@@ -159,7 +163,10 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     Raises:
       ValueError: if they are none, not different or out of range.
     """
-    if jax.dtypes.issubdtype(getattr(seeds, "dtype", object), np.integer):
+    if (
+        isinstance(seeds, np.generic | np.ndarray | jax.Array)
+        and seeds.dtype.kind in "iu"
+    ):
         seeds = np.asarray(seeds).tolist()
     allowed = Range(0, 2**32 - 1, whole=True)
     if isinstance(seeds, Sequence):
@@ -168,10 +175,8 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     elif not isinstance(seeds, bool) and isinstance(seeds, int):
         run_folder.check_seeds(seeds, 0)
         return range(seeds)
-    raise ValueError(
-        f"seeds is {seeds!r}: it must be a number of seeds, or different whole numbers "
-        f"from 0 to {2**32 - 1}"
-    )
+    each = f"different whole numbers from 0 to {2**32 - 1}"
+    raise refusal("seeds", seeds, f"a number of seeds, or {each}")
 
 
 class _Record(NamedTuple):

@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from contextlib import nullcontext
 
 import gymnasium
 import jax
@@ -14,7 +15,8 @@ from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import evaluate
-from gasil_jax.host import run_options
+from gasil_jax.host import resources, run_options
+from gasil_jax.host.members import make_members
 from gasil_jax.imitation import expert as expert_module
 from gasil_jax.run import main
 
@@ -70,6 +72,55 @@ def test_a_scripted_expert_is_imitated(expert):
     # At random about 5, with both blue objects 10.
     assert np.all(returns[:, 0] < 8.0)
     assert np.all(returns[:, -3:].mean(1) > 18.0)
+
+
+def write_expert(path, steps):
+    rng = np.random.default_rng(0)
+    arrays = {"observation": rng.normal(size=(steps, 11))}
+    np.savez(path, action=rng.normal(size=(steps, 2)), **arrays)
+    return gasil_jax.algorithm("gail", expert=str(path), num_envs=4, batch_steps=64)
+
+
+def test_an_expert_is_data_of_which_each_device_has_one_copy(tmp_path):
+    """Not a constant of the program, a part of its states, or a copy for each seed."""
+    env, sizes = gasil_jax.make_env("point_mass"), {}
+    for steps in (10, 10_000):
+        algorithm = write_expert(tmp_path / "expert.npz", steps)
+        members = make_members(env, algorithm, range(3), devices=jax.devices()[:2])
+        states = jax.eval_shape(members.init)
+        lowered = members.advance.lower(states, np.int32(0), members.data)
+        state = sum(x.size for x in jax.tree.leaves(states))
+        sizes[steps] = state, len(lowered.as_text())
+        shapes = [[y.data.shape for y in x.addressable_shards] for x in members.data]
+        assert shapes == [[(steps, 11)] * 2, [(steps, 2)] * 2]
+        assert resources.need(env, algorithm).shared == 4 * steps * (11 + 2)
+    assert sizes[10][0] == sizes[10_000][0]
+    assert abs(sizes[10][1] - sizes[10_000][1]) < 1000
+
+
+def test_an_expert_counts_in_the_memory_that_a_run_needs(tmp_path, monkeypatch):
+    algorithm = write_expert(tmp_path / "expert.npz", 100_000)
+    env, devices = gasil_jax.make_env("point_mass"), jax.devices()[:2]
+    one = resources.need(env, algorithm)
+    assert one.shared > one.memory
+    # On each of two devices there is the expert, and all but one of two seeds.
+    for free, message in (
+        (2 * one.shared + one.memory, "the data of agent 'gail'"),
+        (2 * one.shared + 3 * one.memory, "seeds are 4 .*: at most 2 fit"),
+        (2 * one.shared + 4 * one.memory, None),
+    ):
+        monkeypatch.setattr(resources, "available", lambda _, free=free: free)
+        with pytest.raises(ValueError, match=message) if message else nullcontext():
+            resources.check_memory(env, algorithm, 4, devices)
+
+
+def test_an_expert_is_an_argument_of_a_training_function(tmp_path):
+    env = gasil_jax.make_env("point_mass")
+    algorithm = write_expert(tmp_path / "expert.npz", 20).replace(total_steps=64)
+    train, data = gasil_jax.make_train(env, algorithm), algorithm.agent.data()
+    lower = lambda *given: jax.jit(train).lower(jax.random.key(0), None, *given)
+    arguments = [len(jax.tree.leaves(lower(*x).in_avals)) for x in ((), (data,))]
+    assert arguments == [1, 3]
 
 
 def test_an_expert_of_another_size_is_refused(expert, tmp_path):

@@ -223,6 +223,18 @@ except checkpoint.WriteError as error:
     assert list(tmp_path.iterdir()) == []
 
 
+def test_what_failed_first_is_told_where_cleaning_up_fails_too(tmp_path):
+    with pytest.raises(OSError, match="File too large"):
+        with checkpoint._orbax(tmp_path / "state"):
+            try:
+                raise ValueError(f"writing fails: os_error_code='{errno.EFBIG}'")
+            finally:  # Cleaning up.
+                raise OSError(errno.ENOTEMPTY, "Directory not empty")
+    with pytest.raises(OSError, match="Directory not empty"):
+        with checkpoint._orbax(tmp_path / "state"):
+            raise OSError(errno.ENOTEMPTY, "Directory not empty")
+
+
 def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
     told = []
     monkeypatch.setattr(sys, "unraisablehook", told.append)

@@ -42,15 +42,15 @@ TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
 
 
 class Collector:
-    """A tracker that keeps the scalars that it gets."""
+    """A tracker that keeps the metrics that it gets."""
 
     taken: list = []  # noqa: RUF012
 
-    def __init__(self, folder, name, config):
+    def __init__(self, folder, name, config, members):
         pass
 
-    def log(self, step, scalars):
-        self.taken.append((step, dict(scalars)))
+    def log(self, step, metrics):
+        self.taken.append((step, dict(metrics)))
 
     def close(self):
         pass
@@ -58,7 +58,7 @@ class Collector:
 
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory):
-    """The folder of a run with evaluations, and the scalars of its tracker."""
+    """The folder of a run with evaluations, and the metrics of its tracker."""
     out = tmp_path_factory.mktemp("evaluated") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(trackers.TRACKERS, "collector", ("json", Collector))
@@ -89,7 +89,9 @@ def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
     table = rows(out)
     assert list(table[0]) == ["seed", "env_steps", "mean", "min", "max", "length"]
     assert [(int(row["env_steps"]), int(row["seed"])) for row in table] == [
-        (iteration * 128, seed) for iteration in (5, 10, 15, 20, 22) for seed in SEEDS
+        (iteration * 128, seed)
+        for iteration in (0, 5, 10, 15, 20, 22)
+        for seed in SEEDS
     ]
     for row in table:
         low, mean, high = (float(row[name]) for name in ("min", "mean", "max"))
@@ -166,11 +168,32 @@ def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monke
         patch.setattr(PeriodicEvaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
-    assert len(rows(out)) == 2 * len(SEEDS)
+    assert len(rows(out)) == 3 * len(SEEDS)
     assert run.main(["--resume", "--out", str(out)]) == 0
     for name in ("evaluations.csv", "metrics.csv"):
         assert (out / name).read_bytes() == (whole / name).read_bytes()
     assert not list(out.glob("*-cut-*"))
+
+
+def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
+    evaluated, tmp_path, monkeypatch
+):
+    whole, out = evaluated[0], tmp_path / "out"
+    score = PeriodicEvaluation.score
+
+    def interrupted(self, states, done):
+        scores = score(self, states, done)
+        os.kill(os.getpid(), signal.SIGTERM)
+        return scores
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PeriodicEvaluation, "score", interrupted)
+        status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
+    assert status == 128 + signal.SIGTERM
+    assert {row["env_steps"] for row in rows(out)} == {"0"}
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    for name in ("evaluations.csv", "metrics.csv"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
 @pytest.mark.parametrize(
@@ -189,6 +212,7 @@ def test_evaluations_may_not_change_on_the_way(more, message, evaluated, capsys)
 def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
     out, _ = evaluated
     root, by_iteration = out / "checkpoints", means(out)
+    del by_iteration[0]  # Of the untrained policy there is no checkpoint.
     best = max(by_iteration, key=by_iteration.__getitem__)
     assert checkpoint.best(root).iteration == best
     # Those that are due as ever, without a score, and one for each best so far.
@@ -209,26 +233,19 @@ def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
 
 def test_the_tracker_is_given_the_scores(evaluated):
     out, taken = evaluated
-    given = {
-        step: {name: x for name, x in scalars.items() if name.startswith("evaluation/")}
-        for step, scalars in taken
-        if "evaluation/mean" in scalars
-    }
+    given = {step: x["evaluation"] for step, x in taken if "evaluation" in x}
     expected = {}
     for row in rows(out):
-        scalars = expected.setdefault(int(row["env_steps"]), {})
-        scalars[f"evaluation/{row['seed']}"] = float(row["mean"])
-    for iteration, mean in means(out).items():
-        expected[iteration * 128]["evaluation/mean"] = mean
+        expected.setdefault(int(row["env_steps"]), []).append(float(row["mean"]))
     assert set(given) == set(expected)
-    for step, scalars in given.items():
-        assert scalars == pytest.approx(expected[step], rel=1e-5, abs=1e-6)
+    for step, scores in given.items():
+        np.testing.assert_allclose(scores, expected[step], rtol=1e-5)
 
 
 def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
     out, _ = evaluated
     curves = plot.read(out)
-    assert curves.evaluations["mean"].shape == (3, 5)
+    assert curves.evaluations["mean"].shape == (3, 6)
     plot.draw([curves], tmp_path / "x.png")
     plotting.learning_curve(
         tmp_path / "y.png",
@@ -243,7 +260,7 @@ def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
     for figure in figures:
         lines = figure.axes[0].get_lines()
         (dashed,) = (line for line in lines if line.get_linestyle() == "--")
-        iterations = np.array([5, 10, 15, 20, ITERATIONS])
+        iterations = np.array([0, 5, 10, 15, 20, ITERATIONS])
         np.testing.assert_allclose(dashed.get_xdata(), 128e-6 * iterations)
         np.testing.assert_allclose(dashed.get_ydata(), middle)
 
@@ -300,10 +317,10 @@ def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
     assert "s of evaluations)" in capsys.readouterr().out
     curves = np.load(out / "curves.npz")
     steps = curves["evaluation_env_steps"]
-    np.testing.assert_array_equal(steps[0, 0], [640, 1024])
-    np.testing.assert_array_equal(steps[1, 0], [768, 1024])
+    np.testing.assert_array_equal(steps[0, 0], [0, 640, 1024])
+    np.testing.assert_array_equal(steps[1, 0], [0, 768, 1024])
     for name in ("mean", "min", "max", "length"):
-        assert curves[f"evaluation_{name}"].shape == (2, 2, 2)
+        assert curves[f"evaluation_{name}"].shape == (2, 2, 3)
     summary = json.loads((out / "summary.json").read_text())
     assert summary["evaluation_seconds"] > 0
     final = curves["evaluation_mean"][:, :, -1]

@@ -31,7 +31,7 @@ def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     algorithm = gasil_jax.algorithm(agent, **changes)
     members = make_members(env, algorithm, range(3), devices=jax.devices()[:1])
     states = jax.eval_shape(members.init)
-    account = members.advance.lower(states, np.int32(0)).compile().memory_analysis()
+    account = members.advance.lower(states, np.int32(0), ()).compile().memory_analysis()
     total = account.temp_size_in_bytes + account.argument_size_in_bytes
     assert 0.5 < 3 * resources.need(env, algorithm).memory / total < 2.0
 

@@ -20,30 +20,53 @@ SMALL = (
 )
 
 
-def test_the_means_and_the_members_are_given():
-    taken = []
+METRICS = {
+    "env_steps": np.array([[10, 20], [10, 20]]),
+    "episode_return": np.array([[1.0, 2.0], [3.0, np.nan]]),
+    "entropy": np.array([[np.nan, 1.0], [np.nan, 2.0]]),
+}
+MEMBERS = {"0-5": {"alpha": 0.1, "seed": 5}, "1-5": {"alpha": 0.2, "seed": 5}}
 
-    class Collector:
-        def log(self, step, scalars):
-            taken.append((step, dict(scalars)))
 
-    metrics = {
-        "env_steps": np.array([[10, 20], [10, 20]]),
-        "episode_return": np.array([[1.0, 2.0], [3.0, np.nan]]),
-        "entropy": np.array([[np.nan, 1.0], [np.nan, 2.0]]),
-    }
-    trackers.log([Collector()], {"point": [0, 1], "seed": [5, 5]}, metrics)
-    assert taken == [
-        (
-            10,
-            {"mean/episode_return": 2.0, "episode_return/0-5": 1.0}
-            | {"episode_return/1-5": 3.0},
-        ),
-        (
-            20,
-            {"mean/episode_return": 2.0, "mean/entropy": 1.5}
-            | {"episode_return/0-5": 2.0},
-        ),
+class Taken(list):
+    """What a library was called with, by its own functions' names."""
+
+    def __getattr__(self, name):
+        return lambda *given, **named: self.append((name, *given, *named.items()))
+
+
+def test_the_means_and_the_members_are_given_to_tensorboard(tmp_path, monkeypatch):
+    tensorboard, taken = pytest.importorskip("tensorboardX"), Taken()
+    monkeypatch.setattr(tensorboard, "SummaryWriter", lambda folder: taken)
+    (tracker,) = trackers.make(
+        ["tensorboard"], tmp_path, run_name="alpha", config={}, members=MEMBERS
+    )
+    trackers.log([tracker], METRICS)
+    assert taken[1:] == [
+        ("add_scalar", "mean/episode_return", 2.0, 10),
+        ("add_scalar", "episode_return/0-5", 1.0, 10),
+        ("add_scalar", "episode_return/1-5", 3.0, 10),
+        ("add_scalar", "mean/episode_return", 2.0, 20),
+        ("add_scalar", "episode_return/0-5", 2.0, 20),
+        ("add_scalar", "mean/entropy", 1.5, 20),
+    ]
+
+
+def test_each_member_is_a_run_in_wandb(tmp_path, monkeypatch):
+    """With its own numbers and metrics, in one group."""
+    runs, wandb = {}, types.ModuleType("wandb")
+    wandb.init = lambda **given: runs.setdefault(given["name"], (given, Taken()))[1]
+    monkeypatch.setitem(sys.modules, "wandb", wandb)
+    (tracker,) = trackers.make(
+        ["wandb"], tmp_path, run_name="alpha", config={"alpha": 1.0}, members=MEMBERS
+    )
+    trackers.log([tracker], METRICS)
+    (first, logged), (second, _) = runs["alpha-0-5"], runs["alpha-1-5"]
+    assert first["group"] == second["group"] == "alpha" and first["id"] != second["id"]
+    assert second["config"] == {"alpha": 0.2, "seed": 5}
+    assert logged == [
+        ("log", {"episode_return": 1.0}, ("step", 10)),
+        ("log", {"episode_return": 2.0, "entropy": 1.0}, ("step", 20)),
     ]
 
 
@@ -86,22 +109,24 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     monkeypatch.setenv("WANDB_MODE", "offline")
     out = tmp_path / "out"
     out.mkdir()
-    labels = {"seed": [3, 4]}
+    members = {"3": {"seed": 3}, "4": {"seed": 4}}
     # A run, and its continuation with more steps.
     for total_steps, steps in ((256, [128, 256]), (384, [384])):
         config = {"total_steps": total_steps}
-        (tracker,) = trackers.make(["wandb"], out, run_name="alpha-2", config=config)
+        (tracker,) = trackers.make(
+            ["wandb"], out, run_name="alpha-2", config=config, members=members
+        )
         returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
         metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
-        trackers.log([tracker], labels, metrics)
+        trackers.log([tracker], metrics)
         tracker.close()
         time.sleep(1.1)  # W&B names its folders by the second.
     identifier = (out / "wandb-id").read_text()
-    paths = sorted(out.glob(f"wandb/offline-run-*/run-{identifier}.wandb"))
-    assert len(paths) == 2
-    for path, count in zip(paths, (2, 1), strict=True):
-        for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
-            assert path.read_bytes().count(name) >= count
+    for label in members:
+        name = f"run-{identifier}-{label}.wandb"
+        paths = sorted(out.glob(f"wandb/offline-run-*/{name}"))
+        for path, count in zip(paths, (2, 1), strict=True):
+            assert path.read_bytes().count(b"episode_return") >= count
     # Another run in a folder of the same name is another one there.
     (tmp_path / "other" / "out").mkdir(parents=True)
     assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
@@ -111,7 +136,7 @@ def first_made(monkeypatch, program, *arguments):
     """Return the name and the settings of the first run that trackers are told of."""
     told = []
 
-    def make(names, folder, *, run_name, config):
+    def make(names, folder, *, run_name, config, members):
         told.append((run_name, config))
         raise InputError("enough")
 
@@ -142,7 +167,8 @@ def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, ca
 
     def started():
         trackers.check(["wandb"])
-        trackers.make(["wandb"], tmp_path, run_name="alpha-2", config={})
+        one = {"3": {}}
+        trackers.make(["wandb"], tmp_path, run_name="alpha-2", config={}, members=one)
         return modes.pop(), capsys.readouterr().err
 
     mode, printed = started()
