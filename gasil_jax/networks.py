@@ -1,4 +1,4 @@
-"""The networks, in Flax linen, and the Gaussian distribution of actions."""
+"""The networks, in Flax linen."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -6,8 +6,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
-
-_LOG_2PI = 1.8378770664093453
 
 
 def orthogonal(scale: float) -> nn.initializers.Initializer:
@@ -50,7 +48,7 @@ class MLP(nn.Module):
         return nn.Dense(self.output_size, kernel_init=kernel_init)(x)
 
 
-class Policy(nn.Module):
+class GaussianPolicy(nn.Module):
     """A Gaussian policy whose log standard deviation does not depend on the state.
 
     The last layer starts at scale 0.01, so that the initial policy is nearly the same
@@ -66,6 +64,18 @@ class Policy(nn.Module):
         mean = MLP(self.hidden_sizes, self.action_size, 0.01)(observation)
         log_std = self.param("log_std", nn.initializers.zeros, (self.action_size,))
         return mean, log_std
+
+
+class CategoricalPolicy(nn.Module):
+    """A policy of discrete actions, which are nearly equally probable at first."""
+
+    hidden_sizes: Sequence[int]
+    action_size: int
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """(..., obs) -> logits (..., action)."""
+        return MLP(self.hidden_sizes, self.action_size, 0.01)(observation)
 
 
 class Value(nn.Module):
@@ -103,16 +113,3 @@ class StepReward(nn.Module):
         """(..., obs), (..., action), (..., obs) -> (...)."""
         x = jnp.concatenate([observation, action, next_observation], axis=-1)
         return MLP(self.hidden_sizes, 1, 0.01)(x)[..., 0]
-
-
-def gaussian_log_prob(
-    mean: jax.Array, log_std: jax.Array, action: jax.Array
-) -> jax.Array:
-    """Return the log density of a diagonal Gaussian: (..., action) -> (...)."""
-    z = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
-
-
-def gaussian_entropy(log_std: jax.Array) -> jax.Array:
-    """Return the entropy of a diagonal Gaussian in nats: (..., action) -> (...)."""
-    return jnp.sum(log_std + 0.5 * (_LOG_2PI + 1.0), axis=-1)

@@ -279,7 +279,13 @@ def _action_size(env: str, preset: str) -> int | None:
     # The environment's arrays start JAX.
     devices.use_devices(Settings(), None, environments.available_cores())
     with announced(env, "building the environment"):
-        return int(environments.make_env(env).action_size)
+        built = environments.make_env(env)
+    if environments.is_discrete(built):
+        raise InputError(
+            "preset is 'scaled', a rule for the dimension of an action: those of "
+            f"{env} are discrete, it must be another preset, such as 'gymnax'"
+        )
+    return int(built.action_size)
 
 
 def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
@@ -373,12 +379,15 @@ def without_effect(algorithm: Algorithm) -> dict[str, str]:
     return dict.fromkeys(every, reason)
 
 
-def note_options_without_effect(options: Options, num_members: int) -> None:
+def note_options_without_effect(
+    options: Options, num_members: int, *, discrete: bool = False
+) -> None:
     """Print a note for each option that was changed but has no effect.
 
     Args:
       options: options that `check` accepts.
       num_members: number of seeds, over all points of a sweep.
+      discrete: whether the environment's actions are discrete.
     """
     algorithm, settings = options.algorithm, options.settings
     for name in environments.without_effect(options.env, settings):
@@ -401,7 +410,10 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
         if not now[model.switch]
         for name in names(model)
     }
-    for name, reason in sorted({**reasons, **without_effect(algorithm)}.items()):
+    reasons |= without_effect(algorithm)
+    if discrete:
+        reasons["initial_deviation"] = f"the actions of {options.env} are discrete"
+    for name, reason in sorted(reasons.items()):
         if now[name] != before[name]:
             command_line.note(f"{name} is {now[name]}, which has no effect: {reason}")
     if options.devices is not None and options.devices > num_members:

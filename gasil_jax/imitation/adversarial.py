@@ -375,7 +375,7 @@ class GAIL(ShapedRewardAgent):
 
     Attributes:
       expert: expert that GAIL imitates: minari:NAME for a Minari data set, or an .npz
-        file with the arrays "observation" and "action".
+        file with the arrays "observation" and "action". Discrete actions are numbers.
     """
 
     name = "gail"
@@ -385,7 +385,7 @@ class GAIL(ShapedRewardAgent):
 
     def check(self, sizes: Sizes) -> None:
         """Raise `ValueError` unless there is an expert that fits the environment."""
-        expert.check(self.expert, sizes.observation, sizes.action)
+        expert.check(self.expert, sizes)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Learner:
         """Return an untrained discriminator."""
@@ -397,6 +397,7 @@ class GAIL(ShapedRewardAgent):
         """Train the discriminator (equation 8), and reward with it alone."""
         assert self.expert is not None  # Ensured by `check`.
         observation, action = expert.load(self.expert)
+        action = expert.vectors(action, context.rollout.action.shape[-1])
 
         def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
             rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])

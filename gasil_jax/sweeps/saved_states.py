@@ -204,7 +204,8 @@ def load_policies(
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
         env, _, seeds, states = load(pathlib.Path(folder), which, point, seed=seed)
         every = jax.device_get(policy.weights(states, env))
-        shared = {name: every.pop(name) for name in ("low", "high")}
+        names = [name for name in numpy_policy.SHARED if name in every]
+        shared = {name: every.pop(name) for name in names}
         weights = [member(every, i) | shared for i in range(len(seeds))]
         return Policies(env, train.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":

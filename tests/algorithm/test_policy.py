@@ -11,7 +11,7 @@ import pytest
 import gasil_jax
 from gasil_jax import normalization, npz, numpy_policy, policy
 from gasil_jax.host import policy_file
-from gasil_jax.networks import Policy
+from gasil_jax.networks import GaussianPolicy
 
 # With the other tests that use it, so that it is trained once.
 pytestmark = pytest.mark.xdist_group("trained_point_mass")
@@ -36,7 +36,7 @@ def test_it_is_the_networks_gaussian(saved, seed):
     observation = observation.at[-1].multiply(1e3)
     normalized = normalization.normalize(state.normalizer, observation)
     assert jnp.abs(normalized).max() == numpy_policy.CLIP
-    network = Policy(algorithm.config.hidden_sizes, env.action_size)
+    network = GaussianPolicy(algorithm.config.hidden_sizes, env.action_size)
     mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 
     act = gasil_jax.load_policy(folder, seed)
