@@ -50,8 +50,8 @@ class Options:
 
     Attributes:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
-        humanoid; one of Brax's as brax:NAME, for example brax:inverted_pendulum; or
-        your own as MODULE:NAME.
+        humanoid; one of another package as brax:NAME, gymnax:NAME, navix:NAME or
+        playground:NAME, for example gymnax:CartPole-v1; or your own as MODULE:NAME.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+bonus, gail, or your own as MODULE:CLASS. Each has its own settings: this
         help shows those of the one that is named beside it.
@@ -73,9 +73,10 @@ class Options:
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
-        rule of PPO for all locomotion tasks; or paper, the paper's own protocol, with
-        one environment per seed. Options override them. The defaults that this help
-        shows are those of the preset if --env is named beside --help.
+        rule of PPO for all locomotion tasks; gymnax, one setting for discrete actions;
+        or paper, the paper's own protocol, with one environment per seed. Options
+        override them. The defaults that this help shows are those of the preset if
+        --env is named beside --help.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
