@@ -143,6 +143,9 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
+_NORMALIZES_ACTIONS = "discriminator_normalizes_actions"
+
+
 class Source(NamedTuple):
     """The source of the pairs that the policy imitates.
 
@@ -216,6 +219,38 @@ class AdversarialAgent(Agent):
         pairs = self._preprocessor(context)(rollout.observation, rollout.action)
         bonus = BONUSES[self.bonus](self._network.apply(discriminator.params, *pairs))
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
+
+    def discriminator(self, state: Any) -> Learner:
+        """Return the discriminator in a state."""
+        return state.discriminator
+
+    def reward(
+        self, state: Any, normalizer: normalization.Normalizer
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        """Return the bonus without alpha as a function of observation and action.
+
+        The function is (..., obs), (..., action) -> (...).
+
+        Args:
+          state: the agent's state.
+          normalizer: the normalizer of observations.
+
+        Raises:
+          ValueError: if the bonus of a step depends on the batch that it is in.
+        """
+        if self.bonus == "centered" or self.discriminator_normalizes_actions:
+            name = "bonus" if self.bonus == "centered" else _NORMALIZES_ACTIONS
+            raise ValueError(
+                f"{name} is {getattr(self, name)!r}: the reward of a step then depends "
+                "on the batch that it is in"
+            )
+        params = self.discriminator(state).params
+
+        def reward(observation: jax.Array, action: jax.Array) -> jax.Array:
+            observation = normalization.normalize(normalizer, observation)
+            return BONUSES[self.bonus](self._network.apply(params, observation, action))
+
+        return reward
 
     def _preprocessor(
         self, context: Context
@@ -386,6 +421,10 @@ class GAIL(ShapedRewardAgent):
     def check(self, sizes: Sizes) -> None:
         """Raise `ValueError` unless there is an expert that fits the environment."""
         expert.check(self.expert, sizes)
+
+    def discriminator(self, state: Learner) -> Learner:
+        """Return the discriminator, which is the state."""
+        return state
 
     def init(self, key: jax.Array, sizes: Sizes) -> Learner:
         """Return an untrained discriminator."""

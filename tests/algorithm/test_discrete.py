@@ -2,6 +2,7 @@
 
 import csv
 import functools
+import pathlib
 
 import gymnasium
 import jax
@@ -29,7 +30,8 @@ from gasil_jax import (
 )
 from gasil_jax.host import policy_file
 from gasil_jax.imitation import AGENTS
-from gasil_jax.networks import CategoricalPolicy
+from gasil_jax.networks import CategoricalPolicy, Discriminator
+from gasil_jax.sweeps import saved_states
 
 SETTINGS = {
     "total_steps": 20 * 256,
@@ -200,6 +202,48 @@ def test_an_expert_with_other_actions_is_refused(env, action, message, tmp_path)
     np.savez(path, observation=np.zeros((2, env.observation_size)), action=action)
     with pytest.raises(ValueError, match=message):
         gasil_jax.make_train(env, gasil_jax.algorithm("gail", expert=str(path)))
+
+
+def test_the_discriminators_reward_is_that_of_its_formula(finished):
+    reward = gasil_jax.load_reward(finished, 1)
+    _, algorithm, seeds, states = saved_states.load(pathlib.Path(finished))
+    state = gasil_jax.member(states, seeds.index(1))
+    observation = np.tile(np.eye(LENGTH, dtype=np.float32), (3, 1))
+    action = np.repeat(np.arange(3), LENGTH)
+    network = Discriminator(algorithm.agent.discriminator_hidden_sizes)
+    logit = network.apply(
+        state.agent.discriminator.params,
+        normalization.normalize(state.normalizer, observation),
+        np.eye(3, dtype=np.float32)[action],
+    )
+    expected = -np.log(1 / (1 + np.exp(-np.asarray(logit, np.float64))))
+    np.testing.assert_allclose(reward(observation, action), expected, rtol=1e-4)
+    one = jax.jit(jax.vmap(reward))(observation, action)
+    np.testing.assert_allclose(one, expected, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"observation has shape \(3,\): it must be"):
+        reward(np.zeros(3), 1)
+    with pytest.raises(ValueError, match="seed is 7: the run has 0 to 1"):
+        gasil_jax.load_reward(finished, 7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bonus": "centered"}, "bonus is 'centered': the reward of a step then"),
+        ({"discriminator_normalizes_actions": True}, "actions is True: the reward"),
+    ],
+)
+def test_a_reward_that_depends_on_its_batch_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.GASIL(**change).reward(None, None)
+
+
+def test_without_a_discriminator_there_is_no_reward(tmp_path):
+    env = gasil_jax.make_env("corridor:Corridor")
+    algorithm = gasil_jax.algorithm("ppo", **{**SETTINGS, "total_steps": 256})
+    gasil_jax.fit(env, algorithm, folder=tmp_path / "run")
+    with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
+        gasil_jax.load_reward(tmp_path / "run")
 
 
 def test_a_sweep_and_its_best_point(tmp_path, capsys):
