@@ -13,7 +13,9 @@
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
 the last is followed by tanh; the output is the mean of a Gaussian. Where actions are
 discrete the file has num_actions () in place of log_std, low and high, the output is
-the actions' logits, and an action is an int.
+the actions' logits, and an action is an int. With activation_relu () or
+activation_swish () that function takes the place of tanh. With norm_scale_0 (S, width),
+norm_bias_0, norm_scale_1 ... layer normalization comes before it.
 """
 
 import json
@@ -34,7 +36,7 @@ CLIP = 10.0
 
 _PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
 #: The arrays that are the same for all seeds of a file.
-SHARED = ("low", "high", "num_actions")
+SHARED = ("low", "high", "num_actions", "activation_relu", "activation_swish")
 
 
 def zoo() -> tuple[str, ...]:
@@ -84,7 +86,7 @@ def about(name: str | pathlib.Path) -> dict[str, Any]:
 
 
 def _is_a_weight(name: str) -> bool:
-    layer = name.startswith(("kernel_", "bias_"))
+    layer = name.startswith(("kernel_", "bias_", "norm_scale_", "norm_bias_"))
     return layer or name in (*_PER_SEED, *SHARED)
 
 
@@ -115,6 +117,12 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
         outputs = num_actions if i == last else None
         *_, width = number(f"kernel_{i}", count, width, outputs).shape
         number(f"bias_{i}", count, width)
+        if i < last and _is_normalized(arrays):
+            for name in (f"norm_scale_{i}", f"norm_bias_{i}"):
+                number(name, count, width)
+    for name in SHARED:
+        if name.startswith("activation_") and name in arrays:
+            number(name)
     return checked
 
 
@@ -177,8 +185,28 @@ def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
     last = sum(name.startswith("kernel_") for name in weights) - 1
     for i in range(last + 1):
         x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
-        x = xp.tanh(x) if i < last else x
+        if i < last:
+            x = _activated(weights, x, i, xp)
     return x
+
+
+def _is_normalized(weights: Mapping[str, Any]) -> bool:
+    return "norm_scale_0" in weights
+
+
+def _activated(weights: Mapping[str, Any], x: Any, layer: int, xp: Any) -> Any:
+    """Return what follows a hidden layer's linear part, (..., width)."""
+    if _is_normalized(weights):
+        x = x - x.mean(axis=-1, keepdims=True)
+        deviation = xp.sqrt((x**2).mean(axis=-1, keepdims=True) + 1e-6)
+        x = x / deviation * weights[f"norm_scale_{layer}"]
+        x = x + weights[f"norm_bias_{layer}"]
+    if "activation_relu" in weights:
+        return xp.maximum(x, 0.0)
+    if "activation_swish" in weights:
+        # The sigmoid, which does not overflow in this form.
+        return x * 0.5 * (1.0 + xp.tanh(0.5 * x))
+    return xp.tanh(x)
 
 
 def probabilities(weights: Mapping[str, Any], observation: Any) -> np.ndarray:

@@ -12,6 +12,7 @@ from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
 from gasil_jax.distributions import CATEGORICAL, GAUSSIAN
+from gasil_jax.networks import POLICY_LAYERS
 
 
 def weights(state: Any, env: Any) -> dict[str, Any]:
@@ -21,7 +22,8 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
     (seeds, ...).
     """
     params = state.actor_critic.policy.params["params"]
-    layers = params["MLP_0"]
+    (activation,) = (x for x, name in POLICY_LAYERS.items() if name in params)
+    layers = params[POLICY_LAYERS[activation]]
     mean, scale = normalization.moments(state.normalizer)
     arrays: dict[str, Any] = {"mean": mean, "scale": scale}
     if wrappers.is_discrete(env):
@@ -30,9 +32,12 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
         low, high = wrappers.action_range(env)
         wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
         arrays |= {"log_std": params["log_std"], "low": wide(low), "high": wide(high)}
-    for i in range(len(layers)):
-        arrays[f"kernel_{i}"] = layers[f"Dense_{i}"]["kernel"]
-        arrays[f"bias_{i}"] = layers[f"Dense_{i}"]["bias"]
+    if activation != "tanh":
+        arrays[f"activation_{activation}"] = np.int32(1)
+    for name, own in layers.items():
+        kind, _, i = name.partition("_")
+        prefix = "norm_" if kind == "LayerNorm" else ""
+        arrays |= {f"{prefix}{x}_{i}": array for x, array in own.items()}
     return arrays
 
 

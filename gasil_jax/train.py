@@ -181,8 +181,9 @@ def _networks(env: Any, config: Config) -> tuple[Any, Any, Distribution]:
     """Return the policy's network, the value's, and the distribution of actions."""
     # Typed as Any because Flax declares that `apply` may also return variables.
     sizes, distribution = config.hidden_sizes, distributions.of(env)
-    policy = distribution.network(sizes, wrappers.action_size(env))
-    return policy, Value(sizes), distribution
+    layers = (config.activation, config.layer_norm)
+    policy = distribution.network(sizes, wrappers.action_size(env), *layers)
+    return policy, Value(sizes, *layers), distribution
 
 
 def _init_actor_critic(

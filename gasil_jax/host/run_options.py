@@ -75,8 +75,8 @@ class Options:
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
         rule of PPO for all locomotion tasks; gymnax, one setting for discrete actions;
         or paper, the paper's own protocol, with one environment per seed. Options
-        override them. The defaults that this help shows are those of the preset if
-        --env is named beside --help.
+        override them. The defaults that this help shows are the preset's if --env is
+        named beside --help.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
