@@ -91,7 +91,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         "about": np.array(json.dumps(about)),
         "seeds": np.array([seed]),
         "final_return": np.array([final[best]]),
-        **{x: v if x in ("low", "high") else v[None] for x, v in weights.items()},
+        **{x: v if x in numpy_policy.SHARED else v[None] for x, v in weights.items()},
     }
     zoo.mkdir(exist_ok=True)
     with output_file.atomic(path) as partial, partial.open("wb") as file:

@@ -23,6 +23,7 @@ from .rewards import RewardModel as RewardModel
 from .sweeps.fitting import FitProgress as FitProgress
 from .sweeps.fitting import FitResult as FitResult
 from .sweeps.fitting import fit as fit
+from .sweeps.saved_states import load_reward as load_reward
 from .train import TrainState as TrainState
 from .train import init as init
 from .train import iterate as iterate

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from gasil_envs import own_code, own_environment
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.context import Sizes
+from gasil_jax.context import sizes_of
 from gasil_jax.errors import refusal, shown
 
 
@@ -35,7 +35,7 @@ def check(env: Any, algorithm: Algorithm) -> None:
     algorithms.check(algorithm)
     agent, num_envs = algorithm.agent, algorithm.config.num_envs
     with own_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
-        agent.check(Sizes(num_envs, env.observation_size, env.action_size))
+        agent.check(sizes_of(env, num_envs))
 
 
 def _check_interface(env: Any) -> None:
@@ -44,12 +44,11 @@ def _check_interface(env: Any) -> None:
         raise ValueError(
             f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
         )
-    for name in own_environment.INTERFACE:
-        if not hasattr(env, name):
-            raise ValueError(
-                f"env is {shown(env)}, which has no {name}: it must be an environment "
-                "with Brax's interface, as gasil_jax.make_env gives"
-            )
+    if (lacking := own_environment.missing(env)) is not None:
+        raise ValueError(
+            f"env is {shown(env)}, which has no {lacking}: it must be an environment "
+            "with Brax's interface, as gasil_jax.make_env gives"
+        )
     _refuse_automatic_resets(env)
     if jax.config.read("jax_enable_x64"):
         raise ValueError("jax_enable_x64 is True: training is in float32, unset it")

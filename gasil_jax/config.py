@@ -17,6 +17,7 @@ import numpy as np
 from flax import struct
 
 from gasil_jax.errors import refusal, unknown
+from gasil_jax.networks import ACTIVATIONS
 
 #: A factor that multiplies a number, as a function of environment steps. Either an
 #: Optax schedule (any pure function of the steps) or (steps, factor) points, linear
@@ -152,7 +153,9 @@ class Config(struct.PyTreeNode):
         paper's horizon).
       num_epochs: passes of PPO over a batch.
       minibatch_size: steps in one gradient step of PPO.
-      hidden_sizes: widths of the tanh layers, in the policy and in the value.
+      hidden_sizes: widths of the hidden layers, in the policy and in the value.
+      activation: what follows each of these layers: tanh, relu or swish.
+      layer_norm: whether layer normalization comes before it.
       stagger_episodes: whether each environment's first episode begins at a random age,
         so that a batch holds steps from all parts of an episode. Otherwise all begin at
         age 0 and, if none ends early, a batch holds the same few steps of each episode.
@@ -181,6 +184,8 @@ class Config(struct.PyTreeNode):
     num_epochs: int = count(10)
     minibatch_size: int = count(64)
     hidden_sizes: tuple[int, ...] = widths(64, 64)
+    activation: str = choice("tanh", ACTIVATIONS)
+    layer_norm: bool = switch(False)
     stagger_episodes: bool = switch(True)
     learning_rate: float = number(3e-4, 0.0, excludes_low=True)
     learning_rate_decay: float = number(1.0, 0.0, 1.0)

@@ -6,7 +6,9 @@ from typing import Any, NamedTuple
 import jax
 from flax import struct
 
+from gasil_envs import wrappers
 from gasil_jax.config import Config
+from gasil_jax.distributions import Distribution
 from gasil_jax.good_trajectories import History
 from gasil_jax.normalization import Normalizer
 from gasil_jax.rollout import Rollout
@@ -20,14 +22,27 @@ class Sizes(NamedTuple):
     Attributes:
       num_envs: number of environments.
       observation: dimension of an observation.
-      action: dimension of an action.
+      action: dimension of an action, or number of discrete ones.
       history_steps: length of each environment's history; 0 if there is none.
+      discrete: whether actions are discrete, and one-hot here.
     """
 
     num_envs: int
     observation: int
     action: int
     history_steps: int = 0
+    discrete: bool = False
+
+
+def sizes_of(env: Any, num_envs: int, history_steps: int = 0) -> Sizes:
+    """Return the sizes of a run in an environment."""
+    return Sizes(
+        num_envs,
+        env.observation_size,
+        wrappers.action_size(env),
+        history_steps,
+        discrete=wrappers.is_discrete(env),
+    )
 
 
 class Context(struct.PyTreeNode):
@@ -42,9 +57,13 @@ class Context(struct.PyTreeNode):
       normalizer: the normalizer of observations that the policy used in the batch.
       reward_scale: float32 (), the number that the rollout's rewards were divided by; 1
         if they are not normalized.
-      action_range: the lowest and the highest action of the environment.
+      action_range: the lowest and the highest action of the environment; 0 and 1 where
+        actions are discrete.
       config: the settings of the loop and of PPO, with their numbers in this iteration.
-      policy: (params, normalized observation) -> mean, log standard deviation.
+      policy: (params, normalized observation) -> the parameters of the actions'
+        distribution.
+      distribution: the distribution of actions, such as
+        ``distribution.log_prob(parameters, action)``.
       value: (params, normalized observation) -> value.
       data: what the agent's `data` returns.
     """
@@ -55,6 +74,7 @@ class Context(struct.PyTreeNode):
     reward_scale: jax.Array
     action_range: tuple[Any, Any]
     config: Config
-    policy: Callable[..., tuple[jax.Array, jax.Array]] = struct.field(pytree_node=False)
+    policy: Callable[..., Any] = struct.field(pytree_node=False)
+    distribution: Distribution = struct.field(pytree_node=False)
     value: Callable[..., jax.Array] = struct.field(pytree_node=False)
     data: Any = ()

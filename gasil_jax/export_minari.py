@@ -3,7 +3,8 @@
     python -m gasil_jax.export_minari RUN --name hopper/good-v0
 
 The data set holds complete episodes, best first. Observations and actions are exact;
-actions are as the policy drew them, before the environment limits them to its range.
+actions are as the policy drew them, before the environment limits them to its range;
+discrete ones are numbers.
 The buffer does not hold an episode's rewards or its final observation, so these are
 filled in: the last step's reward is the episode's return, discounted as the buffer
 ranks it, and the others are 0; the final observation repeats the one before it; and
@@ -120,12 +121,20 @@ def check_name(name: str) -> None:
         raise InputError(f"name is {name!r}, which exists: name a new data set")
 
 
-def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
+def write(
+    name: str,
+    complete: Sequence[Episode],
+    *,
+    num_actions: int | None = None,
+    **metadata: str,
+) -> None:
     """Create a Minari data set; the module's docstring says what is filled in.
 
     Args:
       name: a name that `check_name` accepts.
       complete: one or more complete episodes.
+      num_actions: number of discrete actions, which are then numbers in the data set;
+        None if actions are vectors.
       **metadata: further arguments of `minari.create_dataset_from_buffers`.
 
     Raises:
@@ -137,13 +146,17 @@ def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
     from minari.storage import get_dataset_path
 
     space = lambda x: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32)
+    if num_actions is None:
+        actions = lambda x: x
+    else:
+        actions = lambda one_hot: one_hot.argmax(axis=-1)
     buffers = [
         EpisodeBuffer(
             id=index,
             observations=np.append(
                 episode.observation, episode.observation[-1:], axis=0
             ),
-            actions=episode.action,
+            actions=actions(episode.action),
             rewards=[0.0] * (len(episode.action) - 1) + [episode.return_],
             terminations=[False] * len(episode.action),
             truncations=[False] * (len(episode.action) - 1) + [True],
@@ -160,7 +173,11 @@ def write(name: str, complete: Sequence[Episode], **metadata: str) -> None:
                 name,
                 buffers,
                 observation_space=space(complete[0].observation),
-                action_space=space(complete[0].action),
+                action_space=(
+                    space(complete[0].action)
+                    if num_actions is None
+                    else gymnasium.spaces.Discrete(num_actions)
+                ),
                 **metadata,
             )
     except BaseException:
@@ -205,7 +222,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         env=f"{described['env']} {settings}",
         discounted=discounted,
     )
-    write(options.name, complete, algorithm_name=agent.name, description=description)
+    write(
+        options.name,
+        complete,
+        num_actions=getattr(env, "num_actions", None),
+        algorithm_name=agent.name,
+        description=description,
+    )
     steps = sum(len(episode.action) for episode in complete)
     print(f"{len(complete)} episodes, {steps} steps in {options.name}")
     return 0

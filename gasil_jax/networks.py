@@ -1,13 +1,24 @@
-"""The networks, in Flax linen, and the Gaussian distribution of actions."""
+"""The networks, in Flax linen."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-_LOG_2PI = 1.8378770664093453
+#: The functions that may follow a hidden layer.
+ACTIVATIONS: Mapping[str, Callable[[jax.Array], jax.Array]] = {
+    "tanh": nn.tanh,
+    "relu": nn.relu,
+    "swish": nn.swish,
+}
+#: The name of an `MLP` in a policy's parameters, which says its activation.
+POLICY_LAYERS: Mapping[str, str] = {
+    "tanh": "MLP_0",
+    "relu": "MLP_relu",
+    "swish": "MLP_swish",
+}
 
 
 def orthogonal(scale: float) -> nn.initializers.Initializer:
@@ -28,55 +39,90 @@ def orthogonal(scale: float) -> nn.initializers.Initializer:
 
 
 class MLP(nn.Module):
-    """Tanh layers and a linear output layer, orthogonally initialized.
+    """Hidden layers and a linear output layer, orthogonally initialized.
 
     Attributes:
-      hidden_sizes: widths of the tanh layers.
+      hidden_sizes: widths of the hidden layers.
       output_size: width of the output.
       output_scale: scale of the output layer's initial weights.
+      activation: a key of `ACTIVATIONS`.
+      layer_norm: whether what a hidden layer computes is normalized before the
+        activation (Ba, Kiros, Hinton 2016).
     """
 
     hidden_sizes: Sequence[int]
     output_size: int
     output_scale: float = 1.0
+    activation: str = "tanh"
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
         """(..., input) -> (..., output)."""
         for size in self.hidden_sizes:
             kernel_init = orthogonal(2.0**0.5)
-            x = nn.tanh(nn.Dense(size, kernel_init=kernel_init)(x))
+            x = nn.Dense(size, kernel_init=kernel_init)(x)
+            x = nn.LayerNorm()(x) if self.layer_norm else x
+            x = ACTIVATIONS[self.activation](x)
         kernel_init = orthogonal(self.output_scale)
         return nn.Dense(self.output_size, kernel_init=kernel_init)(x)
 
 
-class Policy(nn.Module):
-    """A Gaussian policy whose log standard deviation does not depend on the state.
+class _Policy(nn.Module):
+    """The layers of a policy; the last one starts at scale 0.01.
 
-    The last layer starts at scale 0.01, so that the initial policy is nearly the same
-    in every state (OpenAI baselines, ppo1).
+    So the initial policy is nearly the same in every state (OpenAI baselines, ppo1).
     """
 
     hidden_sizes: Sequence[int]
     action_size: int
+    activation: str = "tanh"
+    layer_norm: bool = False
+
+    def layers(self, observation: jax.Array) -> jax.Array:
+        """(..., obs) -> (..., action)."""
+        return MLP(
+            self.hidden_sizes,
+            self.action_size,
+            0.01,
+            self.activation,
+            self.layer_norm,
+            name=POLICY_LAYERS[self.activation],
+        )(observation)
+
+
+class GaussianPolicy(_Policy):
+    """A Gaussian policy whose log standard deviation does not depend on the state."""
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> tuple[jax.Array, jax.Array]:
         """(..., obs) -> mean (..., action), log standard deviation (action,)."""
-        mean = MLP(self.hidden_sizes, self.action_size, 0.01)(observation)
+        mean = self.layers(observation)
         log_std = self.param("log_std", nn.initializers.zeros, (self.action_size,))
         return mean, log_std
+
+
+class CategoricalPolicy(_Policy):
+    """A policy of discrete actions, which are nearly equally probable at first."""
+
+    @nn.compact
+    def __call__(self, observation: jax.Array) -> jax.Array:
+        """(..., obs) -> logits (..., action)."""
+        return self.layers(observation)
 
 
 class Value(nn.Module):
     """The value of a state."""
 
     hidden_sizes: Sequence[int]
+    activation: str = "tanh"
+    layer_norm: bool = False
 
     @nn.compact
     def __call__(self, observation: jax.Array) -> jax.Array:
         """(..., obs) -> (...)."""
-        return MLP(self.hidden_sizes, 1)(observation)[..., 0]
+        layers = MLP(self.hidden_sizes, 1, 1.0, self.activation, self.layer_norm)
+        return layers(observation)[..., 0]
 
 
 class Discriminator(nn.Module):
@@ -103,16 +149,3 @@ class StepReward(nn.Module):
         """(..., obs), (..., action), (..., obs) -> (...)."""
         x = jnp.concatenate([observation, action, next_observation], axis=-1)
         return MLP(self.hidden_sizes, 1, 0.01)(x)[..., 0]
-
-
-def gaussian_log_prob(
-    mean: jax.Array, log_std: jax.Array, action: jax.Array
-) -> jax.Array:
-    """Return the log density of a diagonal Gaussian: (..., action) -> (...)."""
-    z = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
-
-
-def gaussian_entropy(log_std: jax.Array) -> jax.Array:
-    """Return the entropy of a diagonal Gaussian in nats: (..., action) -> (...)."""
-    return jnp.sum(log_std + 0.5 * (_LOG_2PI + 1.0), axis=-1)

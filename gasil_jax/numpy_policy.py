@@ -11,7 +11,11 @@
     about (), JSON, only in the zoo: see `about`
 
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
-the last is followed by tanh; the output is the mean of a Gaussian.
+the last is followed by tanh; the output is the mean of a Gaussian. Where actions are
+discrete the file has num_actions () in place of log_std, low and high, the output is
+the actions' logits, and an action is an int. With activation_relu () or
+activation_swish () that function takes the place of tanh. With norm_scale_0 (S, width),
+norm_bias_0, norm_scale_1 ... layer normalization comes before it.
 """
 
 import json
@@ -32,7 +36,8 @@ ZOO, ZOO_PREFIX = pathlib.Path(__file__).with_name("zoo"), "zoo:"
 CLIP = 10.0
 
 _PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
-_SHARED = ("low", "high")
+#: The arrays that are the same for all seeds of a file.
+SHARED = ("low", "high", "num_actions", "activation_relu", "activation_swish")
 
 
 def zoo() -> tuple[str, ...]:
@@ -83,8 +88,8 @@ def about(name: str | pathlib.Path) -> dict[str, Any]:
 
 
 def _is_a_weight(name: str) -> bool:
-    layer = name.startswith(("kernel_", "bias_"))
-    return layer or name in (*_PER_SEED, *_SHARED)
+    layer = name.startswith(("kernel_", "bias_", "norm_scale_", "norm_bias_"))
+    return layer or name in (*_PER_SEED, *SHARED)
 
 
 def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
@@ -100,15 +105,26 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
     _, width = number("mean", count, None).shape
     if not (number("scale", count, width).astype(np.float32) > 0).all():
         raise ValueError("scale has numbers that aren't positive")
-    _, num_actions = number("log_std", count, None).shape
-    low, high = (number(name, num_actions, finite=False) for name in _SHARED)
-    if not (low < high).all():
-        raise ValueError("low isn't below high")
+    if is_discrete(arrays):
+        num_actions = int(number("num_actions"))
+    else:
+        _, num_actions = number("log_std", count, None).shape
+        low, high = (
+            number(name, num_actions, finite=False) for name in ("low", "high")
+        )
+        if not (low < high).all():
+            raise ValueError("low isn't below high")
     last = max(1, sum(name.startswith("kernel_") for name in arrays)) - 1
     for i in range(last + 1):
         outputs = num_actions if i == last else None
         *_, width = number(f"kernel_{i}", count, width, outputs).shape
         number(f"bias_{i}", count, width)
+        if i < last and _is_normalized(arrays):
+            for name in (f"norm_scale_{i}", f"norm_bias_{i}"):
+                number(name, count, width)
+    for name in SHARED:
+        if name.startswith("activation_") and name in arrays:
+            number(name)
     return checked
 
 
@@ -135,7 +151,7 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
         raise ValueError(f"{name} is not a saved policy ({error})") from None
     seeds = arrays.pop("seeds").tolist()
     returns = np.nan_to_num(arrays.pop("final_return"), nan=-np.inf)
-    shared = {name: arrays.pop(name) for name in _SHARED}
+    shared = {name: arrays.pop(name) for name in SHARED if name in arrays}
     if seed is None:
         seed = seeds[int(np.argmax(returns))]
     # A list also has numbers that are equal, such as True and 1.0.
@@ -152,10 +168,13 @@ def read(path: str | pathlib.Path, seed: int | None = None) -> dict[str, np.ndar
         return {name: value.astype(np.float32) for name, value in weights.items()}
 
 
-def mean_and_log_std(
-    weights: Mapping[str, Any], observation: Any, xp: Any = np
-) -> tuple[Any, Any]:
-    """Return the policy's mean (..., action) and log standard deviation (action,).
+def is_discrete(weights: Mapping[str, Any]) -> bool:
+    """Return whether a policy's actions are discrete."""
+    return "num_actions" in weights
+
+
+def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
+    """Return the mean of the policy's actions, or their logits, (..., action).
 
     Args:
       weights: the arrays from `read`.
@@ -173,8 +192,46 @@ def mean_and_log_std(
     last = sum(name.startswith("kernel_") for name in weights) - 1
     for i in range(last + 1):
         x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
-        x = xp.tanh(x) if i < last else x
-    return x, weights["log_std"]
+        if i < last:
+            x = _activated(weights, x, i, xp)
+    return x
+
+
+def _is_normalized(weights: Mapping[str, Any]) -> bool:
+    return "norm_scale_0" in weights
+
+
+def _activated(weights: Mapping[str, Any], x: Any, layer: int, xp: Any) -> Any:
+    """Return what follows a hidden layer's linear part, (..., width)."""
+    if _is_normalized(weights):
+        x = x - x.mean(axis=-1, keepdims=True)
+        deviation = xp.sqrt((x**2).mean(axis=-1, keepdims=True) + 1e-6)
+        x = x / deviation * weights[f"norm_scale_{layer}"]
+        x = x + weights[f"norm_bias_{layer}"]
+    if "activation_relu" in weights:
+        return xp.maximum(x, 0.0)
+    if "activation_swish" in weights:
+        # The sigmoid, which does not overflow in this form.
+        return x * 0.5 * (1.0 + xp.tanh(0.5 * x))
+    return xp.tanh(x)
+
+
+def probabilities(weights: Mapping[str, Any], observation: Any) -> np.ndarray:
+    """Return the probability of each discrete action, (..., action).
+
+    Args:
+      weights: the arrays from `read`.
+      observation: (..., obs), not normalized.
+
+    Raises:
+      ValueError: if the policy's actions are not discrete, or if the observation has
+        another size than the policy's.
+    """
+    if not is_discrete(weights):
+        raise ValueError("the policy's actions are not discrete: it has a mean")
+    logits = output(weights, observation)
+    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return exponentials / exponentials.sum(axis=-1, keepdims=True)
 
 
 def load(
@@ -184,7 +241,8 @@ def load(
 
     The function is ``act(observation, generator=None)``, (..., obs) -> (..., action).
     It clips actions to their range. With a `numpy.random.Generator` the action is drawn
-    from the policy; without one it is the policy's mean.
+    from the policy; without one it is the policy's mean. Discrete actions are int32
+    (...), without a generator the most probable ones.
 
     Raises:
       ValueError: as in `read`.
@@ -198,9 +256,15 @@ def make(weights: Mapping[str, np.ndarray]) -> Callable[..., np.ndarray]:
     def act(
         observation: np.ndarray, generator: np.random.Generator | None = None
     ) -> np.ndarray:
-        action, log_std = mean_and_log_std(weights, observation)
+        action = output(weights, observation)
+        if is_discrete(weights):
+            if generator is not None:
+                # The largest of logits with Gumbel noise is drawn by probability.
+                action = action + generator.gumbel(size=action.shape)
+            return np.asarray(action.argmax(axis=-1), np.int32)
         if generator is not None:
-            action = action + np.exp(log_std) * generator.standard_normal(action.shape)
+            noise = generator.standard_normal(action.shape)
+            action = action + np.exp(weights["log_std"]) * noise
         action = np.clip(action, weights["low"], weights["high"])
         return np.asarray(action, np.float32)
 

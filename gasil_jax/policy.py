@@ -11,28 +11,33 @@ import numpy as np
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
+from gasil_jax.distributions import CATEGORICAL, GAUSSIAN
+from gasil_jax.networks import POLICY_LAYERS
 
 
 def weights(state: Any, env: Any) -> dict[str, Any]:
     """Return a `TrainState`'s policy as the arrays that `numpy_policy` describes.
 
-    From a batch of states every array but "low" and "high" is (seeds, ...).
+    From a batch of states every array but those in `numpy_policy.SHARED` is
+    (seeds, ...).
     """
     params = state.actor_critic.policy.params["params"]
-    layers = params["MLP_0"]
-    low, high = wrappers.action_range(env)
-    wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
+    (activation,) = (x for x, name in POLICY_LAYERS.items() if name in params)
+    layers = params[POLICY_LAYERS[activation]]
     mean, scale = normalization.moments(state.normalizer)
-    arrays = {
-        "mean": mean,
-        "scale": scale,
-        "log_std": params["log_std"],
-        "low": wide(low),
-        "high": wide(high),
-    }
-    for i in range(len(layers)):
-        arrays[f"kernel_{i}"] = layers[f"Dense_{i}"]["kernel"]
-        arrays[f"bias_{i}"] = layers[f"Dense_{i}"]["bias"]
+    arrays: dict[str, Any] = {"mean": mean, "scale": scale}
+    if wrappers.is_discrete(env):
+        arrays["num_actions"] = np.int32(env.num_actions)
+    else:
+        low, high = wrappers.action_range(env)
+        wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
+        arrays |= {"log_std": params["log_std"], "low": wide(low), "high": wide(high)}
+    if activation != "tanh":
+        arrays[f"activation_{activation}"] = np.int32(1)
+    for name, own in layers.items():
+        kind, _, i = name.partition("_")
+        prefix = "norm_" if kind == "LayerNorm" else ""
+        arrays |= {f"{prefix}{x}_{i}": array for x, array in own.items()}
     return arrays
 
 
@@ -43,7 +48,8 @@ def load_policy(
 
     The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
     float32. It clips actions to their range. Without a key the action is the policy's
-    mean; with a key it is drawn from the policy. The key is consumed.
+    mean; with a key it is drawn from the policy. The key is consumed. Discrete actions
+    are int32 (...), without a key the most probable ones.
 
     Args:
       path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
@@ -73,14 +79,18 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
     """Return the policy with these arrays, as `load_policy` does for a file."""
     float32 = lambda x: jnp.asarray(x, jnp.float32)
     arrays = jax.tree.map(float32, dict(weights))
+    discrete = numpy_policy.is_discrete(arrays)
+    distribution = CATEGORICAL if discrete else GAUSSIAN
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        observation = float32(observation)
-        action, log_std = numpy_policy.mean_and_log_std(arrays, observation, jnp)
-        if key is not None:
-            noise = jax.random.normal(key, action.shape, action.dtype)
-            action += jnp.exp(log_std) * noise
-        return jnp.clip(action, arrays["low"], arrays["high"])
+        parameters = numpy_policy.output(arrays, float32(observation), jnp)
+        if not discrete:
+            parameters = parameters, arrays["log_std"]
+        if key is None:
+            action = distribution.mode(parameters)
+        else:
+            action = distribution.sample(key, parameters)
+        return distribution.executed(action, arrays.get("low"), arrays.get("high"))
 
     return policy

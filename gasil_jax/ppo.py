@@ -11,8 +11,8 @@ from flax import struct
 
 from gasil_jax import learner
 from gasil_jax.config import Config
+from gasil_jax.distributions import Distribution
 from gasil_jax.learner import Learner
-from gasil_jax.networks import gaussian_entropy, gaussian_log_prob
 from gasil_jax.permutation import permutation
 
 
@@ -20,7 +20,7 @@ class ActorCritic(struct.PyTreeNode):
     """The policy and one value for each reward stream, all with their own optimizers.
 
     Attributes:
-      policy: parameters and optimizer state of a `networks.Policy`.
+      policy: parameters and optimizer state of the policy's network.
       values: the same of a `networks.Value` for each stream.
     """
 
@@ -149,7 +149,8 @@ def loss(
     params: Any,
     batch: Batch,
     *,
-    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    policy: Callable[[Any, jax.Array], Any],
+    distribution: Distribution,
     value: Callable[[Any, jax.Array], jax.Array],
     config: Config,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
@@ -160,7 +161,8 @@ def loss(
     Args:
       params: {"policy": ..., "values": (stream)}.
       batch: a minibatch.
-      policy: (params, observation) -> mean, log standard deviation.
+      policy: (params, observation) -> the parameters of the actions' distribution.
+      distribution: the distribution of actions.
       value: (params, observation) -> value.
       config: clip range and weights.
 
@@ -171,8 +173,8 @@ def loss(
     chex.assert_equal(
         batch.returns.shape, (*batch.log_prob.shape, len(params["values"]))
     )
-    mean, log_std = policy(params["policy"], batch.observation)
-    log_prob = gaussian_log_prob(mean, log_std, batch.action)
+    parameters = policy(params["policy"], batch.observation)
+    log_prob = distribution.log_prob(parameters, batch.action)
     log_ratio = log_prob - batch.log_prob
     ratio = jnp.exp(log_ratio)
     epsilon = config.clip_epsilon
@@ -184,7 +186,7 @@ def loss(
         for i, critic in enumerate(params["values"])
     ]
     value_loss = jnp.stack([0.5 * jnp.mean(x) for x in squared_errors]).sum()
-    entropy = gaussian_entropy(log_std)
+    entropy = jnp.mean(distribution.entropy(parameters))
     total = (
         policy_loss
         + config.value_coefficient * value_loss
@@ -246,7 +248,8 @@ def update(
     batch: Batch,
     key: jax.Array,
     *,
-    policy: Callable[[Any, jax.Array], tuple[jax.Array, jax.Array]],
+    policy: Callable[[Any, jax.Array], Any],
+    distribution: Distribution,
     value: Callable[[Any, jax.Array], jax.Array],
     config: Config,
 ) -> tuple[ActorCritic, dict[str, jax.Array]]:
@@ -256,7 +259,8 @@ def update(
       actor_critic: the networks before the update.
       batch: the batch, (steps, ...), whose advantages are standardized and mixed.
       key: random key; consumed.
-      policy: (params, observation) -> mean, log standard deviation.
+      policy: (params, observation) -> the parameters of the actions' distribution.
+      distribution: the distribution of actions.
       value: (params, observation) -> value.
       config: number of epochs, number and size of minibatches, and this iteration's
         numbers.
@@ -270,6 +274,7 @@ def update(
             actor_critic.params,
             jax.tree.map(lambda x: x[rows], batch),
             policy=policy,
+            distribution=distribution,
             value=value,
             config=config,
         )

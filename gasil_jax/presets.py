@@ -16,6 +16,9 @@ rewards, where rewards are delayed.
 "scaled" has one rule for PPO on all tasks: learning rate, exploration and lambda depend
 on the dimension of an action. Delayed rewards are decomposed.
 
+"gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
+for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
+
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
 each task (experiments/results/paper_protocol.md), and the defaults where we did not
@@ -70,6 +73,16 @@ _ADAPTIVE = {
     "buffer_steps": 10_000,
 }
 _ADAPTIVE_DELAYED = {**_ADAPTIVE, "decompose_rewards": True}
+
+_GYMNAX = {
+    "num_envs": 32,
+    "batch_steps": 2048,
+    "num_epochs": 4,
+    "minibatch_size": 256,
+    "learning_rate": 1e-3,
+    "entropy_coefficient": 0.01,
+    "normalize_rewards": True,
+}
 
 
 def _searched(rewards: str) -> Rows:
@@ -134,6 +147,7 @@ PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(_tuned("dense", _ADAPTIVE), _tuned("delayed", _ADAPTIVE_DELAYED)),
     "decomposed": Preset({}, _searched("decomposed")),
     "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
+    "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
         {
             **_searched("paper dense"),
@@ -197,7 +211,7 @@ def preset(
         raise refusal("reward_delay", reward_delay, _COUNT)
     if action_size is not None and action_size not in _COUNT:
         raise refusal("action_size", action_size, _COUNT)
-    ours, others = ("point_mass", *ACTION_SIZES), ("brax:NAME", "MODULE:NAME")
+    ours, others = ("point_mass", *ACTION_SIZES), ("FAMILY:NAME", "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", env, ours, forms=others))
     if name == "scaled" and kind.name == "ppo" and action_size is not None:

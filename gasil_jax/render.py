@@ -1,7 +1,7 @@
 """Make a film of a run's policy: ``python -m gasil_jax.render RUN --out walk.mp4``.
 
 MuJoCo draws locomotion off screen, or Brax's viewer plays it in a web page. The point
-mass is drawn as the path of an episode.
+mass is drawn as the path of an episode. Other environments draw themselves.
 """
 
 import contextlib
@@ -268,11 +268,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.run, options.checkpoint, options.point, seed=options.seed
     )
     locomotion = environments.is_locomotion(env)
-    if not (locomotion or environments.is_point_mass(env)):
-        raise InputError("run is of an environment that can't be drawn")
+    if not environments.can_be_drawn(env):
+        raise InputError(
+            "run is of an environment that can't be drawn: it must have a function "
+            "draw(state, size)"
+        )
     if options.out.suffix == _PAGE and not locomotion:
         raise InputError(
-            f"out is {options.out}, which is for locomotion: of the point mass it "
+            f"out is {options.out}, which is for locomotion: of other environments it "
             f"must end in {', '.join(_PICTURES)}"
         )
     output_file.make_parent(options.out)

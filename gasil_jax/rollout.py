@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import wrappers
-from gasil_jax.networks import gaussian_log_prob
+from gasil_jax.distributions import Distribution
 
 
 class Rollout(struct.PyTreeNode):
@@ -18,8 +18,10 @@ class Rollout(struct.PyTreeNode):
       observation: float32 (time, env, obs), before the action, not normalized.
       next_observation: float32 (time, env, obs), after the action. Where an episode
         ended, it is its final observation and not the start of the next episode.
-      action: float32 (time, env, action), as drawn from the policy, not clipped.
-      log_prob: float32 (time, env), log density of the action when it was drawn.
+      action: float32 (time, env, action), as drawn from the policy, not clipped; where
+        actions are discrete, one-hot.
+      log_prob: float32 (time, env), log density, or log probability, of the action when
+        it was drawn.
       reward: float32 (time, env), the reward that the environment gives, which may be
         delayed; in an agent's `Context`, what the reward models make of it.
       terminated: bool (time, env), whether the episode ended and has no future value.
@@ -135,10 +137,11 @@ def init(
 
 def collect(
     env: Any,
-    policy: Callable[[jax.Array], tuple[jax.Array, jax.Array]],
+    policy: Callable[[jax.Array], Any],
     environments: EnvironmentStates,
     key: jax.Array,
     *,
+    distribution: Distribution,
     num_steps: int,
     max_episode_steps: int,
     gamma: jax.Array | float,
@@ -147,9 +150,10 @@ def collect(
 
     Args:
       env: a single environment with Brax's interface, not wrapped to reset itself.
-      policy: observation (env, obs) -> mean (env, action), log std (action,).
+      policy: observation (env, obs) -> the parameters of the actions' distribution.
       environments: the running episodes.
       key: random key; consumed.
+      distribution: the distribution of actions.
       num_steps: number of steps in each environment.
       max_episode_steps: length at which an episode is truncated.
       gamma: discount of the episodes' return.
@@ -168,7 +172,7 @@ def collect(
 
     @jax.named_scope("environment")
     def step_one(state: Any, action: jax.Array, reset_key: jax.Array) -> Any:
-        stepped = env.step(state, jnp.clip(action, low, high))
+        stepped = env.step(state, distribution.executed(action, low, high))
         with jax.named_scope("reset"):
             return stepped, env.reset(reset_key)
 
@@ -178,9 +182,8 @@ def collect(
         visible = wrappers.is_sound(carry.state.obs).all(axis=-1)
         observation = jnp.where(visible[:, None], carry.state.obs, 0.0)
         with jax.named_scope("policy"):
-            mean, log_std = policy(observation)
-        noise = jax.random.normal(action_key, mean.shape, mean.dtype)
-        action = mean + jnp.exp(log_std) * noise
+            parameters = policy(observation)
+        action = distribution.sample(action_key, parameters)
         reset_keys = jax.random.split(reset_key, num_envs)
         stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
 
@@ -208,7 +211,7 @@ def collect(
             observation=observation,
             next_observation=next_observation,
             action=action,
-            log_prob=gaussian_log_prob(mean, log_std, action),
+            log_prob=distribution.log_prob(parameters, action),
             reward=reward,
             terminated=terminated,
             truncated=truncated,

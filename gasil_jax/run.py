@@ -70,7 +70,7 @@ def _print_next(env: Any, folder: pathlib.Path) -> None:
     """Print the commands that are of use for a new run, as a line for the shell."""
     quoted = shlex.quote(str(folder))
     commands = [f"evaluate {quoted}", f"plot {quoted}"]
-    if environments.is_locomotion(env) or environments.is_point_mass(env):
+    if environments.can_be_drawn(env):
         commands.append(f"render {quoted} --out episode.gif")
     print("next:", "; ".join(f"python -m gasil_jax.{x}" for x in commands))
 

@@ -15,6 +15,7 @@ from gasil_envs import own_code, wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     checks,
+    distributions,
     good_trajectories,
     learner,
     normalization,
@@ -24,9 +25,10 @@ from gasil_jax import (
 )
 from gasil_jax.algorithms import Algorithm, check_numbers
 from gasil_jax.config import Config
-from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.context import Context, Metrics, sizes_of
+from gasil_jax.distributions import Distribution
 from gasil_jax.imitation.interface import Checked
-from gasil_jax.networks import Policy, Value
+from gasil_jax.networks import Value
 from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
 
@@ -136,12 +138,8 @@ def _init_memory(
 ) -> dict[str, Any]:
     """Return the history and the states of the agent and of the models of rewards."""
     history = _init_history(env, algorithm)
-    sizes = Sizes(
-        algorithm.config.num_envs,
-        env.observation_size,
-        env.action_size,
-        history_steps=0 if history is None else history.reward.shape[1],
-    )
+    history_steps = 0 if history is None else history.reward.shape[1]
+    sizes = sizes_of(env, algorithm.config.num_envs, history_steps)
     models = algorithm.rewards
     keys = _keys(rewards_key, len(models))
     return {
@@ -173,15 +171,19 @@ def _init_history(env: Any, algorithm: Algorithm) -> good_trajectories.History |
         config.num_steps,
         max_episode_steps(env),
         observation_size=env.observation_size,
-        action_size=env.action_size,
+        action_size=wrappers.action_size(env),
         keep_next=any(model.keeps_next_observation for model in models),
         num_episodes=max(episodes),
     )
 
 
-def _networks(env: Any, config: Config) -> tuple[Any, Any]:
+def _networks(env: Any, config: Config) -> tuple[Any, Any, Distribution]:
+    """Return the policy's network, the value's, and the distribution of actions."""
     # Typed as Any because Flax declares that `apply` may also return variables.
-    return Policy(config.hidden_sizes, env.action_size), Value(config.hidden_sizes)
+    sizes, distribution = config.hidden_sizes, distributions.of(env)
+    layers = (config.activation, config.layer_norm)
+    policy = distribution.network(sizes, wrappers.action_size(env), *layers)
+    return policy, Value(sizes, *layers), distribution
 
 
 def _init_actor_critic(
@@ -192,11 +194,11 @@ def _init_actor_critic(
     policy_key: jax.Array,
     value_key: jax.Array,
 ) -> ActorCritic:
-    policy, value = _networks(env, algorithm.config)
+    policy, value, distribution = _networks(env, algorithm.config)
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(algorithm.config)
     policy_params = policy.init(policy_key, observation)
-    policy_params["params"]["log_std"] += jnp.log(initial_deviation)
+    policy_params = distribution.explore(policy_params, initial_deviation)
     return ActorCritic(
         policy=learner.init(policy_params, transform),
         values=tuple(
@@ -311,7 +313,7 @@ def collect(
     config = algorithm.config
     environments, batch = sample_trajectories(env, config, state, key=keys.act)
     history = None if state.history is None else _record(state.history, batch)
-    policy, value = _networks(env, config)
+    policy, value, distribution = _networks(env, config)
     context = Context(
         rollout=batch,
         history=history,
@@ -320,6 +322,7 @@ def collect(
         action_range=wrappers.action_range(env),
         config=config,
         policy=policy.apply,
+        distribution=distribution,
         value=value.apply,
         data=jax.tree.map(jnp.asarray, data),
     )
@@ -419,7 +422,7 @@ def sample_trajectories(
     Returns:
       The running episodes after the batch, and the batch, (time, env, ...).
     """
-    policy, _ = _networks(env, config)
+    policy, _, distribution = _networks(env, config)
     return rollout.collect(
         env,
         lambda observation: policy.apply(
@@ -428,6 +431,7 @@ def sample_trajectories(
         ),
         state.environments,
         key,
+        distribution=distribution,
         num_steps=config.num_steps,
         max_episode_steps=max_episode_steps(env),
         gamma=config.gamma,
@@ -535,6 +539,7 @@ def update_policy(
         batch,
         ppo_key,
         policy=context.policy,
+        distribution=context.distribution,
         value=context.value,
         config=context.config,
     )

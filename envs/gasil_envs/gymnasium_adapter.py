@@ -36,15 +36,16 @@ _NO_FORK = (
 _process: int | None = None
 
 
-def _spaces(env: Env) -> tuple[gymnasium.spaces.Box, gymnasium.spaces.Box]:
+def _spaces(env: Env) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
     """Return the spaces of observations and actions."""
+    box, size = gymnasium.spaces.Box, env.observation_size
+    observations = box(-np.inf, np.inf, (size,), np.float32)
+    if wrappers.is_discrete(env):
+        return observations, gymnasium.spaces.Discrete(env.num_actions)
     low, high = wrappers.action_range(env)
     shape = (env.action_size,)
     wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), shape).copy()
-    return (
-        gymnasium.spaces.Box(-np.inf, np.inf, (env.observation_size,), np.float32),
-        gymnasium.spaces.Box(wide(low), wide(high), shape, np.float32),
-    )
+    return observations, box(wide(low), wide(high), shape, np.float32)
 
 
 def _callers() -> Iterator[Any]:
@@ -84,14 +85,19 @@ def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax
 
     Raises:
       ResetNeeded: if there is no state yet.
-      ValueError: if the action has another shape than the space.
+      ValueError: if the action has another shape than the space, or is no number of a
+        discrete action.
     """
     if state is None:
         raise gymnasium.error.ResetNeeded("step needs a reset before it")
-    given = jnp.asarray(action, jnp.float32)
+    given = np.asarray(action)
     if given.shape != space.shape:
         raise ValueError(f"action has shape {given.shape}: it must have {space.shape}")
-    return given
+    if isinstance(space, gymnasium.spaces.Box):
+        return jnp.asarray(given, jnp.float32)
+    if not space.contains(given.astype(np.int64)) or (given % 1).any():
+        raise ValueError(f"action is {given}: it must be in {space}")
+    return jnp.asarray(given, jnp.int32)
 
 
 def _key(generator: np.random.Generator) -> jax.Array:

@@ -59,7 +59,7 @@ class GymnaxEnv:
         Args:
           key: key for the start of the next episode; consumed.
           state: the state before the step.
-          action: float32 (action,).
+          action: float32 (action,), or int32 () where actions are discrete.
           params: ignored; part of gymnax' interface.
 
         Returns:
@@ -84,18 +84,29 @@ class GymnaxEnv:
         """Return an unbounded ``gymnax.environments.spaces.Box`` of shape (obs,)."""
         return _box(-jnp.inf, jnp.inf, self._env.observation_size)
 
+    @property
+    def num_actions(self) -> int:
+        """The number of discrete actions, or the dimension of an action."""
+        return wrappers.action_size(self._env)
+
     def action_space(self, params: Params | None = None) -> Any:
-        """Return a ``gymnax.environments.spaces.Box`` of shape (action,)."""
+        """Return gymnax' ``Box`` of shape (action,), or its ``Discrete``."""
+        if wrappers.is_discrete(self._env):
+            return _spaces().Discrete(self._env.num_actions)
         low, high = wrappers.action_range(self._env)
         return _box(low, high, self._env.action_size)
 
 
-def _box(low: Any, high: Any, size: int) -> Any:
+def _spaces() -> Any:
     try:
         from gymnax.environments import spaces
     except ImportError:
         raise ImportError(
             'a gymnax space needs the package gymnax (pip install "gasil_jax[gymnax]")'
         ) from None
+    return spaces
+
+
+def _box(low: Any, high: Any, size: int) -> Any:
     wide = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,))
-    return spaces.Box(wide(low), wide(high), (size,), jnp.float32)
+    return _spaces().Box(wide(low), wide(high), (size,), jnp.float32)

@@ -16,7 +16,17 @@ from brax.envs import Env
 from gasil_envs import own_code, wrappers
 
 #: The attributes of Brax's interface that training uses.
-INTERFACE = ("reset", "step", "observation_size", "action_size")
+INTERFACE = ("reset", "step", "observation_size")
+
+
+def missing(env: Any) -> str | None:
+    """Return what an object lacks of Brax's interface, in words; None if nothing."""
+    for name in INTERFACE:
+        if not hasattr(env, name):
+            return name
+    if not (hasattr(env, "action_size") or hasattr(env, "num_actions")):
+        return "action_size, and for discrete actions no num_actions"
+    return None
 
 
 def find(name: str) -> Callable[[], Env]:
@@ -45,9 +55,9 @@ def build(name: str) -> Env:
     with own_code.refused(f"env {name!r} can't be built"):
         env = constructor()
         # An attribute may be a property, which is the user's code too.
-        missing = [x for x in INTERFACE if not hasattr(env, x)]
-    if missing:
-        raise ValueError(f"env {name!r} is no environment: it has no {missing[0]}")
+        lacking = missing(env)
+    if lacking is not None:
+        raise ValueError(f"env {name!r} is no environment: it has no {lacking}")
     # `registry.make` wraps it in an `EpisodeLimit`, which adds fields to its states.
     check(name, env, wrappers.EpisodeLimit(env, 1))
     return env
@@ -58,14 +68,21 @@ def check(name: str, env: Any, trained: Any) -> None:
 
     Args:
       name: name of the environment, for the error message.
-      env: an object with Brax's `reset`, `step`, `observation_size` and `action_size`.
+      env: an object with Brax's `reset`, `step`, `observation_size` and `action_size`,
+        or `num_actions` in place of the last.
       trained: the environment that training steps: `env`, or a wrapper of it.
 
     Raises:
       ValueError: if a size is no count, or if a state has a wrong structure, shape or
         dtype.
     """
-    for attribute in ("observation_size", "action_size"):
+    size = "num_actions" if wrappers.is_discrete(env) else "action_size"
+    if wrappers.is_discrete(env) and hasattr(env, "action_size"):
+        raise ValueError(
+            f"env {name!r} has action_size and num_actions: it must have one of them, "
+            "num_actions if actions are discrete"
+        )
+    for attribute in ("observation_size", size):
         _check_count(name, attribute, getattr(env, attribute))
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
@@ -84,7 +101,8 @@ def _check_action_range(name: str, env: Env) -> None:
     given = wrappers.action_range(env)
     try:
         low, high = (np.asarray(x, np.float32) for x in given)
-        below = bool(np.broadcast_to(low < high, (env.action_size,)).all())
+        wide = np.broadcast_to(low < high, (wrappers.action_size(env),))
+        below = bool(wide.all())
     except (TypeError, ValueError):
         below = False
     if not below:
@@ -112,7 +130,7 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
 
 def _check_states(name: str, env: Env, trained: Env) -> None:
     """Check that states have the declared sizes and fit a carry of `jax.lax.scan`."""
-    key, action = jax.random.key(0), jnp.zeros(env.action_size)
+    key, action = jax.random.key(0), wrappers.zero_action(env)
     size = env.observation_size  # Once: Brax runs a reset for it.
     bare = _traced(name, env, "reset", key)
     stepped = _traced(name, env, "step", bare, action)

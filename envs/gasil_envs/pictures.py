@@ -1,4 +1,9 @@
-"""Draw states of an episode: MuJoCo draws locomotion, Matplotlib the point mass."""
+"""Draw states of an episode.
+
+MuJoCo draws locomotion, Matplotlib the point mass, and another environment itself, with
+a function ``draw(state, size)`` of its `pipeline_state`, as NumPy arrays, and the width
+and height of a picture, which returns the picture, uint8 (height, width, 3).
+"""
 
 from collections.abc import Sequence
 from typing import Any
@@ -120,17 +125,62 @@ class PointMassPainter:
         """Do nothing: there is nothing to free."""
 
 
-def painter(env: Env, size: tuple[int, int]) -> LocomotionPainter | PointMassPainter:
+class OwnPainter:
+    """Draws states of an environment that has a function `draw`.
+
+    Args:
+      env: the environment, without wrappers.
+      size: width and height of a picture in pixels.
+
+    Raises:
+      ValueError: from `draw`, if a picture is no uint8 (height, width, 3).
+    """
+
+    def __init__(self, env: Any, size: tuple[int, int]):
+        self._env, self._size = env, size
+        self.seconds_per_step = float(getattr(env, "dt", 0.1))
+
+    def draw(self, episode: Sequence[Any]) -> np.ndarray:
+        """Return a picture of the last state, uint8 (height, width, 3)."""
+        picture = np.asarray(self._env.draw(episode[-1], self._size))
+        shape = (self._size[1], self._size[0], 3)
+        if picture.shape != shape or picture.dtype != np.uint8:
+            raise ValueError(
+                f"draw of {type(self._env).__name__} returns {picture.dtype}"
+                f"{list(picture.shape)}: it must be uint8{list(shape)}"
+            )
+        return picture
+
+    def moment(self, step: int) -> str:
+        """Return the number of a step as the label of its picture."""
+        return f"step {step}"
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to free."""
+
+
+Painter = LocomotionPainter | PointMassPainter | OwnPainter
+
+
+def can_draw(env: Env) -> bool:
+    """Return whether an environment, wrapped or not, has a painter."""
+    ours = isinstance(env.unwrapped, Locomotion | PointMass)
+    return ours or hasattr(env.unwrapped, "draw")
+
+
+def painter(env: Env, size: tuple[int, int]) -> Painter:
     """Return the painter of an environment, wrapped or not.
 
     Raises:
       NoOpenGL: if the environment is a locomotion task and MuJoCo finds no OpenGL.
-      ValueError: if it is not one of this package's environments.
+      ValueError: if it can't be drawn.
     """
     if isinstance(env.unwrapped, Locomotion):
         return LocomotionPainter(env.unwrapped, size)
     if isinstance(env.unwrapped, PointMass):
         return PointMassPainter(env.unwrapped, size)
+    if can_draw(env):
+        return OwnPainter(env.unwrapped, size)
     raise ValueError(f"{type(env.unwrapped).__name__} can't be drawn")
 
 

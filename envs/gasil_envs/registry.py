@@ -2,19 +2,16 @@
 
 import dataclasses
 import difflib
-import importlib.metadata
+import importlib.util
 import numbers
-import warnings
 from collections.abc import Callable, Iterable
 from typing import Any
 
-import brax.envs
 import jax
-import jax.numpy as jnp
 import numpy as np
-from brax.envs import Env, Wrapper
+from brax.envs import Env
 
-from gasil_envs import locomotion, own_environment, point_mass, wrappers
+from gasil_envs import locomotion, own_environment, point_mass, worlds, wrappers
 from gasil_envs.physics import batching, native
 from gasil_envs.physics.mjx import SOLVERS
 
@@ -50,8 +47,6 @@ class Settings:
     max_episode_steps: int | None = None
 
 
-#: Prefix of the names of environments in ``brax.envs``.
-BRAX = "brax:"
 _EPISODE_LENGTH = 1000
 
 
@@ -83,9 +78,11 @@ def _refuse_unknown(
         return
     name = name[:300]
     # The prefix, which all names have, must not make them similar.
-    bare = {x.removeprefix(BRAX): x for x in allowed}
-    given = name.removeprefix(BRAX).lower()  # Gymnasium writes "Hopper-v5".
+    bare = {x.rpartition(":")[2].lower(): x for x in allowed}
+    given = name.rpartition(":")[2].lower()  # Gymnasium writes "Hopper-v5".
     near = difflib.get_close_matches(given, bare, n=1, cutoff=0.7)
+    if not near and len(given) > 2:
+        near = [x for x in bare if given in x]
     if not near:
         raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
     raise ValueError(
@@ -104,14 +101,33 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
     Raises:
       ValueError: if the name is unknown.
     """
-    if isinstance(name, str) and name.startswith(BRAX):
-        _refuse_unknown("env", name, [BRAX + x for x in brax.envs._envs])
-        return lambda settings: _build_of_brax(name)
     if isinstance(name, str) and ":" in name:
+        family, bare, *_ = name.split(":")
+        if family in worlds.FAMILIES:
+            _refuse_unknown("env", f"{family}:{bare}", worlds.names(family))
+            return lambda settings: worlds.build(name)
+        _refuse_unknown_family(name, family)
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
-    _refuse_unknown("env", name, names(), forms=(f"{BRAX}NAME", "MODULE:NAME"))
+    _refuse_unknown("env", name, names(), forms=(*worlds.forms(), "MODULE:NAME"))
     return lambda settings: _build_ours(name, settings)
+
+
+def _refuse_unknown_family(name: str, family: str) -> None:
+    """Raise `ValueError` if a family's name is misspelled and is no module."""
+    near = difflib.get_close_matches(family.lower(), worlds.FAMILIES, n=1, cutoff=0.7)
+    if near and not _is_module(family):
+        meant = f"{near[0]}:{name.partition(':')[2]}"
+        listed = ", ".join((*worlds.forms(), "MODULE:NAME"))
+        raise ValueError(
+            f"env {name!r} is of an unknown family: did you mean {meant!r}? (one of "
+            f"{listed})"
+        )
+
+
+def _is_module(name: str) -> bool:
+    # A name with dots imports the packages above it, whose errors are told later.
+    return "." in name or importlib.util.find_spec(name) is not None
 
 
 def _build_ours(name: str, settings: Settings) -> Env:
@@ -123,40 +139,6 @@ def _build_ours(name: str, settings: Settings) -> Env:
         solver=settings.solver,
         integrator=settings.integrator,
     )
-
-
-class _OfBrax(Wrapper):
-    """An environment of Brax that keeps the size of its observations.
-
-    Brax runs a reset, operation by operation, each time that it is asked for the size.
-    """
-
-    def __init__(self, env: Env, observation_size: int):
-        super().__init__(env)
-        self._observation_size = observation_size
-
-    @property
-    def observation_size(self) -> int:
-        """The number of numbers in an observation."""
-        return self._observation_size
-
-
-def _build_of_brax(name: str) -> Env:
-    """Build an environment of Brax, and trace a step without running it."""
-    try:
-        with warnings.catch_warnings():
-            # Brax warns that its physics is not maintained.
-            warnings.simplefilter("ignore", UserWarning)
-            env = brax.envs.get_environment(name.removeprefix(BRAX))
-            state = jax.eval_shape(env.reset, jax.random.key(0))
-            jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
-            return _OfBrax(env, state.obs.shape[-1])
-    except Exception as error:
-        version = importlib.metadata.version("brax")
-        why = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise ValueError(
-            f"env {name!r} fails within Brax {version} itself: {why}"
-        ) from None
 
 
 def _is_whole(value: Any, low: int, high: int) -> bool:
@@ -224,8 +206,9 @@ def make(name: str, **settings: Any) -> Env:
     """Build an environment with its step limit and the paper's task variations.
 
     Args:
-      name: one of `names()`; "brax:" and a name in ``brax.envs``; or MODULE:NAME of
-        your own class or function that builds an environment with Brax's interface.
+      name: one of `names()`; one of another package, as FAMILY:NAME (see `worlds`); or
+        MODULE:NAME of your own class or function that builds an environment with Brax's
+        interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
         integrator, terminal_limits, max_episode_steps.
 

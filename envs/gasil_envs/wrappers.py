@@ -46,8 +46,27 @@ def step_is_sound(observation: jax.Array, stepped: State) -> jax.Array:
 
 
 def action_range(env: Any) -> tuple[Any, Any]:
-    """Return the lowest and the highest action; Brax's environments have -1 and 1."""
-    return getattr(env, "action_range", (-1.0, 1.0))
+    """Return the lowest and the highest number of an action as a vector.
+
+    Brax's environments have -1 and 1; discrete actions are one-hot vectors.
+    """
+    default = (0.0, 1.0) if is_discrete(env) else (-1.0, 1.0)
+    return getattr(env, "action_range", default)
+
+
+def is_discrete(env: Any) -> bool:
+    """Return whether an environment's step gets an int32 () below `num_actions`."""
+    return hasattr(env, "num_actions")
+
+
+def action_size(env: Any) -> int:
+    """Return the length of an action as a vector; discrete ones are one-hot."""
+    return env.num_actions if is_discrete(env) else env.action_size
+
+
+def zero_action(env: Any) -> jax.Array:
+    """Return the action that is all 0, as the environment's step gets it."""
+    return jnp.int32(0) if is_discrete(env) else jnp.zeros(env.action_size)
 
 
 def _refuse_taken(state: State, *names: str) -> None:

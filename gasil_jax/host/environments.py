@@ -2,9 +2,9 @@
 
 from typing import Any
 
+from gasil_envs import pictures
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
-from gasil_envs.point_mass import PointMass
 from gasil_envs.registry import (
     Settings,
     check,
@@ -13,16 +13,18 @@ from gasil_envs.registry import (
     prepare,
     without_effect,
 )
+from gasil_envs.wrappers import is_discrete
 
 make_env = make
 
 __all__ = [
     "Settings",
     "available_cores",
+    "can_be_drawn",
     "check",
     "ends_early",
+    "is_discrete",
     "is_locomotion",
-    "is_point_mass",
     "made_with",
     "make_env",
     "prepare",
@@ -40,6 +42,6 @@ def is_locomotion(env: Any) -> bool:
     return isinstance(env.unwrapped, Locomotion)
 
 
-def is_point_mass(env: Any) -> bool:
-    """Return whether an environment, wrapped or not, is the point mass."""
-    return isinstance(env.unwrapped, PointMass)
+def can_be_drawn(env: Any) -> bool:
+    """Return whether there are pictures of an environment, wrapped or not."""
+    return pictures.can_draw(env)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 
+from gasil_envs import wrappers
 from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
 
@@ -56,7 +57,7 @@ def need(env: Any, algorithm: Algorithm) -> Need:
     state = jax.eval_shape(lambda: train.init(env, algorithm, jax.random.key(0)))
     config = algorithm.config
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
-    numbers = 2 * env.observation_size + env.action_size + 12
+    numbers = 2 * env.observation_size + wrappers.action_size(env) + 12
     batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
     steps = _gradient_steps(env, algorithm)
     # What is learned may be large, and is copied if it is not donated. Gradient steps
@@ -86,7 +87,7 @@ def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
     the whole batch.
     """
     settings, steps = algorithm.settings, {}
-    inputs = env.observation_size + env.action_size
+    inputs = env.observation_size + wrappers.action_size(env)
     for name, minibatch_size in settings.items():
         # An agent of the user's may have one that is None.
         if name.endswith("minibatch_size") and minibatch_size:

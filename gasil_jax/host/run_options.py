@@ -50,8 +50,8 @@ class Options:
 
     Attributes:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
-        humanoid; one of Brax's as brax:NAME, for example brax:inverted_pendulum; or
-        your own as MODULE:NAME.
+        humanoid; one of another package as brax:NAME, gymnax:NAME, navix:NAME or
+        playground:NAME, for example gymnax:CartPole-v1; or your own as MODULE:NAME.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+bonus, gail, or your own as MODULE:CLASS. Each has its own settings: this
         help shows those of the one that is named beside it.
@@ -74,9 +74,10 @@ class Options:
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and
         agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
-        rule of PPO for all locomotion tasks; or paper, the paper's own protocol, with
-        one environment per seed. Options override them. The defaults that this help
-        shows are those of the preset if --env is named beside --help.
+        rule of PPO for all locomotion tasks; gymnax, one setting for discrete actions;
+        or paper, the paper's own protocol, with one environment per seed. Options
+        override them. The defaults that this help shows are the preset's if --env is
+        named beside --help.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -280,7 +281,13 @@ def _action_size(env: str, preset: str) -> int | None:
     # The environment's arrays start JAX.
     devices.use_devices(Settings(), None, environments.available_cores())
     with announced(env, "building the environment"):
-        return int(environments.make_env(env).action_size)
+        built = environments.make_env(env)
+    if environments.is_discrete(built):
+        raise InputError(
+            "preset is 'scaled', a rule for the dimension of an action: those of "
+            f"{env} are discrete, it must be another preset, such as 'gymnax'"
+        )
+    return int(built.action_size)
 
 
 def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
@@ -374,12 +381,15 @@ def without_effect(algorithm: Algorithm) -> dict[str, str]:
     return dict.fromkeys(every, reason)
 
 
-def note_options_without_effect(options: Options, num_members: int) -> None:
+def note_options_without_effect(
+    options: Options, num_members: int, *, discrete: bool = False
+) -> None:
     """Print a note for each option that was changed but has no effect.
 
     Args:
       options: options that `check` accepts.
       num_members: number of seeds, over all points of a sweep.
+      discrete: whether the environment's actions are discrete.
     """
     algorithm, settings = options.algorithm, options.settings
     for name in environments.without_effect(options.env, settings):
@@ -402,7 +412,10 @@ def note_options_without_effect(options: Options, num_members: int) -> None:
         if not now[model.switch]
         for name in names(model)
     }
-    for name, reason in sorted({**reasons, **without_effect(algorithm)}.items()):
+    reasons |= without_effect(algorithm)
+    if discrete:
+        reasons["initial_deviation"] = f"the actions of {options.env} are discrete"
+    for name, reason in sorted(reasons.items()):
         if now[name] != before[name]:
             command_line.note(f"{name} is {now[name]}, which has no effect: {reason}")
     if options.devices is not None and options.devices > num_members:

@@ -144,6 +144,9 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
+_NORMALIZES_ACTIONS = "discriminator_normalizes_actions"
+
+
 class Source(NamedTuple):
     """The source of the pairs that the policy imitates.
 
@@ -217,6 +220,38 @@ class AdversarialAgent(Agent):
         pairs = self._preprocessor(context)(rollout.observation, rollout.action)
         bonus = BONUSES[self.bonus](self._network.apply(discriminator.params, *pairs))
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
+
+    def discriminator(self, state: Any) -> Learner:
+        """Return the discriminator in a state."""
+        return state.discriminator
+
+    def reward(
+        self, state: Any, normalizer: normalization.Normalizer
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        """Return the bonus without alpha as a function of observation and action.
+
+        The function is (..., obs), (..., action) -> (...).
+
+        Args:
+          state: the agent's state.
+          normalizer: the normalizer of observations.
+
+        Raises:
+          ValueError: if the bonus of a step depends on the batch that it is in.
+        """
+        if self.bonus == "centered" or self.discriminator_normalizes_actions:
+            name = "bonus" if self.bonus == "centered" else _NORMALIZES_ACTIONS
+            raise ValueError(
+                f"{name} is {getattr(self, name)!r}: the reward of a step then depends "
+                "on the batch that it is in"
+            )
+        params = self.discriminator(state).params
+
+        def reward(observation: jax.Array, action: jax.Array) -> jax.Array:
+            observation = normalization.normalize(normalizer, observation)
+            return BONUSES[self.bonus](self._network.apply(params, observation, action))
+
+        return reward
 
     def _preprocessor(
         self, context: Context
@@ -376,7 +411,7 @@ class GAIL(ShapedRewardAgent):
 
     Attributes:
       expert: expert that GAIL imitates: minari:NAME for a Minari data set, or an .npz
-        file with the arrays "observation" and "action".
+        file with the arrays "observation" and "action". Discrete actions are numbers.
     """
 
     name = "gail"
@@ -386,10 +421,17 @@ class GAIL(ShapedRewardAgent):
 
     def check(self, sizes: Sizes) -> None:
         """Raise `ValueError` unless there is an expert that fits the environment."""
-        expert.check(self.expert, sizes.observation, sizes.action)
+        expert.check(self.expert, sizes)
+
+    def discriminator(self, state: Learner) -> Learner:
+        """Return the discriminator, which is the state."""
+        return state
 
     def data(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the expert's observations (steps, obs) and actions (steps, action)."""
+        """Return the expert's observations (steps, obs) and actions.
+
+        Actions are (steps, action), or numbers (steps,) where they are discrete.
+        """
         assert self.expert is not None  # Ensured by `check`.
         return expert.load(self.expert)
 
@@ -402,10 +444,11 @@ class GAIL(ShapedRewardAgent):
     ) -> tuple[Learner, jax.Array, Metrics]:
         """Train the discriminator (equation 8), and reward with it alone."""
         observation, action = context.data
+        size = context.rollout.action.shape[-1]
 
         def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
             rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
-            return observation[rows], action[rows]
+            return observation[rows], expert.vectors(action[rows], size)
 
         source = Source(sample, jnp.bool_(True))
         state, bonus, metrics = self.update_and_score(state, source, context, key)

@@ -19,13 +19,7 @@ from gasil_jax.context import Context, Metrics
 from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.imitation.buffered import BufferedAgent
 from gasil_jax.learner import Learner
-from gasil_jax.networks import gaussian_log_prob
 from gasil_jax.ppo import ActorCritic
-
-
-def loss(mean: jax.Array, log_std: jax.Array, action: jax.Array) -> jax.Array:
-    """Return the mean negative log likelihood of actions (steps, action), ()."""
-    return -jnp.mean(gaussian_log_prob(mean, log_std, action))
 
 
 class PPOBC(BufferedAgent):
@@ -54,8 +48,8 @@ class PPOBC(BufferedAgent):
         """Take gradient steps on the cloning loss, if the buffer is not empty."""
 
         def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
-            mean, log_std = context.policy(params, observation)
-            value = loss(mean, log_std, action)
+            parameters = context.policy(params, observation)
+            value = -jnp.mean(context.distribution.log_prob(parameters, action))
             return self.behavior_cloning_coefficient * value, value
 
         def step(policy: Learner, key: jax.Array) -> Any:

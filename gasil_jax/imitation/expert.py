@@ -6,9 +6,11 @@ import importlib
 import pathlib
 from typing import Any
 
+import jax
 import numpy as np
 
 from gasil_jax import npz
+from gasil_jax.context import Sizes
 
 _MINARI = "minari:"
 _NAMES = ("observation", "action")
@@ -17,7 +19,7 @@ _NAMES = ("observation", "action")
 def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the expert's observations (steps, obs) and actions (steps, action).
 
-    Both are float32 and read-only.
+    Both are float32 and read-only. Discrete actions may also be numbers, (steps,).
 
     Args:
       source: the path of an ``.npz`` file with arrays "observation" and "action", or
@@ -61,8 +63,11 @@ def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
     # What is wrong in a data set decides the type of the error.
     try:
         arrays = read()
+        numbered = np.ndim(arrays.get("action", 0)) == 1
+        shapes = (None, None), (None,) if numbered else (None, None)
         observation, action = (
-            npz.numbers(arrays, x, (None, None)).astype(np.float32) for x in _NAMES
+            npz.numbers(arrays, x, shape).astype(np.float32)
+            for x, shape in zip(_NAMES, shapes, strict=True)
         )
         if len(observation) != len(action):
             raise ValueError(f"{len(observation)} observations, {len(action)} actions")
@@ -99,7 +104,13 @@ def _read_minari(name: str) -> dict[str, np.ndarray]:
     return dict(zip(_NAMES, arrays))
 
 
-def check(source: str | None, observation_size: int, action_size: int) -> None:
+def vectors(action: jax.Array, size: int) -> jax.Array:
+    """Return actions as vectors (steps, size); numbers (steps,) become one-hot."""
+    numbered = action.ndim == 1
+    return jax.nn.one_hot(action.astype(int), size) if numbered else action
+
+
+def check(source: str | None, sizes: Sizes) -> None:
     """Check that an expert is given and fits the environment's sizes.
 
     Raises:
@@ -111,10 +122,23 @@ def check(source: str | None, observation_size: int, action_size: int) -> None:
             "minari:NAME"
         )
     observation, action = load(source)
-    sizes = (observation.shape[1], action.shape[1])
-    if sizes != (observation_size, action_size):
+    if action.ndim == 1:
+        if not sizes.discrete:
+            raise ValueError(
+                f"expert {source!r} has numbers as actions: the environment's are "
+                f"vectors of size {sizes.action}"
+            )
+        if not np.isin(action, np.arange(sizes.action)).all():
+            raise ValueError(
+                f"expert {source!r} has actions from {action.min():g} to "
+                f"{action.max():g}: the environment's are whole numbers from 0 to "
+                f"{sizes.action - 1}"
+            )
+    width = sizes.action if action.ndim == 1 else action.shape[1]
+    given = (observation.shape[1], width)
+    if given != (sizes.observation, sizes.action):
         raise ValueError(
-            f"expert {source!r} has observations of size {sizes[0]} and actions of "
-            f"size {sizes[1]}: the environment's are of size {observation_size} and "
-            f"{action_size}"
+            f"expert {source!r} has observations of size {given[0]} and actions of "
+            f"size {given[1]}: the environment's are of size {sizes.observation} and "
+            f"{sizes.action}"
         )

@@ -30,7 +30,6 @@ from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import History
 from gasil_jax.imitation.interface import Agent
-from gasil_jax.networks import gaussian_log_prob
 from gasil_jax.ppo import ActorCritic
 
 _PRIORITY_EXPONENT = 0.6
@@ -247,9 +246,8 @@ class PPOSIL(Agent):
 
         def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
             observation = normalize(rows.observation)
-            log_prob = gaussian_log_prob(
-                *context.policy(params["policy"], observation), rows.action
-            )
+            parameters = context.policy(params["policy"], observation)
+            log_prob = context.distribution.log_prob(parameters, rows.action)
             (critic,) = params["values"]
             value = context.value(critic, observation)
             total, fraction = loss(

@@ -106,7 +106,9 @@ def prepare(
             written=sum(map(resources.size_of_checkpoints, folders)),
         )
     run_options.note_if_untuned(options)
-    run_options.note_options_without_effect(options, num_members)
+    run_options.note_options_without_effect(
+        options, num_members, discrete=environments.is_discrete(env)
+    )
     note_if_no_episode_ends(env, [program.algorithm for program in programs])
     return env
 

@@ -4,13 +4,15 @@ import contextlib
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from gasil_envs import wrappers
+from gasil_envs.precision import full_precision
 from gasil_jax import numpy_policy, policy, train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
@@ -22,6 +24,7 @@ from gasil_jax.host import (
     run_folder,
 )
 from gasil_jax.host.members import member
+from gasil_jax.imitation.adversarial import AdversarialAgent
 from gasil_jax.sweeps.plan import Plan, stored_plan
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
@@ -211,7 +214,8 @@ def load_policies(
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
         env, _, seeds, states = load(pathlib.Path(folder), which, point, seed=seed)
         every = jax.device_get(policy.weights(states, env))
-        shared = {name: every.pop(name) for name in ("low", "high")}
+        names = [name for name in numpy_policy.SHARED if name in every]
+        shared = {name: every.pop(name) for name in names}
         weights = [member(every, i) | shared for i in range(len(seeds))]
         return Policies(env, train.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":
@@ -221,3 +225,51 @@ def load_policies(
         about = numpy_policy.about(str(folder))
         env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
     return Policies(env, int(env.episode_length), [about["seed"]], [arrays])
+
+
+def load_reward(
+    folder: str | pathlib.Path,
+    seed: int | None = None,
+    *,
+    which: str = "last",
+    point: int | None = None,
+) -> Callable[[Any, Any], jax.Array]:
+    """Return the reward that a run's discriminator has learned, as a pure function.
+
+    The function is ``reward(observation, action)``, (..., obs), (..., action) -> (...),
+    in float32: the bonus without alpha. Discrete actions are int, (...).
+
+    Args:
+      folder: folder of the run or sweep.
+      seed: number of the seed; default the run's first.
+      which: see `load`.
+      point: see `load`.
+
+    Raises:
+      ValueError: as `load` does, or if the run's agent has no discriminator, or a bonus
+        that depends on the batch that a step is in.
+    """
+    env, algorithm, _, states = load(pathlib.Path(folder), which, point, seed=seed)
+    agent, state = algorithm.agent, member(states, 0)
+    if not isinstance(agent, AdversarialAgent):
+        raise InputError(
+            f"run is {folder}, of agent {agent.name!r}: it has no discriminator"
+        )
+    learned = agent.reward(state.agent, state.normalizer)
+    discrete, size = wrappers.is_discrete(env), wrappers.action_size(env)
+
+    @full_precision
+    def reward(observation: Any, action: Any) -> jax.Array:
+        action = jnp.asarray(action)
+        if discrete:
+            action = jax.nn.one_hot(action, size)
+        sizes = {"observation": env.observation_size, "action": size}
+        given = {"observation": jnp.asarray(observation), "action": action}
+        for name, array in given.items():
+            if array.shape[-1:] != (sizes[name],):
+                raise ValueError(
+                    f"{name} has shape {array.shape}: it must be (..., {sizes[name]})"
+                )
+        return learned(*(array.astype(jnp.float32) for array in given.values()))
+
+    return reward

@@ -15,6 +15,7 @@ from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import evaluate
+from gasil_jax.context import Sizes
 from gasil_jax.host import resources, run_options
 from gasil_jax.host.members import make_members
 from gasil_jax.imitation import expert as expert_module
@@ -160,7 +161,7 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
         expected = [getattr(e, name)[:n] for e, n in zip(episodes, lengths)]
         np.testing.assert_array_equal(got, np.concatenate(expected))
     with pytest.raises(ValueError, match=r"of size 2: .* of size 4 and 3"):
-        expert_module.check("minari:test/expert-v0", 4, 3)
+        expert_module.check("minari:test/expert-v0", Sizes(1, 4, 3))
     # Another data set under the same name is read, not the one before.
     minari.delete_dataset("test/expert-v0")
     minari.create_dataset_from_buffers(

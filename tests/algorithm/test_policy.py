@@ -11,7 +11,7 @@ import pytest
 import gasil_jax
 from gasil_jax import normalization, npz, numpy_policy, policy
 from gasil_jax.host import policy_file
-from gasil_jax.networks import Policy
+from gasil_jax.networks import GaussianPolicy
 
 # With the other tests that use it, so that it is trained once.
 pytestmark = pytest.mark.xdist_group("trained_point_mass")
@@ -36,7 +36,7 @@ def test_it_is_the_networks_gaussian(saved, seed):
     observation = observation.at[-1].multiply(1e3)
     normalized = normalization.normalize(state.normalizer, observation)
     assert jnp.abs(normalized).max() == numpy_policy.CLIP
-    network = Policy(algorithm.config.hidden_sizes, env.action_size)
+    network = GaussianPolicy(algorithm.config.hidden_sizes, env.action_size)
     mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 
     act = gasil_jax.load_policy(folder, seed)
@@ -141,3 +141,60 @@ def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_p
     policy_file.save(path, states, env, [5, 6, 7], np.zeros(3))
     assert list(tmp_path.iterdir()) == [path]
     assert set(numpy_policy.read(path, 5)) >= {"mean", "log_std"}
+
+
+LAYERS = {
+    "tanh": np.tanh,
+    "relu": lambda x: np.maximum(x, 0.0),
+    "swish": lambda x: x / (1.0 + np.exp(-x)),
+}
+
+
+@pytest.mark.parametrize("layer_norm", [False, True])
+@pytest.mark.parametrize("activation", LAYERS)
+def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.algorithm(
+        "ppo", activation=activation, layer_norm=layer_norm, hidden_sizes=(8, 5)
+    )
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
+    states = init(jnp.arange(2, dtype=jnp.uint32))
+    rng = np.random.default_rng(0)
+    draw = lambda x: x + jnp.asarray(rng.normal(size=x.shape), x.dtype)
+    params = jax.tree.map(draw, states.actor_critic.policy.params)
+    learner = states.actor_critic.policy.replace(params=params)
+    states = states.replace(actor_critic=states.actor_critic.replace(policy=learner))
+    policy_file.save(tmp_path / "policy.npz", states, env, [0, 1], np.zeros(2))
+
+    weights = numpy_policy.read(tmp_path, 1)
+    weights |= {"low": np.full(2, -99.0), "high": np.full(2, 99.0)}
+    observation = rng.normal(size=(7, env.observation_size)).astype(np.float32)
+    x = (observation - weights["mean"]) / weights["scale"]
+    for i in range(3):
+        x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]
+        if i < 2 and layer_norm:
+            x = (x - x.mean(axis=1, keepdims=True)) / x.std(axis=1, keepdims=True)
+            x = x * weights[f"norm_scale_{i}"] + weights[f"norm_bias_{i}"]
+        x = LAYERS[activation](x) if i < 2 else x
+    np.testing.assert_allclose(numpy_policy.make(weights)(observation), x, rtol=1e-3)
+    np.testing.assert_allclose(policy.make(weights)(observation), x, rtol=1e-3)
+    # The network that trains is the same.
+    network = GaussianPolicy((8, 5), 2, activation, layer_norm)
+    own = jax.tree.map(lambda leaf: leaf[1], params)
+    normalizer = gasil_jax.member(states, 1).normalizer
+    mean, _ = network.apply(own, normalization.normalize(normalizer, observation))
+    np.testing.assert_allclose(mean, x, rtol=1e-3)
+
+
+def test_a_layer_without_its_norm_is_refused(tmp_path):
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.algorithm("ppo", layer_norm=True, hidden_sizes=(8, 5))
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
+    states = init(jnp.arange(1, dtype=jnp.uint32))
+    path = tmp_path / "policy.npz"
+    policy_file.save(path, states, env, [0], np.zeros(1))
+    arrays = dict(np.load(path))
+    del arrays["norm_bias_1"]
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match="norm_bias_1 is missing"):
+        gasil_jax.load_policy(path)

@@ -6,6 +6,7 @@ import pytest
 
 from gasil_jax import learner, ppo
 from gasil_jax.config import Config
+from gasil_jax.distributions import GAUSSIAN
 
 
 def test_gae_equals_a_plain_loop():
@@ -84,6 +85,7 @@ def test_loss_equals_numpy():
         {"policy": jnp.asarray(log_std, jnp.float32), "values": (None,)},
         batch,
         policy=lambda params, observation: (observation, params),
+        distribution=GAUSSIAN,
         value=lambda params, observation: jnp.asarray(value, jnp.float32),
         config=config,
     )

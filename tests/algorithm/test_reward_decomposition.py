@@ -12,6 +12,7 @@ from test_train import SMALL
 import gasil_jax
 from gasil_jax import good_trajectories, normalization
 from gasil_jax.context import Context, Sizes
+from gasil_jax.distributions import GAUSSIAN
 from gasil_jax.rewards import decomposition
 from gasil_jax.rollout import Rollout
 
@@ -84,6 +85,7 @@ def decompose_once():
             action_range=(-1.0, 1.0),
             config=CONFIG,
             policy=None,
+            distribution=GAUSSIAN,
             value=None,
         )
         model = MODEL.replace(decomposition_learning_rate=learning_rate)

@@ -11,6 +11,7 @@ from brax.envs import Env, State
 import gasil_jax
 from gasil_envs import wrappers
 from gasil_jax import rollout
+from gasil_jax.distributions import GAUSSIAN
 
 LIMIT = 10
 
@@ -51,6 +52,7 @@ def collect(env, num_envs, num_steps, limit=LIMIT, stagger=True):
         policy,
         environments,
         jax.random.key(2),
+        distribution=GAUSSIAN,
         num_steps=num_steps,
         max_episode_steps=limit,
         gamma=1.0,

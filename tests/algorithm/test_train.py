@@ -14,6 +14,7 @@ import gasil_jax
 from gasil_envs.gymnax_adapter import GymnaxEnv
 from gasil_jax import learner, rollout
 from gasil_jax import train as training
+from gasil_jax.distributions import GAUSSIAN
 
 CONFIG = gasil_jax.Config(
     total_steps=512,
@@ -71,6 +72,7 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
         lambda observation: (jnp.zeros((4, 2)), jnp.zeros(2)),
         rollout.init(env, key, 4),
         key,
+        distribution=GAUSSIAN,
         num_steps=limit,
         max_episode_steps=limit,
         gamma=1.0,

@@ -2,19 +2,18 @@
 
 import functools
 
-import chex
 import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from environment_contract import BATCH, check_reset_and_step
 
 import gasil_envs
 from gasil_envs import locomotion, point_mass
 from gasil_envs.physics.interface import PhysicsState
 
-BATCH = 200
 # One worker for each environment, so that it is compiled once; and one of them, because
 # that takes long, as for users.
 EACH_NAME = [
@@ -34,23 +33,6 @@ def env_and_functions(name, physics="mjx"):
     """The environment, and its jitted and vmapped reset and step."""
     env = gasil_envs.make(name, physics=physics)
     return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
-
-
-def check_reset_and_step(env, reset, step):
-    """Under jit and vmap: shapes, dtypes, starts that differ, finite numbers."""
-    state = reset(jax.random.split(jax.random.key(0), BATCH))
-    assert state.obs.shape == (BATCH, env.observation_size)
-    assert len(np.unique(state.obs, axis=0)) == BATCH  # each start is its own
-    action = jax.random.uniform(
-        jax.random.key(1), (BATCH, env.action_size), minval=-0.4, maxval=0.4
-    )
-    following = step(state, action)
-    chex.assert_trees_all_equal_shapes_and_dtypes(state, following)
-    assert following.obs.dtype == jnp.float32
-    assert following.reward.shape == following.done.shape == (BATCH,)
-    assert np.all(np.isfinite(following.obs)) and np.all(np.isfinite(following.reward))
-    assert not np.any(following.done)
-    assert not np.array_equal(state.obs, following.obs)
 
 
 def test_reset_and_step_of_the_point_mass():

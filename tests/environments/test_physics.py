@@ -23,6 +23,7 @@ from gasil_envs.physics import (
 from gasil_envs.physics.interface import PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics
 from gasil_jax import rollout
+from gasil_jax.distributions import GAUSSIAN
 
 # Edges of no tangent, of a pyramid in a plane and of one in space.
 SIMPLE, FLAT, PYRAMID = (
@@ -388,6 +389,7 @@ def test_a_failed_simulation_ends_its_episode_and_is_counted():
             policy,
             environments,
             key,
+            distribution=GAUSSIAN,
             num_steps=3,
             max_episode_steps=1000,
             gamma=jnp.float32(0.99),

@@ -1,0 +1,64 @@
+"""The environments of gymnax 1.0 by name, as gymnax:NAME.
+
+They reset themselves and count their own time in `step`, which is not used here: what
+is stepped is `step_env`.
+"""
+
+from typing import Any
+
+import gymnax
+import jax
+import numpy as np
+from gymnax.environments import spaces
+
+from gasil_envs.worlds import Unfit, World
+
+#: Environments that download data when they are built.
+_DOWNLOADING = ("MNISTBandit-bsuite",)
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of gymnax' environments, and of those registered with it."""
+    return tuple(gymnax.registered_envs)
+
+
+def build(name: str) -> World:
+    """Build an environment of gymnax.
+
+    Args:
+      name: one of `names`; if observations have several parts, NAME:PART.
+
+    Raises:
+      Unfit: if actions are neither a box nor discrete, or if it needs a download.
+    """
+    bare, _, part = name.partition(":")
+    if bare in _DOWNLOADING:
+        raise Unfit("downloads data when it is built, which is not supported")
+    env, params = gymnax.make(bare)
+
+    def begin(key: jax.Array) -> tuple[Any, Any]:
+        observation, state = env.reset_env(key, params)
+        return state, observation
+
+    def advance(key: jax.Array, state: Any, action: jax.Array) -> Any:
+        observation, state, reward, terminated, _ = env.step_env(
+            key, state, action, params
+        )
+        return state, observation, reward, terminated
+
+    space = env.action_space(params)
+    if isinstance(space, spaces.Discrete):
+        actions: Any = int(space.n)
+    elif isinstance(space, spaces.Box):
+        actions = tuple(
+            np.broadcast_to(x, space.shape) for x in (space.low, space.high)
+        )
+    else:
+        raise Unfit(f"has actions in {space}: they must be in a box or discrete")
+    return World(
+        begin,
+        advance,
+        actions=actions,
+        episode_length=int(params.max_steps_in_episode),
+        part=part or None,
+    )

@@ -1,0 +1,41 @@
+"""The environments of navix, MiniGrid's grids in JAX, by name, as navix:NAME."""
+
+from typing import Any
+
+import jax
+import navix
+
+from gasil_envs.worlds import World
+
+
+def names() -> tuple[str, ...]:
+    """Return the names of navix' environments."""
+    return tuple(navix.registry())
+
+
+def build(name: str) -> World:
+    """Build an environment of navix, with its default observation of the whole grid.
+
+    Args:
+      name: one of `names`.
+    """
+    bare, _, part = name.partition(":")
+    env = navix.make(bare)
+
+    def begin(key: jax.Array) -> tuple[Any, Any]:
+        timestep = env.reset(key)
+        return timestep, timestep.observation
+
+    def advance(key: jax.Array, timestep: Any, action: jax.Array) -> Any:
+        # `env.step` would start the next episode.
+        timestep = env._step(timestep, action)
+        terminated = timestep.is_termination()
+        return timestep, timestep.observation, timestep.reward, terminated
+
+    return World(
+        begin,
+        advance,
+        actions=len(env.action_set),
+        episode_length=int(env.max_steps),
+        part=part or None,
+    )

@@ -1,0 +1,306 @@
+"""Every agent with discrete actions, and what a run of one leaves behind."""
+
+import csv
+import functools
+import pathlib
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import minari
+import numpy as np
+import pytest
+from corridor import LENGTH, Corridor
+from gymnasium.utils.env_checker import check_env
+
+import gasil_jax
+from gasil_envs.gymnasium_adapter import GymnasiumEnv, GymnasiumVectorEnv
+from gasil_envs.gymnax_adapter import GymnaxEnv
+from gasil_jax import (
+    evaluate,
+    evaluation,
+    export_minari,
+    normalization,
+    numpy_policy,
+    plot,
+    policy,
+    render,
+    run,
+    sweep,
+)
+from gasil_jax.host import policy_file
+from gasil_jax.imitation import AGENTS
+from gasil_jax.networks import CategoricalPolicy, Discriminator
+from gasil_jax.sweeps import saved_states
+
+SETTINGS = {
+    "total_steps": 20 * 256,
+    "num_envs": 8,
+    "batch_steps": 256,
+    "minibatch_size": 64,
+    "num_epochs": 4,
+    "hidden_sizes": (16,),
+    "learning_rate": 1e-2,
+    "gamma": 0.9,
+    "entropy_coefficient": 0.01,
+}
+SMALL = {
+    "discriminator_hidden_sizes": (16,),
+    "discriminator_learning_rate": 1e-2,
+    "discriminator_updates": 20,
+    "buffer_steps": 200,
+}
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory):
+    """Pairs of a policy that always moves right, with numbers as actions."""
+    path = tmp_path_factory.mktemp("expert") / "expert.npz"
+    position = np.minimum(np.arange(20), LENGTH - 1)
+    np.savez(path, observation=np.eye(LENGTH)[position], action=2 + 0 * position)
+    return str(path)
+
+
+@functools.cache
+def train(agent, seeds=2, **changes):
+    """The environment, algorithm, states and metrics of a short training."""
+    env = gasil_jax.make_env("corridor:Corridor")
+    changes = {**SETTINGS, **changes}
+    algorithm = gasil_jax.algorithm(agent)
+    known = {x: y for x, y in SMALL.items() if x in algorithm.settings}
+    algorithm = algorithm.replace(**known, **changes)
+    keys = jax.vmap(jax.random.key)(np.arange(seeds))
+    learn = jax.jit(jax.vmap(gasil_jax.make_train(env, algorithm)))
+    return env, algorithm, *learn(keys)
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_agent_learns(agent, expert):
+    more = {"expert": expert} if agent == "gail" else {}
+    env, algorithm, states, metrics = train(agent, **more)
+    returns = np.nan_to_num(metrics["episode_return"], nan=-1.0)
+    print(agent, returns.round(2).tolist())
+    assert (returns[:, -3:].mean(axis=1) > returns[:, :2].mean(axis=1) + 3.0).all()
+    # Evaluations take the most probable action.
+    score = jax.vmap(
+        lambda state: evaluation.evaluate(
+            env, algorithm, state, key=jax.random.key(5), num_episodes=8
+        )
+    )(states)
+    assert (score["episode_return"] > 17.0).all()
+    assert (metrics["entropy"] <= np.log(3) + 1e-5).all()
+    assert (metrics["entropy"][:, -1] < metrics["entropy"][:, 0]).all()
+
+
+def test_a_saved_policy_acts_as_the_network(tmp_path):
+    env, _, states, _ = train("ppo")
+    path = tmp_path / "policy.npz"
+    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
+    state, observation = gasil_jax.member(states, 1), np.eye(LENGTH, dtype=np.float32)
+    network = CategoricalPolicy(SETTINGS["hidden_sizes"], 3)
+    logits = network.apply(
+        state.actor_critic.policy.params,
+        normalization.normalize(state.normalizer, observation),
+    )
+    act, in_numpy = gasil_jax.load_policy(path), numpy_policy.load(path)
+    for action in (act(observation), jax.vmap(act)(observation), in_numpy(observation)):
+        np.testing.assert_array_equal(action, logits.argmax(axis=1))
+        assert action.dtype == np.int32
+    weights = numpy_policy.read(path, 4)
+    p = numpy_policy.probabilities(weights, observation)
+    np.testing.assert_allclose(p, jax.nn.softmax(logits), rtol=1e-4)
+    # Both draw by these probabilities, of an observation for which none is near 1.
+    weights["kernel_1"] = 0.1 * weights["kernel_1"]
+    expected = numpy_policy.probabilities(weights, observation[0])
+    assert expected.max() < 0.9
+    many = np.tile(observation[0], (20_000, 1))
+    drawn = numpy_policy.make(weights)(many, np.random.default_rng(0))
+    np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
+    drawn = policy.make(weights)(many, jax.random.key(0))
+    np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
+
+
+def test_a_file_with_another_number_of_actions_is_refused(tmp_path):
+    env, _, states, _ = train("ppo")
+    path = tmp_path / "policy.npz"
+    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "num_actions": np.int32(4)})
+    with pytest.raises(ValueError, match=r"kernel_1 has the shape .*, 4\)"):
+        gasil_jax.load_policy(path)
+    del arrays["num_actions"]
+    np.savez(path, **arrays)
+    with pytest.raises(ValueError, match="log_std is missing"):
+        gasil_jax.load_policy(path)
+    continuous = numpy_policy.read("zoo:hopper")
+    with pytest.raises(ValueError, match="actions are not discrete"):
+        numpy_policy.probabilities(continuous, np.zeros(11))
+
+
+FLAGS = (
+    *("--env", "corridor:Corridor", "--agent", "ppo+gasil", "--num-envs", "8"),
+    *("--batch-steps", "256", "--minibatch-size", "64", "--hidden-sizes", "16"),
+    *("--num-epochs", "2", "--buffer-steps", "200", "--reward-delay", "5"),
+    *("--decompose-rewards", "--obs-noise", "0.1", "--learning-rate-decay", "0"),
+    *("--discriminator-hidden-sizes", "16", "--decomposition-hidden-sizes", "16"),
+)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run with delayed, decomposed rewards and noise, which has been continued."""
+    out = str(tmp_path_factory.mktemp("discrete") / "run")
+    more = ("--seeds", "2", "--evaluate-every", "512", "--initial-deviation", "0.5")
+    assert run.main([*FLAGS, *more, "--total-steps", "512", "--out", out]) == 0
+    assert run.main(["--resume", "--out", out, "--total-steps", "1024"]) == 0
+    return out
+
+
+def test_a_run_from_end_to_end(finished, tmp_path, capsys):
+    whole = str(tmp_path / "whole")
+    more = ("--seeds", "2", "--evaluate-every", "512", "--total-steps", "1024")
+    assert run.main([*FLAGS, *more, "--initial-deviation", "0.5", "--out", whole]) == 0
+    said = capsys.readouterr()
+    assert "initial_deviation is 0.5, which has no effect: the actions of" in said.err
+    assert "gasil_jax.render" in said.out
+    read = lambda out: list(csv.DictReader(open(f"{out}/metrics.csv")))
+    assert read(finished) == read(whole) and len(read(whole)) == 8
+    assert evaluate.main([finished, "--episodes", "4"]) == 0
+    assert evaluate.main([finished, "--episodes", "4", "--stochastic"]) == 0
+    film = tmp_path / "film.png"
+    assert render.main([finished, "--out", str(film), "--width", "80"]) == 0
+    assert film.stat().st_size
+    assert plot.main([finished, "--out", str(tmp_path / "curve.png")]) == 0
+
+
+def test_good_trajectories_are_exported_with_numbers_as_actions(
+    finished, tmp_path, monkeypatch
+):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    assert export_minari.main([finished, "--name", "corridor/good-v0"]) == 0
+    dataset = minari.load_dataset("corridor/good-v0")
+    assert dataset.spec.action_space == gymnasium.spaces.Discrete(3)
+    episode = next(iter(dataset.iterate_episodes()))
+    assert episode.actions.shape == (20,) and episode.actions.dtype.kind == "i"
+    # GAIL takes them back.
+    env = gasil_jax.make_env("corridor:Corridor")
+    algorithm = gasil_jax.algorithm("gail", expert="minari:corridor/good-v0")
+    gasil_jax.make_train(env, algorithm)
+
+
+@pytest.mark.parametrize(
+    ("env", "action", "message"),
+    [
+        ("corridor:Corridor", [0, 3], r"actions from 0 to 3: .* whole numbers .* to 2"),
+        ("corridor:Corridor", [0, 1.5], "actions from 0 to 1.5"),
+        ("point_mass", [0, 1], "numbers as actions: .* vectors of size 2"),
+    ],
+)
+def test_an_expert_with_other_actions_is_refused(env, action, message, tmp_path):
+    env = gasil_jax.make_env(env)
+    path = tmp_path / "expert.npz"
+    np.savez(path, observation=np.zeros((2, env.observation_size)), action=action)
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.make_train(env, gasil_jax.algorithm("gail", expert=str(path)))
+
+
+def test_the_discriminators_reward_is_that_of_its_formula(finished):
+    reward = gasil_jax.load_reward(finished, 1)
+    _, algorithm, seeds, states = saved_states.load(pathlib.Path(finished))
+    state = gasil_jax.member(states, seeds.index(1))
+    observation = np.tile(np.eye(LENGTH, dtype=np.float32), (3, 1))
+    action = np.repeat(np.arange(3), LENGTH)
+    network = Discriminator(algorithm.agent.discriminator_hidden_sizes)
+    logit = network.apply(
+        state.agent.discriminator.params,
+        normalization.normalize(state.normalizer, observation),
+        np.eye(3, dtype=np.float32)[action],
+    )
+    expected = -np.log(1 / (1 + np.exp(-np.asarray(logit, np.float64))))
+    np.testing.assert_allclose(reward(observation, action), expected, rtol=1e-4)
+    one = jax.jit(jax.vmap(reward))(observation, action)
+    np.testing.assert_allclose(one, expected, rtol=1e-4)
+    with pytest.raises(ValueError, match=r"observation has shape \(3,\): it must be"):
+        reward(np.zeros(3), 1)
+    with pytest.raises(ValueError, match="seed is 7: the run has 0 to 1"):
+        gasil_jax.load_reward(finished, 7)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"bonus": "centered"}, "bonus is 'centered': the reward of a step then"),
+        ({"discriminator_normalizes_actions": True}, "actions is True: the reward"),
+    ],
+)
+def test_a_reward_that_depends_on_its_batch_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.GASIL(**change).reward(None, None)
+
+
+def test_without_a_discriminator_there_is_no_reward(tmp_path):
+    env = gasil_jax.make_env("corridor:Corridor")
+    algorithm = gasil_jax.algorithm("ppo", **{**SETTINGS, "total_steps": 256})
+    gasil_jax.fit(env, algorithm, folder=tmp_path / "run")
+    with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
+        gasil_jax.load_reward(tmp_path / "run")
+
+
+def test_a_sweep_and_its_best_point(tmp_path, capsys):
+    out = str(tmp_path / "sweep")
+    grid = ("--grid", "entropy_coefficient=0.0,0.1", "--total-steps", "512")
+    assert sweep.main([*FLAGS, *grid, "--out", out]) == 0
+    assert evaluate.main([out, "--episodes", "2"]) == 0
+
+
+def test_other_libraries_see_a_discrete_space():
+    gym = GymnasiumEnv("corridor:Corridor")
+    assert gym.action_space == gymnasium.spaces.Discrete(3)
+    check_env(gym, skip_render_check=True)
+    gym.reset(seed=0)
+    assert gym.step(2)[1] == gym.step(np.int64(1))[1] > 0
+    for action in (3, 0.5, -1):
+        with pytest.raises(ValueError, match=r"it must be in Discrete\(3\)"):
+            gym.step(action)
+    batch = GymnasiumVectorEnv("corridor:Corridor", 4)
+    batch.reset(seed=0)
+    assert batch.action_space == gymnasium.spaces.MultiDiscrete([3] * 4)
+    assert (batch.step(np.array([2, 2, 2, 2]))[1] > 0).all()
+    gymnax = GymnaxEnv("corridor:Corridor")
+    assert gymnax.num_actions == 3
+    _, state = gymnax.reset(jax.random.key(0), gymnax.default_params)
+    _, _, reward, *_ = gymnax.step(jax.random.key(1), state, jnp.int32(2))
+    assert reward > 0
+
+
+class Both(Corridor):
+    action_size = 3
+
+
+class None_(Corridor):
+    num_actions = property(lambda self: self.missing)
+
+
+@pytest.mark.parametrize(
+    ("env", "message"),
+    [
+        (Both(), "has action_size and num_actions: it must have one"),
+        (None_(), "has no action_size, and for discrete actions no num_actions"),
+    ],
+)
+def test_actions_of_no_kind_or_of_both_are_refused(env, message):
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.make_train(env, gasil_jax.algorithm("ppo"))
+
+
+def test_a_discrete_environment_as_it_is_trains(tmp_path):
+    algorithm = gasil_jax.algorithm("ppo+bc", **{**SETTINGS, "total_steps": 512})
+    result = gasil_jax.fit(Corridor(), algorithm, folder=tmp_path, evaluate_every=256)
+    assert result.metrics["episodes"].sum() > 0
+    assert gasil_jax.load_policy(tmp_path)(jnp.zeros(LENGTH)).dtype == jnp.int32
+
+
+def test_the_rule_for_dimensions_is_refused(capsys):
+    command = ["--env", "corridor:Corridor", "--agent", "ppo", "--preset", "scaled"]
+    assert run.main(command) == 2
+    assert "preset is 'scaled', a rule for the dimension" in capsys.readouterr().err
