@@ -31,6 +31,7 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from gasil_envs import worlds
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
 from gasil_jax.errors import unknown
@@ -209,7 +210,7 @@ def preset(
         raise ValueError(unknown("agent", str(agent), tuple(AGENTS)))
     if reward_delay not in _DELAYS:
         raise ValueError(f"reward_delay is {reward_delay!r}: it must be {_DELAYS}")
-    ours, others = ("point_mass", *ACTION_SIZES), ("FAMILY:NAME", "MODULE:NAME")
+    ours, others = ("point_mass", *ACTION_SIZES), (*worlds.forms(), "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", str(env), ours, forms=others))
     if name == "scaled" and kind.name == "ppo" and action_size is not None:

@@ -9,8 +9,8 @@ import pytest
 from environment_contract import check_reset_and_step
 
 import gasil_envs
-from gasil_envs import worlds, wrappers
-from gasil_jax import run
+from gasil_envs import pictures, worlds, wrappers
+from gasil_jax import render, run
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
@@ -200,6 +200,17 @@ def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.delitem(sys.modules, "gasil_envs.of_gymnax", raising=False)
     with pytest.raises(ValueError, match=r'needs the package .*"gasil_jax\[gymnax\]"'):
         gasil_envs.make("gymnax:CartPole-v1")
+
+
+def test_what_draws_itself_is_drawn():
+    env = gasil_envs.make("gymnax:Catch-bsuite")
+    assert pictures.can_draw(env)
+    assert not pictures.can_draw(gasil_envs.make("gymnax:CartPole-v1"))
+    step = lambda state: env.step(state, jnp.int32(1))
+    states = [env.reset(jax.random.key(0))]
+    states.append(step(states[0]))
+    frames, _ = render.frames_of(env, [x.pipeline_state for x in states], (160, 120))
+    assert frames[0].shape == (120, 160, 3) and (frames[0] != frames[1]).any()
 
 
 def test_control_tasks_are_built_and_robots_that_are_downloaded_refused():
