@@ -1,5 +1,6 @@
 """Environments of other packages: the contract, their limits, what is refused."""
 
+import subprocess
 import sys
 
 import jax
@@ -193,6 +194,19 @@ def test_a_part_is_chosen_and_every_dtype_becomes_float32(space, monkeypatch):
 def test_an_unknown_name_or_family_is_refused_with_the_nearest(name, message):
     with pytest.raises(ValueError, match=message):
         gasil_envs.make(name)
+
+
+def test_a_family_is_not_imported_before_the_devices_are_chosen():
+    code = """
+from jax._src import xla_bridge
+from gasil_envs import registry
+registry.check("gymnax:CartPole-v1", registry.Settings())
+print(xla_bridge.backends_are_initialized())
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True
+    )
+    assert result.stdout == "False\n", result.stderr
 
 
 def test_a_missing_package_is_named(monkeypatch):
