@@ -17,7 +17,6 @@ import numpy as np
 from flax import struct
 
 from gasil_jax.errors import refusal, unknown
-from gasil_jax.networks import ACTIVATIONS
 
 #: A factor that multiplies a number, as a function of environment steps. Either an
 #: Optax schedule (any pure function of the steps) or (steps, factor) points, linear
@@ -184,7 +183,7 @@ class Config(struct.PyTreeNode):
     num_epochs: int = count(10)
     minibatch_size: int = count(64)
     hidden_sizes: tuple[int, ...] = widths(64, 64)
-    activation: str = choice("tanh", ACTIVATIONS)
+    activation: str = choice("tanh", ("tanh", "relu", "swish"))
     layer_norm: bool = switch(False)
     stagger_episodes: bool = switch(True)
     learning_rate: float = number(3e-4, 0.0, excludes_low=True)

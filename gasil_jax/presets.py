@@ -31,6 +31,7 @@ import types
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from gasil_envs import worlds
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
 from gasil_jax.errors import refusal, unknown
@@ -211,7 +212,7 @@ def preset(
         raise refusal("reward_delay", reward_delay, _COUNT)
     if action_size is not None and action_size not in _COUNT:
         raise refusal("action_size", action_size, _COUNT)
-    ours, others = ("point_mass", *ACTION_SIZES), ("FAMILY:NAME", "MODULE:NAME")
+    ours, others = ("point_mass", *ACTION_SIZES), (*worlds.forms(), "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", env, ours, forms=others))
     if name == "scaled" and kind.name == "ppo" and action_size is not None:

@@ -287,6 +287,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         with (
             announced("render", f"drawing {options.out}"),
+            command_line.input_checked(),
             output_file.atomic(options.out) as partial,
         ):
             num_frames = save(env, states, size, partial)

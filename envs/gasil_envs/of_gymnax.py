@@ -4,6 +4,7 @@ They reset themselves and count their own time in `step`, which is not used here
 is stepped is `step_env`.
 """
 
+import functools
 from typing import Any
 
 import gymnax
@@ -55,10 +56,26 @@ def build(name: str) -> World:
         )
     else:
         raise Unfit(f"has actions in {space}: they must be in a box or discrete")
-    return World(
+    world = World(
         begin,
         advance,
         actions=actions,
         episode_length=int(params.max_steps_in_episode),
         part=part or None,
     )
+    if hasattr(env, "render"):
+        world.draw = functools.partial(_draw, env, params)
+    return world
+
+
+def _draw(env: Any, params: Any, state: Any, size: tuple[int, int]) -> np.ndarray:
+    """Return the picture that an environment draws of a state, with Matplotlib."""
+    import matplotlib.pyplot as plt
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    figure, _ = env.render(state[0], params)
+    figure.set(dpi=100, size_inches=(size[0] / 100, size[1] / 100))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    plt.close(figure)
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()

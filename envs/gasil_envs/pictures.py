@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 from brax.envs import Env
 
+from gasil_envs import own_code
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.point_mass import PointMass
 
@@ -133,7 +134,8 @@ class OwnPainter:
       size: width and height of a picture in pixels.
 
     Raises:
-      ValueError: from `draw`, if a picture is no uint8 (height, width, 3).
+      ValueError: from `draw`, if the environment's own fails, or if a picture is no
+        uint8 (height, width, 3).
     """
 
     def __init__(self, env: Any, size: tuple[int, int]):
@@ -142,12 +144,14 @@ class OwnPainter:
 
     def draw(self, episode: Sequence[Any]) -> np.ndarray:
         """Return a picture of the last state, uint8 (height, width, 3)."""
-        picture = np.asarray(self._env.draw(episode[-1], self._size))
+        name = type(self._env).__name__
+        with own_code.refused(f"draw of {name} fails"):
+            picture = np.asarray(self._env.draw(episode[-1], self._size))
         shape = (self._size[1], self._size[0], 3)
         if picture.shape != shape or picture.dtype != np.uint8:
+            given = f"{picture.dtype}{list(picture.shape)}"
             raise ValueError(
-                f"draw of {type(self._env).__name__} returns {picture.dtype}"
-                f"{list(picture.shape)}: it must be uint8{list(shape)}"
+                f"draw of {name} returns {given}: it must be uint8{list(shape)}"
             )
         return picture
 

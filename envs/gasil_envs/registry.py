@@ -102,10 +102,11 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
       ValueError: if the name is unknown.
     """
     if isinstance(name, str) and ":" in name:
-        family, bare, *_ = name.split(":")
+        family = name.partition(":")[0]
         if family in worlds.FAMILIES:
-            _refuse_unknown("env", f"{family}:{bare}", worlds.names(family))
-            return lambda settings: worlds.build(name)
+            # Other packages may start JAX when they are imported, before its devices
+            # are chosen, so their names are not looked up here.
+            return lambda settings: _build_of_others(name)
         _refuse_unknown_family(name, family)
         own_environment.find(name)
         return lambda settings: own_environment.build(name)
@@ -130,6 +131,12 @@ def _is_module(name: str) -> bool:
     return "." in name or importlib.util.find_spec(name) is not None
 
 
+def _build_of_others(name: str) -> Env:
+    family, bare, *_ = name.split(":")
+    _refuse_unknown("env", f"{family}:{bare}", worlds.names(family))
+    return worlds.build(name)
+
+
 def _build_ours(name: str, settings: Settings) -> Env:
     if name == "point_mass":
         return point_mass.PointMass()
@@ -152,7 +159,10 @@ def _is_number(value: Any, kind: type) -> bool:
 
 
 def check(name: str, settings: Settings) -> None:
-    """Raise `ValueError` if `make` would refuse the arguments; builds nothing."""
+    """Raise `ValueError` if `make` would refuse the arguments; builds nothing.
+
+    Of other packages' environments only the family is checked.
+    """
     if jax.config.read("jax_enable_x64"):
         raise ValueError(
             "jax_enable_x64 is True: environments are in float32, unset it"

@@ -112,6 +112,9 @@ class World:
       Unfit: if the observation is no array.
     """
 
+    #: Draws a state, where the other package can (see `pictures`).
+    draw: Callable[[Any, tuple[int, int]], np.ndarray]
+
     def __init__(
         self,
         begin: Callable[[jax.Array], tuple[Any, Any]],

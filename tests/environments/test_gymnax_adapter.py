@@ -89,7 +89,7 @@ def test_gymnax_own_wrappers_take_it():
     space = env.action_space(params)
     assert space.shape == (2,) and space.contains(space.sample(jax.random.key(0)))
     flat = wrappers.FlattenObservationWrapper(env)
-    assert flat.observation_space(params).shape == (9,)
+    assert flat.observation_space(params).shape == (11,)
     logged = wrappers.LogWrapper(flat)
     keys = jax.random.split(jax.random.key(0), 120)
     roll = jax.vmap(lambda key: rollout(logged, key, keys))

@@ -1,5 +1,6 @@
 """Environments of other packages: the contract, their limits, what is refused."""
 
+import subprocess
 import sys
 
 import jax
@@ -9,8 +10,8 @@ import pytest
 from environment_contract import check_reset_and_step
 
 import gasil_envs
-from gasil_envs import worlds, wrappers
-from gasil_jax import run
+from gasil_envs import pictures, worlds, wrappers
+from gasil_jax import render, run
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
@@ -195,11 +196,35 @@ def test_an_unknown_name_or_family_is_refused_with_the_nearest(name, message):
         gasil_envs.make(name)
 
 
+def test_a_family_is_not_imported_before_the_devices_are_chosen():
+    code = """
+from jax._src import xla_bridge
+from gasil_envs import registry
+registry.check("gymnax:CartPole-v1", registry.Settings())
+print(xla_bridge.backends_are_initialized())
+"""
+    result = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True
+    )
+    assert result.stdout == "False\n", result.stderr
+
+
 def test_a_missing_package_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "gymnax", None)
     monkeypatch.delitem(sys.modules, "gasil_envs.of_gymnax", raising=False)
     with pytest.raises(ValueError, match=r'needs the package .*"gasil_jax\[gymnax\]"'):
         gasil_envs.make("gymnax:CartPole-v1")
+
+
+def test_what_draws_itself_is_drawn():
+    env = gasil_envs.make("gymnax:Catch-bsuite")
+    assert pictures.can_draw(env)
+    assert not pictures.can_draw(gasil_envs.make("gymnax:CartPole-v1"))
+    step = lambda state: env.step(state, jnp.int32(1))
+    states = [env.reset(jax.random.key(0))]
+    states.append(step(states[0]))
+    frames, _ = render.frames_of(env, [x.pipeline_state for x in states], (160, 120))
+    assert frames[0].shape == (120, 160, 3) and (frames[0] != frames[1]).any()
 
 
 def test_control_tasks_are_built_and_robots_that_are_downloaded_refused():
