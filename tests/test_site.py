@@ -145,6 +145,32 @@ def test_every_page_and_picture_can_be_reached(site, pages):
     assert len(pages[home].images) >= 2
 
 
+def test_a_picture_leads_to_its_file(site):
+    page = (site / "results" / "matrix" / "index.html").read_text()
+    (address,) = re.findall(r'<a href="([^"]*)"><img [^>]*src="\1"[^>]*></a>', page)
+    assert address.endswith("matrix.png")
+
+
+def test_the_page_of_a_notebook_shows_what_it_printed_and_drew(tmp_path, monkeypatch):
+    hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
+    picture = {"data": {"image/png": "iVBORw0KGgo="}}
+    code = {"cell_type": "code", "source": ["1 + 1"]}
+    code["outputs"] = [{"text": ["2\n", "3\n"]}, picture]
+    cells = [{"cell_type": "markdown", "source": ["# Title"]}, code]
+    (tmp_path / "examples").mkdir()
+    (tmp_path / "examples" / "x.ipynb").write_text(json.dumps({"cells": cells}))
+    made = {}
+    monkeypatch.setattr(
+        hooks["File"],
+        "generated",
+        lambda config, uri, content: made.setdefault(uri, content),
+    )
+    hooks["on_files"]([], types.SimpleNamespace(docs_dir=str(tmp_path)))
+    shown = "```text\n2\n3\n```\n\n![output of the code above](x-3.png)"
+    assert made["examples/x.md"] == f"# Title\n\n```python\n1 + 1\n```\n\n{shown}"
+    assert made["examples/x-3.png"].startswith(b"\x89PNG")
+
+
 def test_a_new_page_of_results_follows_those_with_a_title(tmp_path):
     hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
     (tmp_path / "results").mkdir()
