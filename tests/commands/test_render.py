@@ -142,7 +142,10 @@ def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
     (tmp_path / "there.gif").touch()
     for arguments, message in (
         (["--out", "film.avi"], "must end in .mp4, .gif, .png, .html"),
-        (["--out", "film.html"], "of the point mass it must end in .mp4, .gif, .png"),
+        (
+            ["--out", "film.html"],
+            "other environments it must end in .mp4, .gif, .png",
+        ),
         (["--out", str(tmp_path / "there.gif")], "which exists"),
         (["--seed", "9"], "seed is 9: the run has 0 to 1"),
         (["--steps", "0"], "steps is 0"),
