@@ -163,10 +163,8 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     Raises:
       ValueError: if they are none, not different or out of range.
     """
-    if (
-        isinstance(seeds, np.generic | np.ndarray | jax.Array)
-        and seeds.dtype.kind in "iu"
-    ):
+    # A random key's dtype has no kind, and NumPy's durations are integers.
+    if getattr(getattr(seeds, "dtype", None), "kind", "") in ("i", "u"):
         seeds = np.asarray(seeds).tolist()
     allowed = Range(0, 2**32 - 1, whole=True)
     if isinstance(seeds, Sequence):
