@@ -231,11 +231,13 @@ def training_row(
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began
     count = np.int32(options.iterations)
-    newest = [jax.block_until_ready(advance(states, count))[0]]
+    newest = [jax.block_until_ready(advance(states, count, batch.data))[0]]
 
     def run() -> float:
         began = time.perf_counter()
-        newest.append(jax.block_until_ready(advance(newest.pop(), count))[0])
+        newest.append(
+            jax.block_until_ready(advance(newest.pop(), count, batch.data))[0]
+        )
         steps = options.iterations * batch_steps * seeds
         return steps / (time.perf_counter() - began)
 

@@ -159,7 +159,7 @@ def run(options: Options) -> None:
     newest, seconds = [states], []
 
     def iterate() -> Any:
-        states, metrics = advance(newest.pop(), np.int32(1))
+        states, metrics = advance(newest.pop(), np.int32(1), members.data)
         newest.append(jax.block_until_ready(states))
         return metrics
 

@@ -29,7 +29,6 @@ from gasil_jax import (
     sweep,
 )
 from gasil_jax.host import policy_file
-from gasil_jax.imitation import AGENTS
 from gasil_jax.networks import CategoricalPolicy, Discriminator
 from gasil_jax.sweeps import saved_states
 
@@ -74,8 +73,9 @@ def train(agent, seeds=2, **changes):
     return env, algorithm, *learn(keys)
 
 
-@pytest.mark.parametrize("agent", AGENTS)
-def test_every_agent_learns(agent, expert):
+# The others use nothing of an action that one of these does not.
+@pytest.mark.parametrize("agent", ["ppo", "ppo+bc", "ppo+sil", "ppo+gasil", "gail"])
+def test_agents_learn(agent, expert):
     more = {"expert": expert} if agent == "gail" else {}
     env, algorithm, states, metrics = train(agent, **more)
     returns = np.nan_to_num(metrics["episode_return"], nan=-1.0)

@@ -13,6 +13,7 @@ from small_training import DISCRIMINATOR_FLAGS, FLAGS
 import gasil_jax
 from gasil_jax import algorithms, evaluate, merge, render, run, sweep
 from gasil_jax.host import run_folder
+from gasil_jax.sweeps import programs
 
 MODULE = '''
 import sys
@@ -230,7 +231,7 @@ def test_every_command_takes_it(tmp_path, capsys):
     options = sweep.run_options.parse(
         sweep.Options, [*SMALL, "--points-file", "points.json"], "gasil_jax.sweep"
     )
-    _, (program,) = sweep.plan(options)
+    (program,) = programs.group(sweep.make_plan(options).runs.values())
     assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]
 
 

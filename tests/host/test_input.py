@@ -397,7 +397,7 @@ WHOLE = saved(
                 np.zeros((3, 1), bool),
                 np.full((3, 1), 1e300),
                 np.full((3, 1), np.nan),
-                np.zeros(3),
+                np.zeros((3, 1, 1)),
                 np.zeros((3, 0)),
                 np.zeros((2, 1)),
             )
