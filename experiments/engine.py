@@ -133,17 +133,13 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[ProgramFolder]:
     rank = {run: rank for rank, run in enumerate(missing)}
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
-    # Runs of a search are not evaluated, so they have programs of their own.
-    every = [
-        each
-        for of_search in (True, False)
-        for each in programs.unfinished(
-            [run for run in ordered if _is_of_search(run) == of_search],
-            _scratch(setup),
-            labels=_labels,
-            most=setup.members,
-        )
-    ]
+    every = programs.unfinished(
+        ordered,
+        _scratch(setup),
+        labels=_labels,
+        most=setup.members,
+        apart=_is_of_search,  # Those are not evaluated.
+    )
     order = lambda x: (not x.path.exists(), min(rank.get(r, 0) for r in x.program.runs))
     return sorted(every, key=order)
 

@@ -29,7 +29,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.sweeps import assembly, launch, shards, tables
+from gasil_jax.sweeps import assembly, launch, programs, shards, tables
 from gasil_jax.sweeps.plan import Plan
 from gasil_jax.sweeps.points import Point, check_saved, make_points
 from gasil_jax.sweeps.runs import Run
@@ -150,13 +150,15 @@ def _prepare(options: Options, plan: Plan, requested: Sequence[Run]) -> Any:
 
     The environment is None if no run is missing.
     """
-    unfinished = plan.unfinished(options.out or pathlib.Path(), requested)
+    if options.out is None:
+        return assembly.prepare(options, programs.group(requested))
+    unfinished = plan.unfinished(options.out, requested)
     for each in unfinished:
         run_folder.refuse_without_checkpoints(each.path)
     if not unfinished:
         return None
-    programs, folders = [x.program for x in unfinished], [x.path for x in unfinished]
-    return assembly.prepare(options, programs, folders)
+    folders = [x.path for x in unfinished]
+    return assembly.prepare(options, [x.program for x in unfinished], folders)
 
 
 def _train(
@@ -230,17 +232,19 @@ def _train_shard(
     command = f"{_PROGRAM} --shard {shard}"
     with run_options.told_how_to_continue(folder, command):
         _train(options, plan, part(plan), env=env, folder=folder)
-    trained = [x.training for x in plan.trained(folder, part(plan))]
-    speed = tables.speed(trained)
+    trained, own = plan.trained(folder), set(part(plan))
+    speed = tables.speed(
+        [x.training for x in trained if not own.isdisjoint(x.program.runs)]
+    )
     print(
         f"shard {shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
         f"on {speed['device']}, in {folder}"
     )
-    if missing := plan.missing(plan.trained(folder)):
+    if missing := plan.missing(trained):
         print(f"{len(missing)} of {len(plan.runs)} runs of the sweep are missing")
         return
     with run_folder.wait_for_lock(folder):
-        summary = tables.write(folder, tables.read(plan, plan.trained(folder)))
+        summary = tables.write(folder, tables.read(plan, trained))
     print(*tables.report(plan.points, summary), sep="\n")
 
 

@@ -66,15 +66,13 @@ class Plan:
         """Return the programs that have begun in the sweep's folder."""
         return programs.read(programs_of(folder), self.total_steps)
 
-    def trained(
-        self, folder: pathlib.Path, requested: Collection[Run] | None = None
-    ) -> list[ProgramFolder]:
-        """Return the programs that are trained to their end, of all or some runs."""
-        asked = set(self.runs.values() if requested is None else requested)
+    def trained(self, folder: pathlib.Path) -> list[ProgramFolder]:
+        """Return the programs that are trained to their end, of runs of this plan."""
+        own = set(self.runs.values())
         return [
             each
             for each in self.stored(folder)
-            if each.training and not asked.isdisjoint(each.program.runs)
+            if each.training and not own.isdisjoint(each.program.runs)
         ]
 
     def missing(self, trained: Iterable[ProgramFolder]) -> list[tuple[int, int]]:

@@ -64,11 +64,21 @@ class Program:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def group(runs: Iterable[Run], most: int | None = None) -> list[Program]:
-    """Group runs into as few programs as possible, of at most `most` runs each."""
-    groups: dict[str, dict[Run, None]] = {}
+def group(
+    runs: Iterable[Run],
+    most: int | None = None,
+    apart: Callable[[Run], Any] = lambda run: None,
+) -> list[Program]:
+    """Group runs into as few programs as possible.
+
+    Args:
+      runs: the runs.
+      most: the largest number of runs in a program; default no limit.
+      apart: runs for which it returns different values do not share a program.
+    """
+    groups: dict[tuple[str, Any], dict[Run, None]] = {}
     for run in runs:
-        groups.setdefault(run.shapes, {})[run] = None
+        groups.setdefault((run.shapes, apart(run)), {})[run] = None
     parts = []
     for members in map(tuple, groups.values()):
         count = math.ceil(len(members) / (most or len(members)))
@@ -242,6 +252,7 @@ def unfinished(
     labels: Callable[[Program], Mapping[str, Sequence[int]]],
     total_steps: int | None = None,
     most: int | None = None,
+    apart: Callable[[Run], Any] = lambda run: None,
 ) -> list[ProgramFolder]:
     """Return the programs that are still to be trained, those that have begun first.
 
@@ -252,7 +263,8 @@ def unfinished(
       parent: the folder with the folders of programs.
       labels: returns the labels of a new program, see `ProgramFolder`.
       total_steps: see `read`.
-      most: the largest number of runs in a new program; default no limit.
+      most: see `group`.
+      apart: see `group`.
 
     Raises:
       InputError: if a program.json is damaged.
@@ -260,7 +272,8 @@ def unfinished(
     stored = read(parent, total_steps)
     in_training = [each for each in stored if not each.training]
     begun_or_trained = {run for each in stored for run in each.program.runs}
-    new = group((run for run in requested if run not in begun_or_trained), most)
+    others = (run for run in requested if run not in begun_or_trained)
+    new = group(others, most, apart)
     asked = set(requested)
     return [
         *(each for each in in_training if not asked.isdisjoint(each.program.runs)),

@@ -350,6 +350,22 @@ def test_a_sweep_grows_by_points_and_by_seeds(tmp_path, capsys, jobs_to_train):
     assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
 
 
+def test_a_sweep_without_a_name_does_not_look_into_the_folder_it_starts_in(
+    tmp_path, monkeypatch, capsys
+):
+    train(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    planned = []
+
+    def prepare(options, programs, folders=()):
+        planned.extend(run for program in programs for run in program.runs)
+        raise InputError("enough")
+
+    monkeypatch.setattr(assembly, "prepare", prepare)
+    assert sweep.main([*SMALL, "--grid", *GRID]) == 2
+    assert "enough" in capsys.readouterr().err and len(planned) == 12
+
+
 def test_sweeps_of_other_points_and_seeds_become_one(tmp_path):
     folders = [tmp_path / name for name in ("a", "b", "c")]
     train(folders[0], grid=("alpha=0.1,1",))
