@@ -17,6 +17,12 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 # By default programs that compile in less than a second are compiled by each process.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
+# Without fusion emitters XLA's CPU backend generates code in a third of the time. Later
+# releases cannot do without them, and end the process at a flag that they do not know.
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    _flags = os.environ.get("XLA_FLAGS", "")
+    os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
+
 from gasil_envs.physics import native
 from gasil_jax.host import run_options
 
@@ -34,41 +40,6 @@ _LONG = {
     "test_readme",
     "test_sweep",
 }
-
-
-# Without fusion emitters XLA's CPU backend generates code in a third of the time. Later
-# releases cannot do without them, and end the process at a flag that they do not know.
-_WITHOUT_EMITTERS = "xla_cpu_use_fusion_emitters"
-_KNOWS_EMITTERS = importlib.metadata.version("jaxlib").startswith("0.10.")
-_XLA_FLAGS = os.environ.get("XLA_FLAGS", "")
-
-
-def _generate_code_quickly():
-    """Do without fusion emitters in this process, unless programs are optimized.
-
-    JAX has no setting for it; without the function that is wrapped here tests only take
-    longer.
-    """
-    import jax
-    from jax._src import compiler
-
-    # From now on XLA_FLAGS is only for the processes that a test starts.
-    jax.devices()
-
-    original = getattr(compiler, "get_compile_options", None)
-    if original is None or not _KNOWS_EMITTERS:
-        return
-
-    def options(*arguments, env_options_overrides=None, **more):
-        overrides = dict(env_options_overrides or {})
-        if os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS") == "1":
-            overrides.setdefault(_WITHOUT_EMITTERS, "False")
-        return original(*arguments, env_options_overrides=overrides, **more)
-
-    compiler.get_compile_options = options
-
-
-_generate_code_quickly()
 
 
 def pytest_configure(config):
@@ -89,9 +60,6 @@ def pytest_runtest_setup(item):
     plainly = not _is_optimized(item)
     before = os.environ.get("JAX_DISABLE_MOST_OPTIMIZATIONS", "0")
     os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = str(int(plainly))
-    quick = plainly and _KNOWS_EMITTERS
-    flag = f" --{_WITHOUT_EMITTERS}=false" if quick else ""
-    os.environ["XLA_FLAGS"] = f"{_XLA_FLAGS}{flag}".strip()
     if before != str(int(plainly)):
         jax.config.update("jax_disable_most_optimizations", plainly)
         # JAX keeps compiled programs whatever the setting, and they round otherwise.
