@@ -73,7 +73,10 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
     for name in names:
         if name not in allowed:
             raise InputError(unknown("only", name, allowed))
-    select = lambda values: {k: x for k, x in values.items() if not names or k in names}
+
+    def select(values: Mapping[str, Any]) -> dict[str, Any]:
+        return {k: x for k, x in values.items() if not names or k in names}
+
     panels, searches = select(figure.panels), select(figure.searches)
     return dataclasses.replace(figure, panels=panels, searches=searches)
 

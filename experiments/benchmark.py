@@ -109,7 +109,9 @@ def _random_step(env: Any, states: Any, key: jax.Array) -> Any:
 
 
 def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
-    step = lambda states, key: (_random_step(env, states, key), None)
+    def step(states: Any, key: Any) -> Any:
+        return (_random_step(env, states, key), None)
+
     return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
 
 
@@ -129,11 +131,14 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     env = _make(env_name, variant)
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
     mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
-    shard = lambda function: jax.jit(
-        jax.shard_map(
-            function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+
+    def shard(function: Any) -> Any:
+        return jax.jit(
+            jax.shard_map(
+                function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
+            )
         )
-    )
+
     states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
     rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
     began = time.perf_counter()
@@ -142,7 +147,9 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     # Timed after some steps, when most bodies lie on the ground, as they do later.
     states, _ = jax.block_until_ready(advance((states, _keys(0, count))))
 
-    rollouts = lambda: advance((states, _keys(1, count)))
+    def rollouts() -> Any:
+        return advance((states, _keys(1, count)))
+
     run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, variant, num_envs, run, compile_seconds)
 
@@ -177,7 +184,9 @@ def warp_row(env_name: str, num_envs: int) -> Row:
     # Warp compiles its kernels at the first call.
     compile_seconds = time.perf_counter() - began
 
-    rollouts = lambda: advance(states, _keys(1, _NUM_STEPS))
+    def rollouts() -> Any:
+        return advance(states, _keys(1, _NUM_STEPS))
+
     run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, "warp", num_envs, run, compile_seconds)
 

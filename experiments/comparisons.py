@@ -151,7 +151,9 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str)
     def resampled(values: np.ndarray) -> np.ndarray:
         return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
 
-    of = lambda panel, x: np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
+    def of(panel: str, x: str) -> np.ndarray:
+        return np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
+
     pairs = [(of(panel, ours), of(panel, other)) for panel in panels]
     middle = np.mean([probability(*pair) for pair in pairs])
     drawn = [probability(*map(resampled, pair)) for pair in pairs]

@@ -140,7 +140,10 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[ProgramFolder]:
         most=setup.members,
         apart=_is_of_search,  # Those are not evaluated.
     )
-    order = lambda x: (not x.path.exists(), min(rank.get(r, 0) for r in x.program.runs))
+
+    def order(x: Any) -> Any:
+        return (not x.path.exists(), min(rank.get(r, 0) for r in x.program.runs))
+
     return sorted(every, key=order)
 
 
@@ -220,9 +223,12 @@ def _add_session(stored: ProgramFolder, setup: Setup) -> None:
 def _provenance(stored: ProgramFolder) -> dict[str, Any]:
     """Return how a program was trained, over all sessions of interrupted training."""
     sessions = json.loads((stored.path / _SESSIONS).read_text())["sessions"]
-    every = lambda name: ", then ".join(
-        dict.fromkeys(str(session[name]) for session in sessions if session[name])
-    )
+
+    def every(name: str) -> str:
+        return ", then ".join(
+            dict.fromkeys(str(session[name]) for session in sessions if session[name])
+        )
+
     # False if any session had a changed checkout; otherwise None if any is unknown.
     clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
     commit = every("commit") or None

@@ -99,7 +99,10 @@ def rank(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, str]]:
         of_point = scores.setdefault((int(row["layout"]), row["agent"]), {})
         returns = (float(row["early"]), float(row["final"]))
         of_point.setdefault(point, []).append(returns)
-    final_mean = lambda item: np.mean([final for _, final in item[1]])
+
+    def final_mean(item: Any) -> Any:
+        return np.mean([final for _, final in item[1]])
+
     ranked = []
     for number in sorted({layout for layout, _ in scores}):
         best = [max(scores[number, agent].items(), key=final_mean) for agent in PAIR]

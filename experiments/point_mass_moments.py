@@ -60,7 +60,9 @@ def states_at(
 
     @functools.partial(jax.jit, donate_argnums=0)
     def advance(state: Any, count: jax.Array) -> Any:
-        step = lambda _, state: gasil_jax.iterate(env, algorithm, state)[0]
+        def step(_: Any, state: Any) -> Any:
+            return gasil_jax.iterate(env, algorithm, state)[0]
+
         return jax.lax.fori_loop(0, count, step, state)
 
     state, states = gasil_jax.init(env, algorithm, jax.random.key(0)), []

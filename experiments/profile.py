@@ -111,8 +111,11 @@ def seconds_of_parts(planes: Sequence[Any], program: str) -> dict[str, float]:
       planes: the planes of a `jax.profiler.ProfileData`.
       program: the text of the compiled program.
     """
+
     # A GPU kernel has the name of its operation, with _ instead of punctuation.
-    plain = lambda name: re.sub(r"\W", "_", name)
+    def plain(name: str) -> str:
+        return re.sub(r"\W", "_", name)
+
     on_gpu = [plane for plane in planes if plane.name.startswith("/device:GPU")]
     times = collections.defaultdict(list)
     for plane in on_gpu or planes:

@@ -86,7 +86,10 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def point_in_words(point: Mapping[str, Any]) -> str:
     """Return changed settings as "name value, name value"."""
-    words = lambda value: f"{value:g}" if type(value) in (int, float) else f"{value}"
+
+    def words(value: Any) -> Any:
+        return f"{value:g}" if type(value) in (int, float) else f"{value}"
+
     return ", ".join(f"{name} {words(value)}" for name, value in point.items())
 
 
@@ -358,7 +361,10 @@ class Page:
         rows = []
         for name, beyond in BEYOND.items():
             agents = [agent for agent in AGENTS if name in SPACES[agent]]
-            words = lambda values: ", ".join(f"{x:g}" for x in values if x is not None)
+
+            def words(values: Any) -> Any:
+                return ", ".join(f"{x:g}" for x in values if x is not None)
+
             grid = words(SPACES[agents[0]][name])
             who = "all" if len(agents) == len(AGENTS) else ", ".join(agents)
             rows.append([name, grid, words(beyond), who])

@@ -405,7 +405,10 @@ def importance(agent: str, store: Store) -> dict[str, float]:
             shares.append({name: share or 0.0 for name, share in explained.items()})
     if not shares:
         return {}
-    mean = lambda name: float(np.mean([x[name] for x in shares]))
+
+    def mean(name: str) -> float:
+        return float(np.mean([x[name] for x in shares]))
+
     return {name: max(0.0, mean(name)) for name in points[0]}
 
 
@@ -483,7 +486,10 @@ def coverage(store: Store, curves: Iterable[tuple[str, str, Any]]) -> list[Cover
       store: the store of all runs.
       curves: the curves, each with its panel and name.
     """
-    stored = lambda runs: sum(run in store for run in runs)
+
+    def stored(runs: Any) -> Any:
+        return sum(run in store for run in runs)
+
     rows = []
     for panel, name, curve in curves:
         runs = curve.search.requested(store)

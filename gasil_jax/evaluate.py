@@ -101,7 +101,9 @@ def _score(options: Options, policies: Policies) -> dict[str, np.ndarray]:
         )
 
     # A seed has the same starts and draws whether evaluated alone or with others.
-    fold = lambda seed: jax.random.fold_in(jax.random.key(options.key), seed)
+    def fold(seed: jax.Array) -> jax.Array:
+        return jax.random.fold_in(jax.random.key(options.key), seed)
+
     keys = jax.vmap(fold)(jnp.array(policies.seeds, jnp.uint32))
     weights = jax.tree.map(lambda *x: jnp.stack(x), *policies.weights)
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(score))(weights, keys))

@@ -21,7 +21,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Sequence
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import numpy as np
@@ -145,11 +145,12 @@ def write(
     from minari.data_collector import EpisodeBuffer
     from minari.storage import get_dataset_path
 
-    space = lambda x: gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32)
-    if num_actions is None:
-        actions = lambda x: x
-    else:
-        actions = lambda one_hot: one_hot.argmax(axis=-1)
+    def space(x: np.ndarray) -> Any:
+        return gymnasium.spaces.Box(-np.inf, np.inf, x.shape[1:], np.float32)
+
+    def actions(recorded: np.ndarray) -> np.ndarray:
+        return recorded if num_actions is None else recorded.argmax(axis=-1)
+
     buffers = [
         EpisodeBuffer(
             id=index,

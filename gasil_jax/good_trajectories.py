@@ -119,8 +119,11 @@ def init_history(
     """
     batches = -(-(num_episodes * max_episode_steps + num_steps) // num_steps)
     length = batches * num_steps
+
     # Each field needs its own array: a shared one could not be donated.
-    observations = lambda: jnp.zeros((num_envs, length, observation_size), jnp.float32)
+    def observations() -> jax.Array:
+        return jnp.zeros((num_envs, length, observation_size), jnp.float32)
+
     return History(
         observation=observations(),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
@@ -252,11 +255,16 @@ def insert(
     recorded_index = (episodes.last[offer] - episodes.length[offer] + 1 + time) % ring
 
     filled = slot < size
-    gather = lambda kept, recorded: jnp.where(
-        filled[:, None],
-        jnp.where(is_kept[:, None], kept[kept_index], recorded[env, recorded_index]),
-        0.0,
-    )
+
+    def gather(kept: jax.Array, recorded: jax.Array) -> jax.Array:
+        return jnp.where(
+            filled[:, None],
+            jnp.where(
+                is_kept[:, None], kept[kept_index], recorded[env, recorded_index]
+            ),
+            0.0,
+        )
+
     return GoodTrajectories(
         observation=gather(good_trajectories.observation, history.observation),
         action=gather(good_trajectories.action, history.action),

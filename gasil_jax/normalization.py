@@ -27,8 +27,11 @@ class Normalizer(struct.PyTreeNode):
 
 def init(observation_size: int) -> Normalizer:
     """Return a normalizer without observations, which has mean 0 and variance 1."""
+
     # Each field needs its own array: a shared one could not be donated.
-    zeros = lambda: jnp.zeros(observation_size, jnp.float32)
+    def zeros() -> jax.Array:
+        return jnp.zeros(observation_size, jnp.float32)
+
     return Normalizer(jnp.float32(0), zeros(), zeros())
 
 

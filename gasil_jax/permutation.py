@@ -21,10 +21,16 @@ def permutation(key: jax.Array, size: int) -> jax.Array:
 
     The order is that of `jax.random.permutation`. The key is consumed.
     """
-    of_jax = lambda key: jax.random.permutation(key, size)
+
+    def of_jax(key: jax.Array) -> jax.Array:
+        return jax.random.permutation(key, size)
+
     if not 1 < size <= _MAX_SIZE:
         return of_jax(key)
-    ours = lambda key: _by_packed_keys(key, size)
+
+    def ours(key: jax.Array) -> jax.Array:
+        return _by_packed_keys(key, size)
+
     return jax.lax.platform_dependent(key, cpu=ours, default=of_jax)
 
 

@@ -118,14 +118,20 @@ def _read_tables(
     """
     if not all((folder / name).is_file() for folder, _, _ in saved):
         return {}
-    read = lambda folder, count: metrics_files.read_metrics(
-        folder / name, (), count, (column,), unfinished=True
-    )
+
+    def read(folder: pathlib.Path, count: int) -> dict[str, np.ndarray]:
+        return metrics_files.read_metrics(
+            folder / name, (), count, (column,), unfinished=True
+        )
+
     every = [(read(folder, count), indices) for folder, count, indices in saved]
     if not all(columns for columns, _ in every):
         return {}
     length = min(len(columns["env_steps"][0]) for columns, _ in every)
-    rows = lambda x: [columns[x][list(i), :length] for columns, i in every]
+
+    def rows(x: str) -> list[np.ndarray]:
+        return [columns[x][list(i), :length] for columns, i in every]
+
     return {x: np.concatenate(rows(x)) for x in ("env_steps", column)}
 
 

@@ -30,7 +30,10 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
         arrays["num_actions"] = np.int32(env.num_actions)
     else:
         low, high = wrappers.action_range(env)
-        wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
+
+        def wide(x: Any) -> np.ndarray:
+            return np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
+
         arrays |= {"log_std": params["log_std"], "low": wide(low), "high": wide(high)}
     if activation != "tanh":
         arrays[f"activation_{activation}"] = np.int32(1)
@@ -77,7 +80,10 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
 
 def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
     """Return the policy with these arrays, as `load_policy` does for a file."""
-    float32 = lambda x: jnp.asarray(x, jnp.float32)
+
+    def float32(x: Any) -> jax.Array:
+        return jnp.asarray(x, jnp.float32)
+
     arrays = jax.tree.map(float32, dict(weights))
     discrete = numpy_policy.is_discrete(arrays)
     distribution = CATEGORICAL if discrete else GAUSSIAN

@@ -129,9 +129,13 @@ def evaluate_streams(
       config: discount and lambda.
     """
     chex.assert_equal(rewards.shape, (*terminated.shape, len(actor_critic.values)))
-    evaluate = lambda observation: jnp.stack(
-        [value(critic.params, observation) for critic in actor_critic.values], axis=-1
-    )
+
+    def evaluate(observation: jax.Array) -> jax.Array:
+        return jnp.stack(
+            [value(critic.params, observation) for critic in actor_critic.values],
+            axis=-1,
+        )
+
     values = evaluate(observation)
     advantage = generalized_advantage_estimation(
         rewards,

@@ -111,7 +111,10 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     values of eight (experiments/results/action_dimension.md).
     """
     share = min(max((action_size - 2) / 6, 0.0), 1.0)
-    between = lambda two, eight: two * (1 - share) + eight * share
+
+    def between(two: float, eight: float) -> float:
+        return two * (1 - share) + eight * share
+
     return {
         "normalize_rewards": True,
         "decompose_rewards": decompose_rewards,

@@ -222,9 +222,10 @@ def collect(
             faulty=~sound,
             cut_short=cut_short,
         )
-        select = lambda a, b: jnp.where(
-            ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b
-        )
+
+        def select(a: jax.Array, b: jax.Array) -> jax.Array:
+            return jnp.where(ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b)
+
         carry = EnvironmentStates(
             state=jax.tree.map(
                 lambda a, b: _cast(select(a, b), b.dtype), fresh, stepped

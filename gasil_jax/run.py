@@ -37,7 +37,10 @@ def train(
       OSError: if the folder can no longer be written.
       ValueError: if the run to continue does not fit the options.
     """
-    write = lambda: write_config(options, folder)
+
+    def write() -> None:
+        write_config(options, folder)
+
     # A run that is continued keeps its config.json until its checkpoint is restored.
     if not run_folder.has_run(folder):
         write()

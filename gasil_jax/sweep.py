@@ -201,7 +201,10 @@ def _train_whole(options: Options, plan: Plan) -> None:
     requested = list(plan.runs.values())
     env = _prepare(options, plan, requested)
     with run_options.open_folder(options, _PROGRAM) as folder:
-        write = lambda: _write_config(options, plan, folder)
+
+        def write() -> None:
+            _write_config(options, plan, folder)
+
         # A sweep keeps its config.json until a checkpoint is restored.
         if env is None or not run_folder.has_run(folder):
             write()
@@ -214,7 +217,10 @@ def _train_shard(
     options: Options, plan: Plan, shard: Shard, *, folder: pathlib.Path
 ) -> None:
     """Train what is missing of a shard, and write the tables if no run is missing."""
-    part = lambda plan: shards.cut_evenly(list(plan.runs.values()), shard)
+
+    def part(plan: Plan) -> list[Run]:
+        return shards.cut_evenly(list(plan.runs.values()), shard)
+
     begun = [x for x in plan.unfinished(folder, part(plan)) if x.path.exists()]
     if begun and not options.resume:
         raise InputError(

@@ -495,7 +495,10 @@ def advantages(
     )
     returns = advantage + values
     mixed, metrics = agent.mix(agent_state, ppo.standardize(advantage), context)
-    flat = lambda x: x.reshape(-1, *x.shape[2:])
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, *x.shape[2:])
+
     residual = jnp.var(returns - values, axis=(0, 1))
     explained = 1.0 - residual / (jnp.var(returns, axis=(0, 1)) + 1e-8)
     return ppo.Batch(
@@ -556,7 +559,10 @@ def rollout_metrics(batch: Rollout) -> Metrics:
     Means over the whole episodes that ended in the batch are NaN if none did.
     """
     completed = batch.completed
-    mean = lambda x: jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
+
     return {
         "episode_return": mean(batch.episode_return),
         "episode_length": mean(batch.episode_length),

@@ -44,7 +44,10 @@ def _spaces(env: Env) -> tuple[gymnasium.Space[Any], gymnasium.Space[Any]]:
         return observations, gymnasium.spaces.Discrete(env.num_actions)
     low, high = wrappers.action_range(env)
     shape = (env.action_size,)
-    wide = lambda x: np.broadcast_to(np.asarray(x, np.float32), shape).copy()
+
+    def wide(x: Any) -> np.ndarray:
+        return np.broadcast_to(np.asarray(x, np.float32), shape).copy()
+
     return observations, box(wide(low), wide(high), shape, np.float32)
 
 

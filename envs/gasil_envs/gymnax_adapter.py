@@ -108,5 +108,7 @@ def _spaces() -> Any:
 
 
 def _box(low: Any, high: Any, size: int) -> Any:
-    wide = lambda x: jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,))
+    def wide(x: Any) -> jax.Array:
+        return jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,))
+
     return _spaces().Box(wide(low), wide(high), (size,), jnp.float32)

@@ -9,6 +9,7 @@ import dataclasses
 import pathlib
 import types
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import gymnasium
 import jax
@@ -322,7 +323,10 @@ class Locomotion(Env):
 
     def _is_healthy(self, physics: PhysicsState) -> jax.Array:
         task, qpos = self.task, physics.qpos
-        within = lambda x, bounds: jnp.all((bounds[0] < x) & (x < bounds[1]))
+
+        def within(x: jax.Array, bounds: Any) -> jax.Array:
+            return jnp.all((bounds[0] < x) & (x < bounds[1]))
+
         healthy = within(qpos[task.z_index], task.healthy_z)
         healthy &= within(qpos[2], task.healthy_angle)
         healthy &= within(jnp.concatenate([qpos[2:], physics.qvel]), task.healthy_state)

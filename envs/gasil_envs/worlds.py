@@ -156,7 +156,10 @@ class World:
         inner, observation, reward, terminated = self._advance(
             step_key, inner, self._as_given(action)
         )
-        number = lambda x: jnp.asarray(x).astype(jnp.float32).reshape(())
+
+        def number(x: Any) -> jax.Array:
+            return jnp.asarray(x).astype(jnp.float32).reshape(())
+
         return state.replace(
             pipeline_state=(self._cast(inner), key),
             obs=self._vector(observation),

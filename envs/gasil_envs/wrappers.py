@@ -217,7 +217,10 @@ class FaultyStepEnds(Wrapper):
         """Step, and terminate the episode if the physics fails."""
         stepped = self.env.step(state, action)
         sound = step_is_sound(state.obs, stepped) & ~state.info["unsound_start"]
-        zero = lambda x: jnp.where(sound, x, jnp.zeros_like(x))
+
+        def zero(x: jax.Array) -> jax.Array:
+            return jnp.where(sound, x, jnp.zeros_like(x))
+
         info = {k: zero(x) if k in _OF_STEP else x for k, x in stepped.info.items()}
         info["unsound_start"] = jnp.zeros_like(state.info["unsound_start"])
         return stepped.replace(
@@ -252,7 +255,10 @@ class AutoReset(Wrapper):
         stepped = self.env.step(state.replace(info=info, done=0.0 * state.done), action)
         fresh = self.env.reset(reset_key)
         done = stepped.done > 0
-        select = lambda a, b: jax.tree.map(lambda x, y: jnp.where(done, x, y), a, b)
+
+        def select(a: Any, b: Any) -> Any:
+            return jax.tree.map(lambda x, y: jnp.where(done, x, y), a, b)
+
         kept = {k: v for k, v in stepped.info.items() if k in _LAST_STEP_INFO}
         return stepped.replace(
             pipeline_state=select(fresh.pipeline_state, stepped.pipeline_state),

@@ -158,8 +158,11 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     arrays = _read_arrays(folder)
     missing = {x: y for x, y in expected.items() if x not in arrays and not y.size}
     arrays |= {name: np.zeros(x.shape, x.dtype) for name, x in missing.items()}
+
     # Orbax may silently restore only a part of a tree that does not match.
-    shape = lambda tree: {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
+    def shape(tree: Any) -> dict[str, Any]:
+        return {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
+
     if shape(arrays) != shape(expected):
         names = set(arrays) ^ set(expected) or {
             name for name in expected if shape(arrays)[name] != shape(expected)[name]

@@ -190,7 +190,10 @@ def _check_flags(
 
 def _similar(name: str, names: Sequence[str]) -> list[str]:
     """Return up to three names that have the given word or initials, or its letters."""
-    singular = lambda word: word.removesuffix("s")
+
+    def singular(word: str) -> str:
+        return word.removesuffix("s")
+
     same = [
         x
         for x in names
@@ -251,7 +254,10 @@ def _in_one_line(printed: str) -> str:
         message,
     )
     if number is None:
-        underscored = lambda match: f"{match[1].replace('-', '_')} is "
+
+        def underscored(match: re.Match[str]) -> str:
+            return f"{match[1].replace('-', '_')} is "
+
         return re.sub(r"^Error parsing --([\w-]+): ", underscored, message)
     name, whole, value = number.groups()
     kind = "a whole number" if whole else "a number"

@@ -132,7 +132,10 @@ class _Training:
     def progress(self, metrics: _Columns, evaluation: _Columns | None) -> FitProgress:
         """Return the progress after a chunk, with its metrics and evaluation."""
         done, env_steps = self.done, self.done * self.members.config.batch_steps
-        copy_states = lambda: self._copy_states(done)
+
+        def copy_states() -> TrainState:
+            return self._copy_states(done)
+
         return FitProgress(done, env_steps, metrics, evaluation, copy_states)
 
     def _copy_states(self, iteration: int) -> TrainState:
@@ -358,7 +361,9 @@ def drive(
     checkpoints = PeriodicCheckpoints(members, root, schedule)
     checkpoints.check()
     first = training.done
-    steps_of = lambda done: steps_before + members.env_steps(done)
+
+    def steps_of(done: int) -> int:
+        return steps_before + members.env_steps(done)
 
     started = time.monotonic()
     if training.left:

@@ -84,7 +84,10 @@ def as_type(kind: Any, value: Any, name: str) -> Any:
             hints = get_type_hints(kind)
             if missing := sorted(kind.__required_keys__ - set(value)):
                 raise InputError(f"{_join(name, missing[0])} is missing")
-            of = lambda key: hints.get(key, Any)
+
+            def of(key: str) -> Any:
+                return hints.get(key, Any)
+
             return {
                 key: as_type(of(key), x, _join(name, key)) for key, x in value.items()
             }

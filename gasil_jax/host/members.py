@@ -95,9 +95,10 @@ def advance_members(
     def body(index: jax.Array, carry: Any) -> Any:
         states, metrics = carry
         states, new = step(states)
-        write = lambda all_, one: jax.lax.dynamic_update_index_in_dim(
-            all_, one, index, 1
-        )
+
+        def write(all_: jax.Array, one: jax.Array) -> jax.Array:
+            return jax.lax.dynamic_update_index_in_dim(all_, one, index, 1)
+
         return states, jax.tree.map(write, metrics, new)
 
     return jax.lax.fori_loop(0, num_iterations, body, (states, metrics))
@@ -173,10 +174,13 @@ class Members:
 
     def init(self) -> Any:
         """Return the first states of all members, (padded, ...) each leaf."""
-        pad = lambda values: [*values, *[values[-1]] * self._padding]
-        init_one = lambda seed, hyperparameters: init_member(
-            self.env, self.algorithm, seed, hyperparameters
-        )
+
+        def pad(values: Any) -> Any:
+            return [*values, *[values[-1]] * self._padding]
+
+        def init_one(seed: Any, hyperparameters: Any) -> Any:
+            return init_member(self.env, self.algorithm, seed, hyperparameters)
+
         init = jax.jit(
             self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
         )
@@ -261,8 +265,11 @@ class Members:
         """Return the members' arrays, (members, ...), padded and on their devices."""
         padded = np.arange(self.num_members + self._padding)
         index = np.minimum(padded, self.num_members - 1)
+
         # Not on one device first, whose memory may hold only its share.
-        padded_rows = lambda x: x[index] if self._padding else x
+        def padded_rows(x: Any) -> Any:
+            return x[index] if self._padding else x
+
         padded_states = jax.tree.map(padded_rows, states)
         return jax.device_put(
             padded_states, jax.tree.map(self._sharding_of, padded_states)
@@ -286,7 +293,10 @@ class Members:
 
     def shapes(self) -> Any:
         """Return the shapes and dtypes of the members' states, (members, ...) each."""
-        resized = lambda x: x.update(shape=(self.num_members, *x.shape[1:]))
+
+        def resized(x: Any) -> Any:
+            return x.update(shape=(self.num_members, *x.shape[1:]))
+
         return jax.tree.map(resized, jax.eval_shape(self.init))
 
 

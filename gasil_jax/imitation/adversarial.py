@@ -257,7 +257,10 @@ class AdversarialAgent(Agent):
         self, context: Context
     ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
         """Return the function that makes the discriminator's inputs from pairs."""
-        normalize = lambda x: normalization.normalize(context.normalizer, x)
+
+        def normalize(x: jax.Array) -> jax.Array:
+            return normalization.normalize(context.normalizer, x)
+
         if not self.discriminator_normalizes_actions:
             return lambda observation, action: (normalize(observation), action)
         actions = context.rollout.action
@@ -287,7 +290,10 @@ class AdversarialAgent(Agent):
             )
             if penalty:
                 share = jax.random.uniform(key, (minibatch_size,))
-                logit = lambda *pair: network.apply(params, *pair)
+
+                def logit(*pair: Any) -> Any:
+                    return network.apply(params, *pair)
+
                 value += penalty * gradient_penalty(
                     logit, policy_pair, good_pair, share=share
                 )

@@ -56,10 +56,15 @@ def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
         name = source.removeprefix(_MINARI)
         _require_minari(name)
         form = "a local data set with arrays as observations and actions"
-        read = lambda: _read_minari(name)
+
+        def read() -> dict[str, np.ndarray]:
+            return _read_minari(name)
     else:
         form = "an .npz file with arrays 'observation' and 'action'"
-        read = lambda: npz.read(pathlib.Path(source), lambda name: name in _NAMES)
+
+        def read() -> dict[str, np.ndarray]:
+            return npz.read(pathlib.Path(source), lambda name: name in _NAMES)
+
     # What is wrong in a data set decides the type of the error.
     try:
         arrays = read()

@@ -122,7 +122,10 @@ def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> R
     highest priority that a step can have, so that each is drawn soon.
     """
     return_, complete = returns_to_go(history, num_steps, gamma)
-    flat = lambda x: x.reshape(-1, *x.shape[2:])
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, *x.shape[2:])
+
     capacity = replay.return_.shape[0]
     complete = flat(complete)
     count = jnp.sum(complete)
@@ -131,7 +134,10 @@ def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> R
     # out of bounds, so steps with it are dropped.
     kept = complete & (rank >= count - capacity)
     index = jnp.where(kept, (replay.cursor + rank) % capacity, capacity)
-    write = lambda ring, new: ring.at[index].set(new, mode="drop")
+
+    def write(ring: jax.Array, new: Any) -> jax.Array:
+        return ring.at[index].set(new, mode="drop")
+
     return Replay(
         observation=write(
             replay.observation, flat(history.in_time(history.observation))
@@ -160,7 +166,10 @@ def sample(
     last = jnp.max(jnp.where(mass > 0, jnp.arange(mass.shape[0]), 0))
     index = jnp.minimum(index, last)
     size = jnp.sum(replay.priority > 0)
-    weight = lambda mass: (mass / total * size) ** -_IMPORTANCE_EXPONENT
+
+    def weight(mass: jax.Array) -> jax.Array:
+        return (mass / total * size) ** -_IMPORTANCE_EXPONENT
+
     least = jnp.min(jnp.where(mass > 0, mass, jnp.inf))
     return index, weight(jnp.maximum(mass[index], least)) / weight(least)
 
@@ -239,7 +248,10 @@ class PPOSIL(Agent):
         self, state: Replay, actor_critic: ActorCritic, context: Context, key: jax.Array
     ) -> tuple[Replay, ActorCritic, Metrics]:
         """Take gradient steps on the loss, if the replay is not empty."""
-        normalize = lambda x: normalization.normalize(context.normalizer, x)
+
+        def normalize(x: jax.Array) -> jax.Array:
+            return normalization.normalize(context.normalizer, x)
+
         # The replay's returns are in the environment's unit, the value's targets in
         # that of the normalized reward.
         scale = return_scale(state) / context.reward_scale

@@ -131,7 +131,10 @@ def window_sums(
     def step(running: Any, now: Any) -> Any:
         reward, ends = now
         total, length = running[0] + reward, running[1] + 1.0
-        reset = lambda x: jnp.where(ends, 0.0, x)
+
+        def reset(x: jax.Array) -> jax.Array:
+            return jnp.where(ends, 0.0, x)
+
         return (reset(total), reset(length)), (total, length)
 
     running, (total, length) = jax.lax.scan(step, running, (reward, ends))
@@ -174,7 +177,10 @@ def goodness_of_fit(
       the root of the mean squared error of a step, both ().
     """
     count = jnp.sum(valid)
-    mean = lambda x: jnp.sum(jnp.where(valid, x, 0.0)) / count
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(valid, x, 0.0)) / count
+
     error = mean((predicted - actual) ** 2)
     middle = mean(actual)
     variance = mean((actual - middle) ** 2)
@@ -249,7 +255,10 @@ def num_parts(num_windows: int, numbers_per_window: int) -> int:
       numbers_per_window: count of the network's input numbers for a window.
     """
     divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
-    fits = lambda parts: num_windows // parts * numbers_per_window <= _PART_NUMBERS
+
+    def fits(parts: int) -> bool:
+        return num_windows // parts * numbers_per_window <= _PART_NUMBERS
+
     return next((parts for parts in divisors if fits(parts)), num_windows)
 
 
@@ -267,7 +276,10 @@ def mean_gradient(
     if parts == 1:
         return gradient(params, minibatch)
     divided = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), minibatch)
-    add = lambda total, part: jax.tree.map(jnp.add, total, gradient(params, part))
+
+    def add(total: Any, part: Any) -> Any:
+        return jax.tree.map(jnp.add, total, gradient(params, part))
+
     total, _ = jax.lax.scan(
         lambda total, part: (add(total, part), None),
         jax.tree.map(jnp.zeros_like, params),
@@ -373,7 +385,9 @@ class Decompose(RewardModel):
         network, batch, history = self._network, context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.
         low, high = context.action_range
-        normalize = lambda x: normalization.normalize(context.normalizer, x)
+
+        def normalize(x: jax.Array) -> jax.Array:
+            return normalization.normalize(context.normalizer, x)
 
         def predict(
             params: Any,

@@ -29,9 +29,10 @@ def read(folder: pathlib.Path, num_seeds: int) -> Tables:
     Raises:
       InputError: if a table is damaged.
     """
-    table = lambda path, required: metrics_files.read_metrics(
-        path, ("seed",), num_seeds, required
-    )
+
+    def table(path: Any, required: Any) -> Any:
+        return metrics_files.read_metrics(path, ("seed",), num_seeds, required)
+
     required = (*metrics_files.SUMMARIZED, "faulty_steps")
     metrics = table(folder / "metrics.csv", required)
     path = folder / "evaluations.csv"
@@ -72,11 +73,14 @@ def write(
         )
     faulty = np.nansum(metrics["faulty_steps"], axis=1)
     skipped = np.nansum(metrics["skipped_updates"], axis=1)
-    by_seed = lambda values, kind: {
-        str(seed): kind(value)
-        for seed, value in zip(seeds, values, strict=True)
-        if np.isfinite(value)
-    }
+
+    def by_seed(values: Any, kind: Any) -> Any:
+        return {
+            str(seed): kind(value)
+            for seed, value in zip(seeds, values, strict=True)
+            if np.isfinite(value)
+        }
+
     trained = {
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,

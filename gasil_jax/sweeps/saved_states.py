@@ -170,7 +170,9 @@ def _load(
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
     with command_line.input_checked():
         # The leaves of all members have the same shapes.
-        init = lambda seed: train.first_state(env, algorithm, jax.random.key(seed))
+        def init(seed: Any) -> Any:
+            return train.first_state(env, algorithm, jax.random.key(seed))
+
         like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
         states = chosen.restore(like)
     seeds = saved.program.seeds

@@ -97,15 +97,18 @@ def read(plan: Plan, trained: Sequence[ProgramFolder]) -> Results:
                 )
         scores |= dict(zip(runs, own_scores))
     curves = _curves(plan, metrics)
-    of_point = lambda name, i: np.stack(
-        [metrics[plan.runs[i, seed]][name] for seed in plan.seeds]
-    )
-    finals_of = lambda name: np.array(
-        [
-            metrics_files.final_returns(of_point(name, i))
-            for i in range(len(plan.points))
-        ]
-    )
+
+    def of_point(name: str, i: int) -> np.ndarray:
+        return np.stack([metrics[plan.runs[i, seed]][name] for seed in plan.seeds])
+
+    def finals_of(name: str) -> np.ndarray:
+        return np.array(
+            [
+                metrics_files.final_returns(of_point(name, i))
+                for i in range(len(plan.points))
+            ]
+        )
+
     finals = {
         "final_return": finals_of("episode_return"),
         "final_length": finals_of("episode_length"),
@@ -191,7 +194,10 @@ def _summary(results: Results) -> dict[str, Any]:
     others = dict(results.finals)
     final = others.pop("final_return")
     sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
-    best = lambda scores: int(sound[scores[sound].argmax()]) if sound.size else None
+
+    def best(scores: np.ndarray) -> int | None:
+        return int(sound[scores[sound].argmax()]) if sound.size else None
+
     returns = mean[results.ended]
     every = {name: importance(x, returns) for name, x in results.varied.items()}
     # The estimate is noisy and may be below 0.
@@ -237,7 +243,10 @@ def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     "evaluation_seconds" is included if policies were evaluated. For shards, which run
     in parallel, "env_steps_per_second" is the average speed of one shard.
     """
-    total = lambda name: sum(training[name] for training in trainings)
+
+    def total(name: str) -> float:
+        return sum(training[name] for training in trainings)
+
     devices = _joined([{"device": training["device"]} for training in trainings])
     evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
     return {
@@ -275,7 +284,10 @@ def _curves(plan: Plan, tables: Mapping[Run, _Columns]) -> dict[str, Any]:
             )
     # Points may differ in batch_steps, and so in iterations.
     length = max(len(metrics["env_steps"]) for metrics in every.values())
-    pad = lambda x: np.concatenate([x, np.full(length - len(x), np.nan)])
+
+    def pad(x: np.ndarray) -> np.ndarray:
+        return np.concatenate([x, np.full(length - len(x), np.nan)])
+
     shape = (len(plan.points), len(plan.seeds), length)
     return {
         name: np.array([pad(x[name]) for x in every.values()]).reshape(shape)

@@ -141,7 +141,10 @@ def in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
         parts = materialize(jax.tree.map(split, tree))
         if tiles == 1:
-            first = lambda tree: jax.tree.map(lambda x: x[0], tree)
+
+            def first(tree: Any) -> Any:
+                return jax.tree.map(lambda x: x[0], tree)
+
             results = jax.tree.map(lambda x: x[None], function(first(parts)))
         else:
             results = jax.lax.map(function, parts)

@@ -15,7 +15,7 @@ Shape letters: C contacts, A axes, B batch.
 """
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -141,7 +141,10 @@ def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
         return parts[0]
     distance = jnp.concatenate([part.distance for part in parts])
     position = jnp.concatenate([part.position for part in parts])
-    shape = lambda x: (x.position.shape[0], x.axes.shape[1], *x.position.shape[1:])
+
+    def shape(x: Touch) -> tuple[int, ...]:
+        return (x.position.shape[0], x.axes.shape[1], *x.position.shape[1:])
+
     axes = [jnp.broadcast_to(part.axes, shape(part)) for part in parts]
     return Touch(distance, position, jnp.concatenate(axes))
 
@@ -151,7 +154,10 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     normal = data.geom_xmat[plane].reshape(-1, 3, 3)[:, :, 2]
-    constant = lambda x: x.astype(np.float32)[..., None]
+
+    def constant(x: Any) -> Any:
+        return x.astype(np.float32)[..., None]
+
     height = constant(np.sum(normal * data.geom_xpos[plane], axis=1))
     radius = constant(model.geom_size[geom, 0])
     axis = take(lines.half, geom)
@@ -187,9 +193,12 @@ def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
 def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     first, second = pairs.between
     a, b = (Segments(take(lines.middle, i), take(lines.half, i)) for i in pairs.between)
-    length = lambda i: np.where(
-        model.geom_type[i] == _CAPSULE, model.geom_size[i, 1], 0.0
-    ).astype(np.float32)[:, None]
+
+    def length(i: np.ndarray) -> np.ndarray:
+        return np.where(
+            model.geom_type[i] == _CAPSULE, model.geom_size[i, 1], 0.0
+        ).astype(np.float32)[:, None]
+
     near_a, near_b = _nearest_points(a, b, length(first), length_b=length(second))
     radius = model.geom_size[pairs.between, 0].astype(np.float32)[..., None]
     away = materialize(near_b - near_a)
@@ -219,7 +228,10 @@ def _nearest_points(
     The lengths (C, 1) are halves. The nearest points of the two lines are moved onto
     the segments; then the better of two corrections is taken.
     """
-    dot = lambda x, y: total(x * y, 1)
+
+    def dot(x: jax.Array, y: jax.Array) -> jax.Array:
+        return total(x * y, 1)
+
     along_a = a.half / np.maximum(length_a, 1e-15)[..., None]
     along_b = b.half / np.maximum(length_b, 1e-15)[..., None]
     between = a.middle - b.middle
@@ -229,14 +241,25 @@ def _nearest_points(
     # 1e-6 is for parallel lines.
     at_a = (cosine * from_b - from_a) / (1.0 - cosine**2 + 1e-6)
     at_b = from_b + at_a * cosine
-    on_a = lambda x: jnp.clip(x, -length_a, length_a)
-    on_b = lambda x: jnp.clip(x, -length_b, length_b)
+
+    def on_a(x: jax.Array) -> jax.Array:
+        return jnp.clip(x, -length_a, length_a)
+
+    def on_b(x: jax.Array) -> jax.Array:
+        return jnp.clip(x, -length_b, length_b)
+
     at_a, at_b = materialize((on_a(at_a), on_b(at_b)))
     # Of each segment the point that is nearest to the other's point.
     other_a, other_b = on_a(at_b * cosine - from_a), on_b(at_a * cosine + from_b)
-    point = lambda line, along, at: line.middle + along * at[:, None]
+
+    def point(line: Any, along: jax.Array, at: jax.Array) -> jax.Array:
+        return line.middle + along * at[:, None]
+
     one = point(a, along_a, other_a), point(b, along_b, at_b)
     two = point(a, along_a, at_a), point(b, along_b, other_b)
-    square = lambda x: dot(x[0] - x[1], x[0] - x[1])
+
+    def square(x: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return dot(x[0] - x[1], x[0] - x[1])
+
     nearer = (square(one) < square(two))[:, None]
     return jnp.where(nearer, one[0], two[0]), jnp.where(nearer, one[1], two[1])

@@ -49,7 +49,10 @@ class Impedance(struct.PyTreeNode):
         lowest, highest, width, midpoint, power = (
             np.asarray(solimp, np.float64).reshape(-1, 5).T
         )
-        within = lambda x: np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP)
+
+        def within(x: np.ndarray) -> np.ndarray:
+            return np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP)
+
         lowest, highest, midpoint = within(lowest), within(highest), within(midpoint)
         safe = time
         if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
@@ -232,7 +235,10 @@ def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | Non
         return None
     # Turning about the normal leaves all of these properties as they are.
     normal = data.xaxis[hinge][0]
-    is_all = lambda x, value: np.allclose(x, value, atol=1e-6)
+
+    def is_all(x: np.ndarray, value: float) -> bool:
+        return np.allclose(x, value, atol=1e-6)
+
     across = np.abs(data.xaxis @ normal)
     moves_in_it = is_all(across[hinge], 1.0) and is_all(across[slide], 0.0)
     is_coordinate_axis = is_all(np.abs(normal).max(), 1.0)
@@ -270,7 +276,10 @@ def _group(
     if condim > 1:
         inverse_weight = inverse_weight * (1 + friction**2)
         inverse_weight = inverse_weight * 2 * friction**2 / model.opt.impratio
-    at = lambda x, width: x.reshape(-1, width)[index]
+
+    def at(x: np.ndarray, width: int) -> np.ndarray:
+        return x.reshape(-1, width)[index]
+
     constants = Constants(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
         body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),

@@ -234,7 +234,10 @@ def _integrate_positions(
 
 def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: float) -> jax.Array:
     """Unit quaternions (4, B) after turning with `velocity` (3, B) rad/s for `dt`."""
-    norm = lambda x: jnp.sqrt(total(x**2))
+
+    def norm(x: jax.Array) -> jax.Array:
+        return jnp.sqrt(total(x**2))
+
     speed = norm(velocity)
     half = 0.5 * dt * speed
     scale = jnp.where(speed > 1e-10, jnp.sin(half) / jnp.maximum(speed, 1e-10), 0.0)

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -96,7 +97,10 @@ class MjxPhysics:
         """Advance `frame_skip` time steps under one control (nu,)."""
         if self._small is not None:
             small = self._small
-            many = lambda x: dynamics.step(small, x[0], x[1], frame_skip)
+
+            def many(x: Any) -> Any:
+                return dynamics.step(small, x[0], x[1], frame_skip)
+
             return batch_last(in_tiles(many))((state, control))
         data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(

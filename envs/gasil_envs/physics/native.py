@@ -111,7 +111,10 @@ class _ThreadedSimulations:
         self._shares = list(itertools.pairwise(bounds))
         self._data = [mujoco.MjData(model) for _ in self._shares]
         self._pool = concurrent.futures.ThreadPoolExecutor(len(self._shares))
-        shape = lambda name: (count, *getattr(self._data[0], name).shape)
+
+        def shape(name: str) -> tuple[int, ...]:
+            return (count, *getattr(self._data[0], name).shape)
+
         self._results = {name: np.zeros(shape(name)) for name in _STATE + self._fields}
         self._failed = np.zeros(count, bool)
 
@@ -169,7 +172,10 @@ class MujocoPhysics:
     ):
         self._model, self._fields, self._threads = model, tuple(fields), threads
         data = mujoco.MjData(model)
-        shape = lambda name: getattr(data, name).shape
+
+        def shape(name: str) -> tuple[int, ...]:
+            return getattr(data, name).shape
+
         self._at_rest = {x: getattr(data, x).copy() for x in (*_STATE, "ctrl")}
         self._shapes = {name: shape(name) for name in (*_STATE, *self._fields)}
         # By number of simulations. Devices call at the same time, and each call takes

@@ -179,7 +179,9 @@ class _Rows:
     """
 
     def __init__(self, problem: Problem, for_speed: bool):
-        edges_first = lambda x: jnp.swapaxes(x, 0, 1)
+        def edges_first(x: jax.Array) -> jax.Array:
+            return jnp.swapaxes(x, 0, 1)
+
         self._sign = problem.limits.sign
         self._edges = [group.edges for group in problem.contacts]
         self._shapes = [group.tangents.shape[:2] for group in problem.contacts]
@@ -314,7 +316,10 @@ def _repeat(
     may be unrolled there. On a CPU unrolling it only costs compile time.
     """
     if not on_cpu():
-        call = lambda _, carry: function(carry)[0]
+
+        def call(_: Any, carry: Any) -> Any:
+            return function(carry)[0]
+
         return jax.lax.fori_loop(0, most, call, carry, unroll=unroll)
 
     def goes_on(state: Any) -> jax.Array:
@@ -339,20 +344,33 @@ def solve_many(
     spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
     each = jax.tree.map
-    flat = lambda x: x.reshape(-1, x.shape[-1])
-    of_rows = lambda parts: add(total(flat(x)) for x in parts)
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, x.shape[-1])
+
+    def of_rows(parts: Any) -> jax.Array:
+        return add(total(flat(x)) for x in parts)
+
     # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
-    jaref_at = lambda qacc: each(jnp.subtract, rows.times(qacc), rows.reference)
+    def jaref_at(qacc: Any) -> Any:
+        return each(jnp.subtract, rows.times(qacc), rows.reference)
+
     qacc_smooth = eliminate(inertia, force)
 
-    is_pushing = lambda jaref: each(lambda d: d < 0.0, jaref)
-    changes = lambda a, b: functools.reduce(
-        jnp.logical_or, (jnp.any(x != y) for x, y in zip(a, b, strict=True))
-    )
+    def is_pushing(jaref: Any) -> Any:
+        return each(lambda d: d < 0.0, jaref)
+
+    def changes(a: Any, b: Any) -> jax.Array:
+        return functools.reduce(
+            jnp.logical_or, (jnp.any(x != y) for x, y in zip(a, b, strict=True))
+        )
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
-        square = lambda d, w: w * jnp.minimum(d, 0.0) ** 2
+
+        def square(d: jax.Array, w: jax.Array) -> jax.Array:
+            return w * jnp.minimum(d, 0.0) ** 2
+
         constraint_cost = of_rows(each(square, materialize(jaref_at(qacc)), weight))
         return _dot(away, _matvec(inertia, away, spell_out)) + constraint_cost
 

@@ -203,7 +203,10 @@ def _inertia(
     # local is symmetric: row j of (local @ rotation') is the sum over its columns.
     half = add(local[:, :, k] * rotation[:, k, None] for k in range(3))  # (N, k, i, B)
     half = materialize(half)
-    entry = lambda i, j: add(half[:, k, i] * rotation[:, k, j] for k in range(3))
+
+    def entry(i: int, j: int) -> jax.Array:
+        return add(half[:, k, i] * rotation[:, k, j] for k in range(3))
+
     x, y, z = (offset[:, i] for i in range(3))
     return jnp.stack(
         [
@@ -394,7 +397,10 @@ def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
     turn = cvel[:, :3]
     local = jnp.stack([turn, cvel[:, 3:] - cross(arm, turn)])  # (2, N, 3, B)
     local = total(axes * local[:, :, None], 3)
-    factor = lambda x: x.astype(np.float32)[..., None]
+
+    def factor(x: np.ndarray) -> np.ndarray:
+        return x.astype(np.float32)[..., None]
+
     against = -(factor(linear) + factor(square) * jnp.abs(local)) * local
     torque, force = total(axes * against[:, :, :, None], 2)
     return jnp.concatenate([torque + cross(arm, force), force], axis=1)
