@@ -52,11 +52,11 @@ def _with_deviation(params: Any, deviation: jax.Array) -> Any:
 def _gaussian_sample(key: jax.Array, parameters: Any) -> jax.Array:
     mean, log_std = parameters
     noise = jax.random.normal(key, mean.shape, mean.dtype)
-    return mean + jnp.exp(log_std) * noise
+    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * noise
 
 
 def _gaussian_log_prob(parameters: Any, action: jax.Array) -> jax.Array:
-    mean, log_std = parameters
+    mean, log_std = jnp.broadcast_arrays(*parameters)
     z = (action - mean) * jnp.exp(-log_std)
     return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
 

@@ -47,7 +47,7 @@ def update(normalizer: Normalizer, observation: jax.Array) -> Normalizer:
     rows = jnp.where(valid, rows, 0.0)
     count = jnp.sum(valid, dtype=jnp.float32)
     mean = jnp.sum(rows, axis=0) / jnp.maximum(count, 1.0)
-    m2 = jnp.sum(jnp.where(valid, (rows - mean) ** 2, 0.0), axis=0)
+    m2 = jnp.sum(jnp.where(valid, (rows - mean[None]) ** 2, 0.0), axis=0)
     total = normalizer.count + count
     delta = mean - normalizer.mean
     share = count / jnp.maximum(total, 1.0)
@@ -67,5 +67,5 @@ def moments(normalizer: Normalizer) -> tuple[jax.Array, jax.Array]:
 
 def normalize(normalizer: Normalizer, observation: jax.Array) -> jax.Array:
     """Scale observations (..., obs) to mean 0 and variance 1, clipped to +-`CLIP`."""
-    mean, scale = moments(normalizer)
+    mean, scale = (jnp.broadcast_to(x, observation.shape) for x in moments(normalizer))
     return jnp.clip((observation - mean) / scale, -CLIP, CLIP)

@@ -90,7 +90,9 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        parameters = numpy_policy.output(arrays, float32(observation), jnp)
+        # The functions for NumPy broadcast as NumPy does.
+        with jax.numpy_rank_promotion("allow"):
+            parameters = numpy_policy.output(arrays, float32(observation), jnp)
         if not discrete:
             parameters = parameters, arrays["log_std"]
         if key is None:

@@ -101,8 +101,9 @@ def standardize(advantage: jax.Array) -> jax.Array:
 
     Mean and variance are over the whole batch, as in OpenAI baselines' ppo1.
     """
-    mean = jnp.mean(advantage, axis=(0, 1))
-    return (advantage - mean) / (jnp.std(advantage, axis=(0, 1)) + 1e-8)
+    mean = jnp.mean(advantage, axis=(0, 1), keepdims=True)
+    deviation = jnp.std(advantage, axis=(0, 1), keepdims=True)
+    return (advantage - mean) / (deviation + 1e-8)
 
 
 def evaluate_streams(

@@ -106,7 +106,7 @@ class PointMass(Env):
         action = jnp.clip(action, -1.0, 1.0)
         before = state.pipeline_state
         position = jnp.clip(before.position + self.layout.max_speed * action, -1.0, 1.0)
-        distance = jnp.linalg.norm(position - self.objects, axis=-1)
+        distance = jnp.linalg.norm(position[None] - self.objects, axis=-1)
         reached = (distance <= self.layout.radius) & ~before.collected
         pipeline_state = PointMassState(position, before.collected | reached)
         reward = jnp.sum(jnp.where(reached, self.object_rewards, 0.0))

@@ -99,7 +99,7 @@ def windows(history: History, recorded_steps: jax.Array) -> Windows:
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     steps = reward.shape[1]
-    index = jnp.arange(steps, dtype=jnp.int32)
+    index = jnp.arange(steps, dtype=jnp.int32)[None]
     recorded = index >= steps - recorded_steps
     last = ends_window(reward, ended) | ~recorded
     latest = jax.lax.cummax(jnp.where(last, index, -1), axis=1)
@@ -441,7 +441,7 @@ class Decompose(RewardModel):
         share = at_window_end(share, ends)
         # Steps of the history, in earlier batches, of the window that goes on in this.
         age = (cursor - 1 - jnp.arange(ring)) % ring
-        is_open = age < state.open_steps[:, None]
+        is_open = age[None] < state.open_steps[:, None]
         recorded = state.reward + jnp.where(is_open, share[0][:, None], 0.0)
         reward = reward + share
         reward = jnp.where(ends & (length == 1), batch.reward, reward)

@@ -32,7 +32,7 @@ def test_many_batched_orthogonal_matrices_do_not_deadlock():
 
     for matrix in jax.jit(jax.vmap(six))(jnp.arange(8)):
         product = jnp.einsum("bij,bik->bjk", matrix, matrix)
-        assert float(jnp.max(jnp.abs(product - jnp.eye(64)))) < 1e-4
+        assert float(jnp.max(jnp.abs(product - jnp.eye(64)[None]))) < 1e-4
 
 
 def test_the_release_that_miscompiles_is_refused_at_import():
