@@ -187,9 +187,11 @@ def check(name: str, settings: Settings) -> None:
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
         raise _refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
+    # NumPy would convert the limit to the number's own type, such as float16.
+    noise = noise.item() if isinstance(noise, np.generic) else noise
     # Numbers are float32.
     if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
-        raise _refusal("obs_noise", noise, "finite and 0 or more")
+        raise _refusal("obs_noise", settings.obs_noise, "finite and 0 or more")
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:

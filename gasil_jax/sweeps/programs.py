@@ -21,7 +21,7 @@ import numpy as np
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
 from gasil_jax.host import json_reader, metrics_files, run_folder
-from gasil_jax.sweeps.runs import Run, read_run
+from gasil_jax.sweeps.runs import Run, read_run, run_key
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
 
@@ -60,8 +60,12 @@ class Program:
     @functools.cached_property
     def name(self) -> str:
         """A hash of its runs, the name of its folder."""
-        text = " ".join(run.key for run in self.runs)
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return _name(run.key for run in self.runs)
+
+
+def _name(keys: Iterable[str]) -> str:
+    """Return the name of the program whose runs have these keys."""
+    return hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
 
 
 def group(
@@ -231,7 +235,10 @@ def _read(path: pathlib.Path, total_steps: int | None) -> ProgramFolder:
     try:
         experiments = listed["experiments"]
         every = [read_run(experiments[index], seed) for index, seed in listed["runs"]]
-        if not every or Program(tuple(every)).name != path.parent.name:
+        # An earlier version may have had fewer settings: the hash is of those listed.
+        texts = [json.dumps(experiment, sort_keys=True) for experiment in experiments]
+        keys = (run_key(texts[index], seed) for index, seed in listed["runs"])
+        if not every or _name(keys) != path.parent.name:
             raise ValueError("its runs are not those of its folder")
         labels = listed["labels"]
         if {len(values) for values in labels.values()} != {len(every)}:
