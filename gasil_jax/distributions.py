@@ -52,12 +52,15 @@ def _with_deviation(params: Any, deviation: jax.Array) -> Any:
 def _gaussian_sample(key: jax.Array, parameters: Any) -> jax.Array:
     mean, log_std = parameters
     noise = jax.random.normal(key, mean.shape, mean.dtype)
-    return mean + jnp.broadcast_to(jnp.exp(log_std), mean.shape) * noise
+    return mean + jax.lax.broadcast_to_rank(jnp.exp(log_std), mean.ndim) * noise
 
 
 def _gaussian_log_prob(parameters: Any, action: jax.Array) -> jax.Array:
-    mean, log_std = jnp.broadcast_arrays(*parameters)
-    z = (action - mean) * jnp.exp(-log_std)
+    mean, log_std = parameters
+    log_std, precision = (
+        jax.lax.broadcast_to_rank(x, mean.ndim) for x in (log_std, jnp.exp(-log_std))
+    )
+    z = (action - mean) * precision
     return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
 
 

@@ -44,6 +44,7 @@ class FitResult(NamedTuple):
     Attributes:
       states: the training states after the last iteration, (seeds, ...). They are NumPy
         arrays and random keys where the seeds can't be divided equally by the devices.
+        With points all arrays here have one more axis in front, (points, seeds, ...).
       metrics: every metric from the first iteration on, (seeds, iterations) each.
       evaluations: columns of evaluations.csv ("env_steps", and "mean", "min", "max" of
         the returns, and "length"), (seeds, evaluations) each; empty without any.
@@ -59,6 +60,7 @@ def fit(
     algorithm: Algorithm,
     *,
     seeds: int | Sequence[int] | np.ndarray | jax.Array = 1,
+    points: Sequence[Mapping[str, float]] | None = None,
     folder: str | os.PathLike[str] | None = None,
     resume: bool = False,
     checkpoint_every: int | None = None,
@@ -75,6 +77,9 @@ def fit(
       env: one environment.
       algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
+      points: numbers of hyperparameters by name: each point is trained with all seeds,
+        in the same program. What a callback gets is then (points x seeds, ...), in
+        order. A folder holds one point: ``python -m gasil_jax.sweep`` keeps several.
       folder: folder for the files of a run, created if it is missing; None keeps
         nothing. The commands take it like a run's. Only if the environment is not from
         `gasil_jax.make_env`, if the seeds do not follow one another, or if a schedule
@@ -102,7 +107,16 @@ def fit(
       ValueError: if a value is not allowed, or if the folder holds other files.
     """
     checks.check_environment(env)
-    members = make_members(env, algorithm, _numbers(seeds))
+    numbers = _numbers(seeds)
+    if points is not None:
+        _check_points(points, folder)
+    every = [{}] if points is None else points
+    members = make_members(
+        env,
+        algorithm,
+        [seed for _ in every for seed in numbers],
+        [point for point in every for _ in numbers],
+    )
     for name, value in (
         ("checkpoint_every", checkpoint_every),
         ("evaluate_every", evaluate_every),
@@ -154,7 +168,25 @@ def fit(
             )
         if outcome.unsaved is not None:
             raise outcome.unsaved
-        return FitResult(outcome.states, *tables)
+        result = FitResult(outcome.states, *tables)
+        if points is None:
+            return result
+        shape = (len(points), len(numbers))
+        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), result)
+
+
+def _check_points(points: Any, folder: Any) -> None:
+    """Raise `ValueError` if points are not mappings, or are to be kept in a folder."""
+    if folder is not None:
+        raise ValueError(
+            f"folder is {folder}: a folder holds one point, leave out points or folder "
+            "(python -m gasil_jax.sweep keeps several points)"
+        )
+    is_sequence = isinstance(points, list | tuple) and len(points) > 0
+    if not is_sequence or not all(isinstance(x, Mapping) for x in points):
+        raise refusal(
+            "points", points, "a list of at least one dict of numbers by name"
+        )
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:

@@ -235,7 +235,7 @@ def test_noise_that_is_no_number_is_refused(value):
 
 @pytest.mark.filterwarnings("error")
 def test_noise_of_every_type_of_number_is_compared_in_silence():
-    with pytest.raises(ValueError, match="obs_noise is .*inf"):
+    with pytest.raises(ValueError, match=r"obs_noise is .*inf"):
         gasil_envs.make("point_mass", obs_noise=np.float16("inf"))
     gasil_envs.make("point_mass", obs_noise=np.float16(0.5))
 

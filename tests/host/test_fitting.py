@@ -131,6 +131,25 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     )
 
 
+def test_points_are_trained_beside_each_other(env):
+    """Each as alone, to rounding, and the callback sees them all."""
+    algorithm, seen = PPO.replace(total_steps=4 * 128), []
+    points = [{"learning_rate": 1e-3}, {"learning_rate": 1e-2, "gamma": 0.9}]
+    callback = lambda progress: seen.append(progress.metrics["policy_loss"].shape[0])
+    result = gasil_jax.fit(env, algorithm, seeds=3, points=points, callback=callback)
+    assert set(seen) == {6}
+    alone = gasil_jax.fit(env, algorithm.replace(**points[1]), seeds=[2])
+    for name, values in alone.metrics.items():
+        together = result.metrics[name]
+        assert together.shape == (2, 3, 4)
+        np.testing.assert_allclose(together[1, 2], values[0], rtol=1e-3, atol=1e-4)
+    params = lambda states: jax.tree.leaves(states.actor_critic.policy.params)
+    for x, y in zip(params(result.states), params(alone.states), strict=True):
+        assert x.shape[:2] == (2, 3)
+        np.testing.assert_allclose(x[1, 2], y[0], rtol=1e-3, atol=1e-4)
+    assert not np.allclose(*result.metrics["policy_loss"], rtol=1e-3)
+
+
 def test_checkpoints_without_evaluations_are_no_reason_to_begin_anew(own, tmp_path):
     description, root = tmp_path / "fit.json", tmp_path / "checkpoints"
 
@@ -233,6 +252,9 @@ def test_what_no_run_can_describe_is_plotted(env, own, changes, why, tmp_path, c
         (BEGUN | {"evaluate_every": None}, "evaluate_every was 128, is None"),
         (BEGUN | {"evaluate_every": 256}, "evaluate_every was 128, is 256: only total"),
         (BEGUN | {"evaluate_episodes": 3}, "evaluate_episodes was 10, is 3: only tot"),
+        ({"points": []}, r"points is \[\]: it must be a list of at least one dict"),
+        ({"points": [{"alpha": 1.0}]}, "alpha is a setting of .*, not of ppo"),
+        ({"points": [{}], "folder": "new"}, "folder is new: a folder holds one point"),
         (BEGUN | {"seeds": 2}, r"seeds was \(0,\), is \(0, 1\): only total_steps"),
     ],
 )
