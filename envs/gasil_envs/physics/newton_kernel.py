@@ -10,8 +10,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax.experimental import pallas as pl
-from jax.experimental.pallas import triton
+
+# Pallas takes long to import, and only a GPU needs it: functions import it themselves.
 
 # Shape letters: V unknowns, padded in a kernel; B batch.
 
@@ -48,6 +48,8 @@ def eliminate(matrix: jax.Array, right: jax.Array, size: int) -> jax.Array:
 
 def _kernel(size: int, matrix: Any, right: Any, out: Any) -> None:
     """Solve one system; the padding lies outside the arrays."""
+    from jax.experimental.pallas import triton
+
     (padded,) = out.shape
     index = jax.lax.broadcasted_iota(jnp.int32, (padded,), 0)
     row_of = jax.lax.broadcasted_iota(jnp.int32, (padded, padded), 0)
@@ -68,6 +70,9 @@ def solve_linear(
       right: b.
       interpret: run the kernel as XLA's operations, on any device, to test it.
     """
+    from jax.experimental import pallas as pl
+    from jax.experimental.pallas import triton
+
     size, batch = right.shape
     padded = max(8, pl.next_power_of_2(size))
     of_vectors = pl.BlockSpec((None, padded), lambda b: (b, 0))
