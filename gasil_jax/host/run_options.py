@@ -297,9 +297,9 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
       InputError: if --resume is given without --out, if it is given without --env and
         the folder holds no run, or if the run's config.json is damaged.
     """
-    given = _first_arguments(arguments)
-    if not given.resume:
+    if "--resume" not in _words(arguments):
         return None
+    given = _first_arguments(arguments)
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
     if run_folder.has_run(given.out):
@@ -310,6 +310,11 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
             "give --env"
         )
     return None
+
+
+def _words(arguments: Sequence[str] | None) -> Sequence[str]:
+    """Return the words of a command line, by default of this process."""
+    return sys.argv[1:] if arguments is None else arguments
 
 
 def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -324,17 +329,12 @@ def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         return 1
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--resume", action="store_true")
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
     parser.add_argument("--agent", nargs="?", default=Options.agent)
     parser.add_argument("--env", nargs="?")
     parser.add_argument("--preset", nargs="?", default=presets.DEFAULT)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1)
-    words = sys.argv[1:] if arguments is None else arguments
-    # This parser would exit at a value of --resume.
-    given = parser.parse_known_args(
-        [word for word in words if not word.startswith("--resume=")]
-    )[0]
+    given = parser.parse_known_args(_words(arguments))[0]
     given.agent = given.agent or Options.agent
     given.preset = given.preset or presets.DEFAULT
     given.reward_delay = given.reward_delay or 1
