@@ -53,8 +53,7 @@ class Options(run_options.Options):
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
         from 1 on. Other processes train the others in the same folder, or in others
         that gasil_jax.merge unites. With --resume it continues.
-      launcher: train all shards: local, in one process after another, or ray, on a Ray
-        cluster. With --resume it continues them.
+      launcher: train all shards on a cluster: ray. With --resume it continues them.
       shards: number of shards that the launcher makes.
     """
 

@@ -1,14 +1,12 @@
-"""Launchers that run a sweep's shards: ``python -m gasil_jax.sweep --launcher ray``.
+"""Run a sweep's shards on a Ray cluster: ``python -m gasil_jax.sweep --launcher ray``.
 
-A launcher is a function that gets the arguments of each job, and runs each job in its
-own process. It runs a job again if its process dies; the job then continues from its
-checkpoint. It returns when all jobs are done. To add a launcher, add it to `LAUNCHERS`.
+To add a launcher, add a function like `run_on_ray` to `LAUNCHERS`. It gets the
+arguments of each job, runs each in a process of its own and, if that dies, again, so
+that the job continues from its checkpoint. It returns when all jobs are done.
 """
 
 import contextlib
 import importlib
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -25,11 +23,9 @@ Launcher = Callable[[str, Jobs, int | None], None]
 
 
 def check(name: str) -> None:
-    """Raise `InputError` for a launcher that is unknown or not installed."""
+    """Raise `InputError` for a launcher that is unknown."""
     if name not in LAUNCHERS:
         raise InputError(unknown("launcher", name, tuple(LAUNCHERS)))
-    if name == "ray":
-        _ray_package()
 
 
 def _raise_failures(failed: Mapping[str, str], num_jobs: int) -> None:
@@ -51,48 +47,6 @@ def _raise_failures(failed: Mapping[str, str], num_jobs: int) -> None:
             f"{jobs} failed; the others are done. Continue with the same command and "
             "--resume"
         )
-
-
-def run_locally(program: str, jobs: Jobs, devices: int | None) -> None:
-    """Run jobs on this machine one after another, each with all of its devices.
-
-    Args:
-      program: name of the module to start.
-      jobs: the arguments of each job, by the job's name in messages.
-      devices: ignored, because the arguments include it.
-
-    Raises:
-      ChildProcessError: if jobs have failed; the others are done.
-      InputError: if all jobs have failed because of bad input.
-      Interrupted: if a signal was received; it was passed on to the running job.
-    """
-    failed = {}
-    for name, arguments in jobs.items():
-        for _ in range(1 + RETRIES):
-            status = _run_process([sys.executable, "-m", program, *arguments])
-            if status in (0, _BAD_INPUT):
-                break
-        if status:
-            failed[name] = f"status {status}"
-    _raise_failures(failed, len(jobs))
-
-
-def _run_process(command: Sequence[str]) -> int:
-    """Run a command and return its exit status, negative if a signal killed it."""
-    with Interruption() as interruption:
-        # In its own session the child gets no Ctrl-C but the signal that is sent below.
-        child = subprocess.Popen(command, start_new_session=True)
-        while True:
-            with contextlib.suppress(subprocess.TimeoutExpired):
-                status = child.wait(_SECONDS_BETWEEN_POLLS)
-                break
-            if interruption.signal is not None:
-                child.send_signal(interruption.signal)
-                child.wait()
-                raise Interrupted(interruption.signal)
-    if interruption.signal is not None:
-        raise Interrupted(interruption.signal)
-    return status
 
 
 class _Unfinished(Exception):
@@ -149,8 +103,8 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
 
     Raises:
       ChildProcessError: if jobs have failed; the others are done.
-      InputError: if no node has that many CPUs, or if all jobs have failed because of
-        bad input.
+      InputError: if Ray is not installed, if no node has that many CPUs, or if all jobs
+        have failed because of bad input.
       Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     ray = _ray_package()
@@ -206,4 +160,4 @@ def _wait(ray: Any, references: list[Any]) -> None:
             raise Interrupted(interruption.signal)
 
 
-LAUNCHERS: Mapping[str, Launcher] = {"local": run_locally, "ray": run_on_ray}
+LAUNCHERS: Mapping[str, Launcher] = {"ray": run_on_ray}

@@ -4,7 +4,6 @@ import json
 import shutil
 import signal
 import sys
-import textwrap
 
 import numpy as np
 import pytest
@@ -457,15 +456,15 @@ def test_shards_need_no_file_of_points_once_one_has_begun(
 def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):
     launched = []
     monkeypatch.setitem(
-        launch.LAUNCHERS, "local", lambda program, jobs, devices: launched.append(jobs)
+        launch.LAUNCHERS, "ray", lambda program, jobs, devices: launched.append(jobs)
     )
     out = tmp_path / "out"
     train(out)
-    more = [*SMALL, "--grid", *GRID, "--launcher", "local", "--shards", "2"]
+    more = [*SMALL, "--grid", *GRID, "--launcher", "ray", "--shards", "2"]
     assert sweep.main([*more, "--out", str(out)]) == 2
     assert "the run in it with --resume" in capsys.readouterr().err
     assert not launched
-    resumed = ["--resume", "--launcher", "local", "--shards", "2", "--out", str(out)]
+    resumed = ["--resume", "--launcher", "ray", "--shards", "2", "--out", str(out)]
     for command in ([*more, "--resume", "--out", str(out)], resumed):
         assert sweep.main(command) == 0
         jobs = launched.pop()
@@ -480,55 +479,7 @@ def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch
     assert all("--resume" in arguments for arguments in launched[-1].values())
 
 
-@pytest.fixture
-def program(tmp_path, monkeypatch):
-    """A module that ends as its second argument says; its first one is a folder."""
-    (tmp_path / "job.py").write_text(
-        textwrap.dedent(
-            """
-            import os, pathlib, signal, sys, time
-            folder, what = pathlib.Path(sys.argv[1]), sys.argv[2]
-            tries = len(list(folder.iterdir()))
-            (folder / f"{what}-{tries}").touch()
-            if what == "killed" and tries < 2:
-                os.kill(os.getpid(), signal.SIGKILL)
-            if what == "waits":
-                signal.signal(signal.SIGTERM, lambda *_: (folder / "signalled").touch())
-                os.kill(os.getppid(), signal.SIGTERM)
-                signal.pause()
-            sys.exit(2 if what == "refused" else 0)
-            """
-        )
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    return "job"
-
-
-def test_a_launched_job_runs_again_after_its_process_died(program, tmp_path):
-    folders = {}
-    for name in ("killed", "refused", "fine"):
-        folders[name] = tmp_path / name
-        folders[name].mkdir()
-    jobs = {name: [str(folder), name] for name, folder in folders.items()}
-    with pytest.raises(ChildProcessError, match=r"^refused \(status 2\) failed"):
-        launch.run_locally(program, jobs, None)
-    ran = {name: len(list(folder.iterdir())) for name, folder in folders.items()}
-    assert ran == {"killed": 3, "refused": 1, "fine": 1}
-    # Nothing is left to continue.
-    with pytest.raises(InputError, match=r"^refused \(status 2\): bad input"):
-        launch.run_locally(program, {"refused": jobs["refused"]}, None)
-
-
-def test_a_signal_reaches_the_job_and_ends_the_launch(program, tmp_path):
-    folder = tmp_path / "waits"
-    folder.mkdir()
-    with pytest.raises(Interrupted) as interrupted:
-        launch.run_locally(program, {"waits": [str(folder), "waits"]}, None)
-    assert interrupted.value.signal == signal.SIGTERM
-    assert (folder / "signalled").exists()
-
-
 def test_a_launcher_that_is_not_installed_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(InputError, match=r"gasil_jax\[ray\]"):
-        launch.check("ray")
+        launch.run_on_ray("x", {}, None)

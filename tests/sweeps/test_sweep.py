@@ -189,11 +189,11 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
         ("--grid alpha=1 --shard 1/1", "shard needs --out"),
         ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
-        ("--grid alpha=1 --launcher loacl", "did you mean 'local'"),
-        ("--grid alpha=1 --launcher local --out x", "None: --launcher needs --shards"),
-        ("--grid alpha=1 --launcher local --shards 1", "launcher needs --out"),
-        ("--grid alpha=1 --launcher local --shards 2 --out x", "make 1 shards"),
-        ("--grid alpha=1 --launcher local --shards 999999999 --out x", "make 1 shards"),
+        ("--grid alpha=1 --launcher rya", "'rya' is unknown: it must be one of ray"),
+        ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
+        ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
+        ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
+        ("--grid alpha=1 --launcher ray --shards 999999999 --out x", "make 1 shards"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
