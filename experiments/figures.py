@@ -127,6 +127,11 @@ def _by_root(size: int) -> Point:
     }
 
 
+#: PPO on decomposed rewards, and with a network that stays untrained, near 0: then each
+#: step of a window has the same share of its payout.
+_NEVER_TRAINED = {"decomposition_updates": 1, "decomposition_learning_rate": 1e-12}
+_CONTROLS = [_SCALED, Arm("ppo (equal shares, scaled)", "ppo", _NEVER_TRAINED)]
+
 #: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
     "by the root": _by_root,
@@ -355,6 +360,19 @@ FIGURES: Mapping[str, Figure] = {
             ]
         ),
         favourite=_SCALED.name,
+    ),
+    "decomposition_controls": Figure(
+        "Delayed rewards: what learning which steps earned a reward is worth",
+        "",
+        grid(
+            ("hopper", "walker2d", "halfcheetah", "swimmer"),
+            _CONTROLS,
+            (DELAY, 1000),
+            panel="{env} delayed {delay}",
+            base="scaled",
+            seeds=20,
+        ),
+        favourite="ppo (decomposed, scaled)",
     ),
     "action_dimension": Figure(
         "Delayed rewards: settings that follow the dimension of an action",
