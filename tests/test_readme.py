@@ -51,6 +51,7 @@ NOT_RUN = {
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
+    "python -m gasil_jax.run --env my_tasks:Quadruped": "a test below trains it",
     "python -m gasil_jax.sweep --env my_tasks:Line": "a test below trains it",
 }
 
@@ -84,11 +85,11 @@ FIGURES = [
 def my_tasks(tmp_path_factory):
     """The agent and the task of the documents can be imported; return the test."""
     text = (DOCS / "extending.md").read_text()
-    agent, test, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    agent, test, task, robot = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     # Whatever its attributes are called, it is none of ours.
     names = "Line.model = Line.layout = Line.task = None"
     folder = tmp_path_factory.mktemp("my_tasks")
-    (folder / "my_tasks.py").write_text(f"{agent}\n{task}\n{names}\n")
+    (folder / "my_tasks.py").write_text(f"{agent}\n{task}\n{robot}\n{names}\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         yield test
@@ -374,6 +375,20 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     scaled = np.load(swept / "curves.npz")["scaled_reward"][:, 0, 0]
     # The first batch is that of the same policy.
     np.testing.assert_allclose(scaled[1] / scaled[0], 3.0, rtol=1e-5)
+
+
+def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
+    env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
+    out = tmp_path / "run"
+    assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
+    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
+    assert (metrics["faulty_steps"] == 0).all()
+    assert (
+        evaluate.main([str(out), "--episodes", "1", "--out", str(out / "a.csv")]) == 0
+    )
+    page = tmp_path / "walk.html"
+    assert render.main([str(out), "--steps", "2", "--out", str(page)]) == 0
+    assert page.stat().st_size > 1000
 
 
 def test_the_documented_test_of_an_agent_passes(my_tasks):

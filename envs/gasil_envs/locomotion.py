@@ -64,6 +64,8 @@ class Task:
       reward: (state before, state after, fields, action) -> reward (), added to the
         others.
       healthy: (state, fields) -> bool (), whether an episode goes on.
+      solver_iterations: number of Newton iterations of physics "mjx". 4 are enough for
+        most states of Gymnasium's tasks, 8 for all of robots with more contacts.
       start: random key -> qpos (nq,), qvel (nv,) of an episode's start; None for the
         model's own, with noise.
     """
@@ -90,6 +92,7 @@ class Task:
         Callable[[PhysicsState, PhysicsState, Fields, jax.Array], jax.Array] | None
     ) = None
     healthy: Callable[[PhysicsState, Fields], jax.Array] | None = None
+    solver_iterations: int = 8
     start: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
 
 
@@ -127,6 +130,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="Hopper-v5",
             xml=ASSETS / "hopper.xml",
             frame_skip=4,
+            solver_iterations=4,
             healthy_reward=1.0,
             healthy_z=(0.7, float("inf")),
             healthy_angle=(-0.2, 0.2),
@@ -137,6 +141,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="Walker2d-v5",
             xml=ASSETS / "walker2d_v5.xml",
             frame_skip=4,
+            solver_iterations=4,
             healthy_reward=1.0,
             healthy_z=(0.8, 2.0),
             healthy_angle=(-1.0, 1.0),
@@ -146,6 +151,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="HalfCheetah-v5",
             xml=ASSETS / "half_cheetah.xml",
             frame_skip=5,
+            solver_iterations=4,
             control_cost=0.1,
             reset_noise=0.1,
             normal_velocity_noise=True,
@@ -154,6 +160,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="Swimmer-v5",
             xml=ASSETS / "swimmer.xml",
             frame_skip=4,
+            solver_iterations=4,
             control_cost=1e-4,
             reset_noise=0.1,
             hidden_positions=2,
@@ -162,6 +169,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="Ant-v5",
             xml=ASSETS / "ant.xml",
             frame_skip=5,
+            solver_iterations=4,
             control_cost=0.5,
             healthy_reward=1.0,
             healthy_z=(0.2, 1.0),
@@ -178,6 +186,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="Humanoid-v5",
             xml=ASSETS / "humanoid.xml",
             frame_skip=5,
+            solver_iterations=4,
             forward_reward=1.25,
             control_cost=0.1,
             healthy_reward=5.0,
@@ -201,14 +210,14 @@ class LocomotionState(struct.PyTreeNode):
     position: jax.Array
 
 
-#: Physics engines by name: (model, fields, solver) -> `Physics`.
-PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], str], Physics]] = (
-    types.MappingProxyType(
-        {
-            "mjx": MjxPhysics,
-            "mujoco": lambda model, fields, solver: MujocoPhysics(model, fields),
-        }
-    )
+#: Physics engines by name: (model, fields, solver, iterations) -> `Physics`.
+PHYSICS: Mapping[
+    str, Callable[[mujoco.MjModel, tuple[str, ...], str, int], Physics]
+] = types.MappingProxyType(
+    {
+        "mjx": MjxPhysics,
+        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+    }
 )
 
 #: Integrators by name; "model" is the integrator that the model specifies.
@@ -233,12 +242,15 @@ def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
 
 def _check(task: Task, model: mujoco.MjModel) -> None:
     """Raise `ValueError` if a task and its model do not fit each other, or us."""
+    if not model.nu:
+        raise ValueError("the model has no actuators: it must have one or more")
     entries = range(model.nq)
     indexed = f"an index of qpos, which has {model.nq} entries"
     skip = task.frame_skip
     low, high = model.actuator_ctrlrange.T
     for field, allowed, holds in (
         ("frame_skip", "1 or more", isinstance(skip, int) and skip > 0),
+        ("solver_iterations", "1 or more", task.solver_iterations > 0),
         ("hidden_positions", indexed, task.hidden_positions in entries),
         ("z_index", indexed, task.z_index in entries or task.healthy_z == _EVERYTHING),
         (
@@ -252,8 +264,6 @@ def _check(task: Task, model: mujoco.MjModel) -> None:
             raise ValueError(
                 f"{field} is {getattr(task, field)!r}: it must be {allowed}"
             )
-    if not model.nu:
-        raise ValueError("the model has no actuators: it must have one or more")
     if not (low < high).all():
         name = model.actuator(int(np.argmin(low < high))).name
         raise ValueError(
@@ -314,7 +324,9 @@ class Locomotion(Env):
         if INTEGRATORS[integrator] is not None:
             self.model.opt.integrator = INTEGRATORS[integrator]
         self._physics_name = physics
-        self.physics = PHYSICS[physics](self.model, task.fields, solver)
+        self.physics = PHYSICS[physics](
+            self.model, task.fields, solver, task.solver_iterations
+        )
         self.dt = self.model.opt.timestep * task.frame_skip
         # A NumPy array becomes a constant of the traced functions.
         self._start = np.asarray(self.model.qpos0, np.float32)
