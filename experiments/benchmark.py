@@ -7,6 +7,8 @@
   environments and, if it is installed (the extra "benchmark"), Stable-Baselines3's PPO
   on Gymnasium's task: a run in one process, a run whose environments have processes of
   their own, and a run on every core.
+- "peers": PPO of this package, rejax and purejaxrl, with the same sizes on the same
+  environments, 1 and 10 seeds at once (see `peers`; a line says what to install).
 - "scaling": training on 1, 2, 4 ... devices, with as many seeds on each device. A
   perfect ratio is the number of devices.
 
@@ -29,6 +31,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
+from experiments import peers
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
@@ -52,8 +55,8 @@ class Options:
     """Measure the speed and fidelity of physics and training.
 
     Attributes:
-      tables: tables to print: physics, training, scaling.
-      envs: names of the tasks.
+      tables: tables to print: physics, training, scaling, peers.
+      envs: names of the tasks; the table peers has its own.
       variants: ways of building a task; default all in the physics table, and ours and
         mujoco in the training table.
       num_envs: numbers of environments in the physics table.
@@ -61,7 +64,7 @@ class Options:
       devices: number of CPU devices; default one per core.
       seeds: number of seeds to train; in the scaling table on each device.
       training_envs: number of environments per seed; default the paper preset's.
-      iterations: training iterations in a repeat.
+      iterations: training iterations in a repeat; in the table peers, of each training.
     """
 
     tables: tuple[str, ...] = ("physics", "training")
@@ -354,13 +357,26 @@ def scaling_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     yield rows
 
 
+def peers_table(env_name: str, options: Options) -> Iterator[list[Row]]:
+    """The rows of each number of seeds."""
+    for seeds in (1, 10):
+        rows = []
+        for name, train, seconds, steps in peers.programs(
+            env_name, seeds, options.iterations
+        ):
+            name = f"{name}, {seeds} seed{'s' * (seeds > 1)}"
+            run = functools.partial(_speed, train, steps)
+            rows.append(Row(env_name, name, 32 * seeds, run, seconds))
+        yield rows
+
+
 def measure(rows: Sequence[Row], repeats: int) -> None:
     """Time the rows of a task in turn and print them."""
     speeds = np.median([[row.run() for row in rows] for _ in range(repeats)], axis=0)
     for row, speed in zip(rows, speeds, strict=True):
         error = "" if row.error is None else f"{row.error:17.1e}"
         print(
-            f"{row.env:11} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
+            f"{row.env:16} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
             f"{speed / speeds[0]:6.2f} {row.compile_seconds:9.1f}{error}",
             flush=True,
         )
@@ -370,6 +386,7 @@ TABLES = {
     "physics": physics_table,
     "training": training_table,
     "scaling": scaling_table,
+    "peers": peers_table,
 }
 
 
@@ -385,6 +402,8 @@ def run(options: Options) -> None:
     command_line.check_minimum(
         options, repeats=1, seeds=1, iterations=1, devices=1, training_envs=1
     )
+    if "peers" in options.tables:
+        peers.check()
     count = options.devices or available_cores()
     prepare(Settings(physics="mujoco"), count)
     jax.config.update("jax_num_cpu_devices", count)
@@ -393,7 +412,7 @@ def run(options: Options) -> None:
     print(f"{len(devices)} x {devices[0].device_kind}, {available_cores()} cores")
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     for table in options.tables:
-        print(f"{table:49}  envs     steps/s  ratio compile s  error of a step")
-        for env_name in options.envs:
+        print(f"{table:54}  envs     steps/s  ratio compile s  error of a step")
+        for env_name in peers.ENVS if table == "peers" else options.envs:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)

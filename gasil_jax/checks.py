@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 
 from gasil_envs import own_code, own_environment
-from gasil_jax import algorithms
+from gasil_jax import algorithms, networks
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.context import sizes_of
+from gasil_jax.context import Sizes, sizes_of
 from gasil_jax.errors import refusal, shown
 
 
@@ -34,8 +34,49 @@ def check(env: Any, algorithm: Algorithm) -> None:
     _check_interface(env)
     algorithms.check(algorithm)
     agent, num_envs = algorithm.agent, algorithm.config.num_envs
+    sizes = sizes_of(env, num_envs)
     with own_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
-        agent.check(sizes_of(env, num_envs))
+        agent.check(sizes)
+    _check_networks(agent, sizes)
+
+
+def _check_networks(agent: Any, sizes: Sizes) -> None:
+    """Raise `ValueError` if a network of the user's own returns a wrong shape.
+
+    Only these are traced.
+    """
+    observation, action = (
+        jnp.zeros((2, sizes.observation)),
+        jnp.zeros((2, sizes.action)),
+    )
+    for function, arguments, inputs, shape in (
+        ("policy_network", (sizes,), (observation,), (2, sizes.action)),
+        ("value_network", (sizes,), (observation,), (2,)),
+        ("discriminator_network", (), (observation, action), (2,)),
+    ):
+        what = f"{function} of agent {agent.name!r}"
+        with own_code.refused(f"{what} fails"):
+            network = getattr(agent, function, lambda *_: None)(*arguments)
+        if network is None or type(network).__module__ == networks.__name__:
+            continue
+        with own_code.refused(f"{what} can't be traced"):
+            output, variables = jax.eval_shape(
+                lambda network=network, inputs=inputs: network.init_with_output(
+                    jax.random.key(0), *inputs
+                )
+            )
+        expected = f"float32{list(shape)}"
+        given = " and ".join(
+            f"{x.dtype}{list(x.shape)}" for x in jax.tree.leaves(output)
+        )
+        if given != expected:
+            raise ValueError(
+                f"{what} returns {given} for 2 steps: it must be {expected}"
+            )
+        if set(variables) != {"params"}:
+            raise ValueError(
+                f"{what} has {', '.join(sorted(variables))}: it must have params alone"
+            )
 
 
 def _check_interface(env: Any) -> None:

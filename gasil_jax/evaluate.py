@@ -135,8 +135,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options.run, options.checkpoint, options.point, seed=options.seed
     )
     env, seeds = policies.env, policies.seeds
-    if options.gymnasium and not environments.is_locomotion(env):
-        raise InputError("gymnasium is on: the run must be of a locomotion task")
+    if options.gymnasium and not (
+        environments.is_locomotion(env) and env.unwrapped.task.gymnasium_id
+    ):
+        raise InputError(
+            "gymnasium is on: the run must be of a locomotion task of Gymnasium"
+        )
     if options.gymnasium and options.stochastic:
         raise InputError("gymnasium is on: stochastic must be off")
     if not options.gymnasium:

@@ -9,10 +9,17 @@ from flax import struct
 
 
 class Learner(struct.PyTreeNode):
-    """A network's parameters and its optimizer's state, one pytree."""
+    """A network's parameters and its optimizer's state, one pytree.
+
+    Attributes:
+      params: the parameters.
+      optimizer_state: the optimizer's state.
+      network: the Flax module, if it is none of the package's.
+    """
 
     params: Any
     optimizer_state: Any
+    network: Any = struct.field(pytree_node=False, default=None)
 
 
 def init(params: Any, transform: optax.GradientTransformation) -> Learner:
@@ -45,7 +52,7 @@ def descend(
     """
     updates, optimizer_state = transform.update(gradient, learner.optimizer_state)
     params = jax.tree.map(lambda p, u: p - step_size * u, learner.params, updates)
-    return Learner(params, optimizer_state)
+    return learner.replace(params=params, optimizer_state=optimizer_state)
 
 
 def select(condition: jax.Array, new: Any, old: Any) -> Any:

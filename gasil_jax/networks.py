@@ -69,7 +69,7 @@ class MLP(nn.Module):
 
 
 class _Policy(nn.Module):
-    """The layers of a policy; the last one starts at scale 0.01.
+    """The layers of a policy, or a module in their place; the last starts at 0.01.
 
     So the initial policy is nearly the same in every state (OpenAI baselines, ppo1).
     """
@@ -78,9 +78,12 @@ class _Policy(nn.Module):
     action_size: int
     activation: str = "tanh"
     layer_norm: bool = False
+    own: nn.Module | None = None
 
     def layers(self, observation: jax.Array) -> jax.Array:
         """(..., obs) -> (..., action)."""
+        if self.own is not None:
+            return self.own(observation)
         return MLP(
             self.hidden_sizes,
             self.action_size,

@@ -37,6 +37,7 @@ CLIP = 10.0
 
 _PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
 #: The arrays that are the same for all seeds of a file.
+OWN_NETWORK = "the policy's network is a Flax module of your own, which needs JAX"
 SHARED = ("low", "high", "num_actions", "activation_relu", "activation_swish")
 
 
@@ -173,6 +174,15 @@ def is_discrete(weights: Mapping[str, Any]) -> bool:
     return "num_actions" in weights
 
 
+def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
+    """Return normalized observations, (..., obs), as `output` describes."""
+    size = weights["mean"].shape[-1]
+    if (shape := np.shape(observation))[-1:] != (size,):
+        raise ValueError(f"observation has shape {shape}: it must be (..., {size})")
+    x = (observation - weights["mean"]) / weights["scale"]
+    return xp.clip(x, -CLIP, CLIP)
+
+
 def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
     """Return the mean of the policy's actions, or their logits, (..., action).
 
@@ -182,13 +192,12 @@ def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
       xp: the array module, numpy or jax.numpy.
 
     Raises:
-      ValueError: if the observation has another size than the policy's.
+      ValueError: if the observation has another size than the policy's, or if the
+        policy's network is none of the package's.
     """
-    size = weights["mean"].shape[-1]
-    if (shape := np.shape(observation))[-1:] != (size,):
-        raise ValueError(f"observation has shape {shape}: it must be (..., {size})")
-    x = (observation - weights["mean"]) / weights["scale"]
-    x = xp.clip(x, -CLIP, CLIP)
+    if "network" in weights:
+        raise ValueError(OWN_NETWORK)
+    x = inputs(weights, observation, xp)
     last = sum(name.startswith("kernel_") for name in weights) - 1
     for i in range(last + 1):
         x = x @ weights[f"kernel_{i}"] + weights[f"bias_{i}"]

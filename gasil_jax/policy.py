@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import struct
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
@@ -15,15 +16,21 @@ from gasil_jax.distributions import CATEGORICAL, GAUSSIAN
 from gasil_jax.networks import POLICY_LAYERS
 
 
+class Network(struct.PyTreeNode):
+    """A policy's network that is none of the package's, in place of its arrays."""
+
+    params: Any
+    module: Any = struct.field(pytree_node=False)
+
+
 def weights(state: Any, env: Any) -> dict[str, Any]:
     """Return a `TrainState`'s policy as the arrays that `numpy_policy` describes.
 
     From a batch of states every array but those in `numpy_policy.SHARED` is
     (seeds, ...).
     """
-    params = state.actor_critic.policy.params["params"]
-    (activation,) = (x for x, name in POLICY_LAYERS.items() if name in params)
-    layers = params[POLICY_LAYERS[activation]]
+    learner = state.actor_critic.policy
+    params = learner.params["params"]
     mean, scale = normalization.moments(state.normalizer)
     arrays: dict[str, Any] = {"mean": mean, "scale": scale}
     if wrappers.is_discrete(env):
@@ -35,6 +42,10 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
             return np.broadcast_to(np.asarray(x, np.float32), (env.action_size,))
 
         arrays |= {"log_std": params["log_std"], "low": wide(low), "high": wide(high)}
+    if learner.network is not None:
+        return arrays | {"network": Network(learner.params, learner.network)}
+    (activation,) = (x for x, name in POLICY_LAYERS.items() if name in params)
+    layers = params[POLICY_LAYERS[activation]]
     if activation != "tanh":
         arrays[f"activation_{activation}"] = np.int32(1)
     for name, own in layers.items():
@@ -85,6 +96,7 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
         return jnp.asarray(x, jnp.float32)
 
     arrays = jax.tree.map(float32, dict(weights))
+    network = arrays.pop("network", None)
     discrete = numpy_policy.is_discrete(arrays)
     distribution = CATEGORICAL if discrete else GAUSSIAN
 
@@ -92,9 +104,13 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
         # The functions for NumPy broadcast as NumPy does.
         with jax.numpy_rank_promotion("allow"):
-            parameters = numpy_policy.output(arrays, float32(observation), jnp)
-        if not discrete:
-            parameters = parameters, arrays["log_std"]
+            if network is not None:
+                inputs = numpy_policy.inputs(arrays, float32(observation), jnp)
+                parameters = network.module.apply(network.params, inputs)
+            else:
+                parameters = numpy_policy.output(arrays, float32(observation), jnp)
+                if not discrete:
+                    parameters = parameters, arrays["log_std"]
         if key is None:
             action = distribution.mode(parameters)
         else:

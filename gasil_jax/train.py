@@ -24,7 +24,6 @@ from gasil_jax import (
     schedules,
 )
 from gasil_jax.algorithms import Algorithm, check_numbers
-from gasil_jax.config import Config
 from gasil_jax.context import Context, Metrics, sizes_of
 from gasil_jax.distributions import Distribution
 from gasil_jax.imitation.interface import Checked
@@ -177,13 +176,16 @@ def _init_history(env: Any, algorithm: Algorithm) -> good_trajectories.History |
     )
 
 
-def _networks(env: Any, config: Config) -> tuple[Any, Any, Distribution]:
+def _networks(env: Any, algorithm: Algorithm) -> tuple[Any, Any, Distribution]:
     """Return the policy's network, the value's, and the distribution of actions."""
     # Typed as Any because Flax declares that `apply` may also return variables.
-    sizes, distribution = config.hidden_sizes, distributions.of(env)
+    agent, config = algorithm.agent, algorithm.config
+    widths, distribution = config.hidden_sizes, distributions.of(env)
     layers = (config.activation, config.layer_norm)
-    policy = distribution.network(sizes, wrappers.action_size(env), *layers)
-    return policy, Value(sizes, *layers), distribution
+    sizes = sizes_of(env, config.num_envs)
+    own_policy, own_value = agent.policy_network(sizes), agent.value_network(sizes)
+    policy = distribution.network(widths, sizes.action, *layers, own=own_policy)
+    return policy, own_value or Value(widths, *layers), distribution
 
 
 def _init_actor_critic(
@@ -194,13 +196,14 @@ def _init_actor_critic(
     policy_key: jax.Array,
     value_key: jax.Array,
 ) -> ActorCritic:
-    policy, value, distribution = _networks(env, algorithm.config)
+    policy, value, distribution = _networks(env, algorithm)
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(algorithm.config)
     policy_params = policy.init(policy_key, observation)
     policy_params = distribution.explore(policy_params, initial_deviation)
+    trained = learner.init(policy_params, transform)
     return ActorCritic(
-        policy=learner.init(policy_params, transform),
+        policy=trained if policy.own is None else trained.replace(network=policy),
         values=tuple(
             learner.init(value.init(key, observation), transform)
             for key in _keys(value_key, algorithm.agent.num_streams)
@@ -311,9 +314,9 @@ def collect(
       data: the agent's data.
     """
     config = algorithm.config
-    environments, batch = sample_trajectories(env, config, state, key=keys.act)
+    environments, batch = sample_trajectories(env, algorithm, state, key=keys.act)
     history = None if state.history is None else _record(state.history, batch)
-    policy, value, distribution = _networks(env, config)
+    policy, value, distribution = _networks(env, algorithm)
     context = Context(
         rollout=batch,
         history=history,
@@ -409,20 +412,21 @@ def learn(
 
 @jax.named_scope("rollout")
 def sample_trajectories(
-    env: Any, config: Config, state: TrainState, *, key: jax.Array
+    env: Any, algorithm: Algorithm, state: TrainState, *, key: jax.Array
 ) -> tuple[rollout.EnvironmentStates, Rollout]:
     """Collect one batch of experience with the current policy.
 
     Args:
       env: one environment.
-      config: sizes of the batch, and the discount in this iteration.
+      algorithm: with its numbers in this iteration.
       state: with the policy and the running episodes.
       key: random key; consumed.
 
     Returns:
       The running episodes after the batch, and the batch, (time, env, ...).
     """
-    policy, _, distribution = _networks(env, config)
+    config = algorithm.config
+    policy, _, distribution = _networks(env, algorithm)
     return rollout.collect(
         env,
         lambda observation: policy.apply(

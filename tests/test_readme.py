@@ -16,7 +16,7 @@ import gasil_jax
 from gasil_jax import evaluate, merge, plot, render, run, sweep
 from gasil_jax import export_minari as export
 from gasil_jax.host import command_line, metrics_files, policy_file, run_options
-from gasil_jax.sweeps import shards
+from gasil_jax.sweeps import saved_states, shards
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
@@ -51,6 +51,9 @@ NOT_RUN = {
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
+    "python -m gasil_jax.run --env gymnax:Breakout-MinAtar --agent my_tasks": "a test "
+    "below trains it",
+    "python -m gasil_jax.run --env my_tasks:Quadruped": "a test below trains it",
     "python -m gasil_jax.sweep --env my_tasks:Line": "a test below trains it",
 }
 
@@ -84,11 +87,13 @@ FIGURES = [
 def my_tasks(tmp_path_factory):
     """The agent and the task of the documents can be imported; return the test."""
     text = (DOCS / "extending.md").read_text()
-    agent, test, task = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
+    agent, test, network, task, robot = re.findall(
+        r"```python\n(.*?)```", text, re.DOTALL
+    )
     # Whatever its attributes are called, it is none of ours.
     names = "Line.model = Line.layout = Line.task = None"
     folder = tmp_path_factory.mktemp("my_tasks")
-    (folder / "my_tasks.py").write_text(f"{agent}\n{task}\n{names}\n")
+    (folder / "my_tasks.py").write_text("\n".join((agent, network, task, robot, names)))
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(folder)
         yield test
@@ -374,6 +379,39 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     scaled = np.load(swept / "curves.npz")["scaled_reward"][:, 0, 0]
     # The first batch is that of the same policy.
     np.testing.assert_allclose(scaled[1] / scaled[0], 3.0, rtol=1e-5)
+
+
+def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
+    env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
+    out = tmp_path / "run"
+    assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
+    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
+    assert (metrics["faulty_steps"] == 0).all()
+    assert (
+        evaluate.main([str(out), "--episodes", "1", "--out", str(out / "a.csv")]) == 0
+    )
+    page = tmp_path / "walk.html"
+    assert render.main([str(out), "--steps", "2", "--out", str(page)]) == 0
+    assert page.stat().st_size > 1000
+
+
+def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
+    pytest.importorskip("gymnax")
+    run_of_it = ["--env", "gymnax:Breakout-MinAtar", "--agent", "my_tasks:Planes"]
+    out = tmp_path / "run"
+    arguments = [*run_of_it, *SMALL[:-2], "--seeds", "2", "--out", str(out)]
+    assert run.main(arguments) == 0
+    assert "policy.npz is not written: the policy's network is a F" in (
+        capsys.readouterr().err
+    )
+    *_, states = saved_states.load(out)
+    params = states.actor_critic.policy.params
+    assert params["params"]["own"]["Conv_0"]["kernel"].shape == (2, 3, 3, 4, 16)
+    assert evaluate.main([str(out), "--episodes", "2"]) == 0
+    more = ["--resume", "--out", str(out), "--total-steps", "512"]
+    assert run.main(more) == 0
+    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 2)
+    assert metrics["value_loss"].shape[-1] == 4
 
 
 def test_the_documented_test_of_an_agent_passes(my_tasks):

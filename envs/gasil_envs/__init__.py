@@ -2,7 +2,8 @@
 
 ``make("walker2d", reward_delay=20)`` returns an environment whose ``reset`` and
 ``step`` are pure functions for ``jax.jit`` and ``jax.vmap``; ``names()`` lists all
-environments. Nothing here imports ``gasil_jax``.
+environments. ``Locomotion(Task(...))`` is a robot of your own. Nothing here imports
+``gasil_jax``.
 """
 
 import contextlib
@@ -12,6 +13,7 @@ import io
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
 
+from gasil_envs.locomotion import Locomotion, Task
 from gasil_envs.registry import make, names
 
-__all__ = ["make", "names"]
+__all__ = ["Locomotion", "Task", "make", "names"]

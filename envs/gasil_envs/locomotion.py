@@ -1,8 +1,8 @@
-"""Gymnasium's MuJoCo locomotion tasks (version 5) as Brax environments.
+"""Robots of MuJoCo as Brax environments, among them Gymnasium's locomotion tasks.
 
-There is one class, `Locomotion`, and a row in `TASKS` for each task. The models are
-Gymnasium's XML files; observation, reward, termination, start and frame skip are those
-of ``gymnasium.envs.mujoco.*_v5``.
+There is one class, `Locomotion`, for any `Task`, and a row in `TASKS` for each task of
+Gymnasium (version 5). The models of these are Gymnasium's XML files; observation,
+reward, termination, start and frame skip are those of ``gymnasium.envs.mujoco.*_v5``.
 """
 
 import dataclasses
@@ -19,8 +19,10 @@ import numpy as np
 from brax.envs import Env, State
 from flax import struct
 
+from gasil_envs.physics import batching
+from gasil_envs.physics.dynamics import FIELDS
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
-from gasil_envs.physics.mjx import MjxPhysics
+from gasil_envs.physics.mjx import SOLVERS, MjxPhysics
 from gasil_envs.physics.native import MujocoPhysics
 
 # MuJoCo would also write each of its warnings to MUJOCO_LOG.TXT in the user's folder.
@@ -34,12 +36,14 @@ _EVERYTHING: Range = (-float("inf"), float("inf"))
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """The definition of one locomotion task.
+    """The definition of one locomotion task, or of another task of a robot.
+
+    Rewards are summed: ``forward_reward=0.0`` leaves out that of walking.
 
     Attributes:
-      gymnasium_id: name of the task in Gymnasium.
-      xml: name of the model's file in Gymnasium's MuJoCo assets.
+      xml: path of the model's file, or the model itself, in MuJoCo's XML.
       frame_skip: number of physics steps in an environment step.
+      gymnasium_id: name of the same task in Gymnasium, or None.
       forward_reward: weight of the forward velocity, 1 / (m/s).
       control_cost: weight of the squared norm of the action.
       healthy_reward: reward of each step that ends in a healthy state.
@@ -52,16 +56,24 @@ class Task:
       normal_velocity_noise: whether the initial velocity's noise is normal.
       hidden_positions: number of leading entries of qpos that are not observed.
       max_velocity: largest absolute value of an observed velocity.
-      fields: names of the arrays of ``mjData`` that the next three functions use.
+      fields: names of the arrays of ``mjData`` that the next functions use, of
+        `physics.dynamics.FIELDS`.
       position: (model, fields) -> planar position (2,), whose change is the forward
         velocity; None for qpos[0:2].
       observe_more: fields -> the rest of the observation.
       contact_cost: contact forces, ``cfrc_ext`` (nbody, 6) -> cost.
+      reward: (state before, state after, fields, action) -> reward (), added to the
+        others.
+      healthy: (state, fields) -> bool (), whether an episode goes on.
+      solver_iterations: number of Newton iterations of physics "mjx". 4 are enough for
+        most states of Gymnasium's tasks, 8 for all of robots with more contacts.
+      start: random key -> qpos (nq,), qvel (nv,) of an episode's start; None for the
+        model's own, with noise.
     """
 
-    gymnasium_id: str
-    xml: str
+    xml: str | pathlib.Path
     frame_skip: int
+    gymnasium_id: str | None = None
     forward_reward: float = 1.0
     control_cost: float = 1e-3
     healthy_reward: float = 0.0
@@ -77,6 +89,16 @@ class Task:
     position: Callable[[mujoco.MjModel, Fields], jax.Array] | None = None
     observe_more: Callable[[Fields], jax.Array] | None = None
     contact_cost: Callable[[jax.Array], jax.Array] | None = None
+    reward: (
+        Callable[[PhysicsState, PhysicsState, Fields, jax.Array], jax.Array] | None
+    ) = None
+    healthy: Callable[[PhysicsState, Fields], jax.Array] | None = None
+    solver_iterations: int = 8
+    start: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
+
+
+#: The folder of Gymnasium's models.
+ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 
 
 def _torso_position(model: mujoco.MjModel, fields: Fields) -> jax.Array:
@@ -107,8 +129,9 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
     {
         "hopper": Task(
             gymnasium_id="Hopper-v5",
-            xml="hopper.xml",
+            xml=ASSETS / "hopper.xml",
             frame_skip=4,
+            solver_iterations=4,
             healthy_reward=1.0,
             healthy_z=(0.7, float("inf")),
             healthy_angle=(-0.2, 0.2),
@@ -117,8 +140,9 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
         ),
         "walker2d": Task(
             gymnasium_id="Walker2d-v5",
-            xml="walker2d_v5.xml",
+            xml=ASSETS / "walker2d_v5.xml",
             frame_skip=4,
+            solver_iterations=4,
             healthy_reward=1.0,
             healthy_z=(0.8, 2.0),
             healthy_angle=(-1.0, 1.0),
@@ -126,24 +150,27 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
         ),
         "halfcheetah": Task(
             gymnasium_id="HalfCheetah-v5",
-            xml="half_cheetah.xml",
+            xml=ASSETS / "half_cheetah.xml",
             frame_skip=5,
+            solver_iterations=4,
             control_cost=0.1,
             reset_noise=0.1,
             normal_velocity_noise=True,
         ),
         "swimmer": Task(
             gymnasium_id="Swimmer-v5",
-            xml="swimmer.xml",
+            xml=ASSETS / "swimmer.xml",
             frame_skip=4,
+            solver_iterations=4,
             control_cost=1e-4,
             reset_noise=0.1,
             hidden_positions=2,
         ),
         "ant": Task(
             gymnasium_id="Ant-v5",
-            xml="ant.xml",
+            xml=ASSETS / "ant.xml",
             frame_skip=5,
+            solver_iterations=4,
             control_cost=0.5,
             healthy_reward=1.0,
             healthy_z=(0.2, 1.0),
@@ -158,8 +185,9 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
         ),
         "humanoid": Task(
             gymnasium_id="Humanoid-v5",
-            xml="humanoid.xml",
+            xml=ASSETS / "humanoid.xml",
             frame_skip=5,
+            solver_iterations=4,
             forward_reward=1.25,
             control_cost=0.1,
             healthy_reward=5.0,
@@ -183,14 +211,14 @@ class LocomotionState(struct.PyTreeNode):
     position: jax.Array
 
 
-#: Physics engines by name: (model, fields, solver) -> `Physics`.
-PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], str], Physics]] = (
-    types.MappingProxyType(
-        {
-            "mjx": MjxPhysics,
-            "mujoco": lambda model, fields, solver: MujocoPhysics(model, fields),
-        }
-    )
+#: Physics engines by name: (model, fields, solver, iterations) -> `Physics`.
+PHYSICS: Mapping[
+    str, Callable[[mujoco.MjModel, tuple[str, ...], str, int], Physics]
+] = types.MappingProxyType(
+    {
+        "mjx": MjxPhysics,
+        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+    }
 )
 
 #: Integrators by name; "model" is the integrator that the model specifies.
@@ -199,37 +227,107 @@ INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
 )
 
 
+def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
+    """Return the model of a file or text; raise `ValueError`, in one line, if none is.
+
+    What MuJoCo says of a fault has several lines.
+    """
+    is_text = str(xml).lstrip().startswith("<")
+    load = mujoco.MjModel.from_xml_string if is_text else mujoco.MjModel.from_xml_path
+    try:
+        return load(str(xml))
+    except ValueError as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"xml is no model of MuJoCo: {why}") from None
+
+
+def _check(task: Task, model: mujoco.MjModel) -> None:
+    """Raise `ValueError` if a task and its model do not fit each other, or us."""
+    if not model.nu:
+        raise ValueError("the model has no actuators: it must have one or more")
+    entries = range(model.nq)
+    indexed = f"an index of qpos, which has {model.nq} entries"
+    skip = task.frame_skip
+    low, high = model.actuator_ctrlrange.T
+    for field, allowed, holds in (
+        ("frame_skip", "1 or more", isinstance(skip, int) and skip > 0),
+        ("solver_iterations", "1 or more", task.solver_iterations > 0),
+        ("hidden_positions", indexed, task.hidden_positions in entries),
+        ("z_index", indexed, task.z_index in entries or task.healthy_z == _EVERYTHING),
+        (
+            "healthy_angle",
+            f"{_EVERYTHING}, as the model has no qpos[2]",
+            model.nq > 2 or task.healthy_angle == _EVERYTHING,
+        ),
+        ("fields", f"a tuple of {', '.join(FIELDS)}", set(task.fields) <= {*FIELDS}),
+    ):
+        if not holds:
+            raise ValueError(
+                f"{field} is {getattr(task, field)!r}: it must be {allowed}"
+            )
+    if not (low < high).all():
+        name = model.actuator(int(np.argmin(low < high))).name
+        raise ValueError(
+            f"actuator {name!r} of the model has no ctrlrange: it must have one, which "
+            "is the range of its actions"
+        )
+    # They would be lost between two steps.
+    for size, what in (("na", "activations"), ("nhistory", "delays")):
+        if getattr(model, size):
+            raise ValueError(
+                f"the model has actuators with {what}: its state must be positions and "
+                "velocities"
+            )
+
+
 class Locomotion(Env):
-    """One of the locomotion tasks in `TASKS`.
+    """A robot in one of the tasks in `TASKS`, or in a `Task` of your own.
 
     Actions are in the units of the model's actuators, as in Gymnasium. Physics limits
     them to `action_range`; the control cost is of the actions before this limit.
 
     Args:
-      name: name of the task.
+      task: the task, or the name of one in `TASKS`.
       physics: "mjx", in pure JAX, or "mujoco", in C on the host's cores.
       solver: solver of MJX's constraints, see `MjxPhysics`.
       integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
+
+    Raises:
+      ValueError: if the model can't be loaded or does not fit the task, if the physics
+        lacks a part of it, or if a name is unknown.
     """
 
     episode_length = 1000
 
     def __init__(
         self,
-        name: str,
+        task: str | Task,
         *,
         physics: str = "mjx",
         solver: str = "small",
         integrator: str = "model",
     ):
-        self.task = task = TASKS[name]
-        assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-        self.model = mujoco.MjModel.from_xml_path(str(assets / task.xml))
+        for what, name, names in (
+            ("task", task, TASKS),
+            ("physics", physics, PHYSICS),
+            ("solver", solver, SOLVERS),
+            ("integrator", integrator, INTEGRATORS),
+        ):
+            if name not in names and not isinstance(name, Task):
+                raise ValueError(
+                    f"{what} is {name!r}: it must be one of {', '.join(names)}"
+                )
+        batching.keep_loops()
+        self.task = task = task if isinstance(task, Task) else TASKS[task]
+        self.model = _load(task.xml)
+        _check(task, self.model)
         if INTEGRATORS[integrator] is not None:
             self.model.opt.integrator = INTEGRATORS[integrator]
         self._physics_name = physics
-        self.physics = PHYSICS[physics](self.model, task.fields, solver)
+        self.physics = PHYSICS[physics](
+            self.model, task.fields, solver, task.solver_iterations
+        )
         self.dt = self.model.opt.timestep * task.frame_skip
         # A NumPy array becomes a constant of the traced functions.
         self._start = np.asarray(self.model.qpos0, np.float32)
@@ -239,7 +337,7 @@ class Locomotion(Env):
     def ends_early(self) -> bool:
         """Whether an episode can end before its step limit."""
         bounds = (self.task.healthy_z, self.task.healthy_angle, self.task.healthy_state)
-        return any(bound != _EVERYTHING for bound in bounds)
+        return self.task.healthy is not None or any(x != _EVERYTHING for x in bounds)
 
     @property
     def observation_size(self) -> int:
@@ -263,7 +361,9 @@ class Locomotion(Env):
         return self._physics_name
 
     def reset(self, rng: jax.Array) -> State:
-        """Start at rest with Gymnasium's noise on positions and velocities."""
+        """Start as the task says, or at rest with noise on positions and velocities."""
+        if self.task.start is not None:
+            return self.state_at(*self.task.start(rng))
         scale = self.task.reset_noise
         position_key, velocity_key = jax.random.split(rng)
         noise = jax.random.uniform(
@@ -303,11 +403,13 @@ class Locomotion(Env):
         position = self._position(physics, fields)
         x_velocity = (position[0] - before.position[0]) / self.dt
 
-        healthy = self._is_healthy(physics)
+        healthy = self._is_healthy(physics, fields)
         reward = task.forward_reward * x_velocity + task.healthy_reward * healthy
         reward = reward - task.control_cost * jnp.sum(action**2)
         if task.contact_cost is not None:
             reward = reward - task.contact_cost(fields["cfrc_ext"])
+        if task.reward is not None:
+            reward = reward + task.reward(before.physics, physics, fields, action)
         return state.replace(
             pipeline_state=LocomotionState(physics, position),
             obs=self._observe(physics, fields),
@@ -321,16 +423,19 @@ class Locomotion(Env):
             return physics.qpos[:2]
         return self.task.position(self.model, fields)
 
-    def _is_healthy(self, physics: PhysicsState) -> jax.Array:
+    def _is_healthy(self, physics: PhysicsState, fields: Fields) -> jax.Array:
         task, qpos = self.task, physics.qpos
 
         def within(x: jax.Array, bounds: Any) -> jax.Array:
             return jnp.all((bounds[0] < x) & (x < bounds[1]))
 
-        healthy = within(qpos[task.z_index], task.healthy_z)
-        healthy &= within(qpos[2], task.healthy_angle)
+        # A small robot may have no such entry, nor bounds of it.
+        healthy = within(qpos[task.z_index : task.z_index + 1], task.healthy_z)
+        healthy &= within(qpos[2:3], task.healthy_angle)
         healthy &= within(jnp.concatenate([qpos[2:], physics.qvel]), task.healthy_state)
         # Without bounds this is still false for NaN and infinity.
+        if task.healthy is not None:
+            healthy &= task.healthy(physics, fields)
         return healthy.astype(jnp.float32)
 
     def _observe(self, physics: PhysicsState, fields: Fields) -> jax.Array:

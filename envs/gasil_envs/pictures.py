@@ -41,6 +41,14 @@ class LocomotionPainter:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
         self._data = mujoco.MjData(model)
+        self._walks = env.task.forward_reward != 0.0
+        self._camera: int | mujoco.MjvCamera = 0
+        if not model.ncam:
+            self._camera = mujoco.MjvCamera()
+            mujoco.mjv_defaultFreeCamera(model, self._camera)
+            if self._walks:
+                self._camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+                self._camera.trackbodyid = 1
         try:
             # MuJoCo's letters have sizes from 50% to 300%.
             scale = mujoco.mjtFontScale(50 * min(6, max(1, size[0] // 96)))
@@ -57,13 +65,16 @@ class LocomotionPainter:
         physics = episode[-1].physics
         self._data.qpos[:], self._data.qvel[:] = physics.qpos, physics.qvel
         mujoco.mj_forward(self._model, self._data)
-        self._renderer.update_scene(self._data, 0 if self._model.ncam else -1)
-        self._mark_metres()
+        self._renderer.update_scene(self._data, self._camera)
+        if self._walks:
+            self._mark_metres()
         return self._renderer.render().copy()
 
     def _mark_metres(self) -> None:
         """Draw a line across the ground at each whole metre nearby, with its number."""
-        scene, floor = self._renderer.scene, self._model.geom("floor").pos[2]
+        scene, model = self._renderer.scene, self._model
+        planes = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        floor = model.geom_pos[planes][0, 2] if planes.any() else 0.0
         x, y, _ = self._data.subtree_com[1]
         for metre in range(round(x) - _METRES, round(x) + _METRES + 1):
             geom = scene.geoms[scene.ngeom]

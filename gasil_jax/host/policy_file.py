@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import policy
-from gasil_jax.host import output_file
+from gasil_jax import numpy_policy, policy
+from gasil_jax.host import command_line, output_file
 
 
 def save(
@@ -26,10 +26,14 @@ def save(
       seeds: numbers of the seeds.
       final_return: (seeds,), NaN where unknown.
     """
+    weights = policy.weights(states, env)
+    if "network" in weights:
+        command_line.note(f"{path.name} is not written: {numpy_policy.OWN_NETWORK}")
+        return
     arrays: dict[str, Any] = {
         "seeds": np.asarray(seeds, np.int64),
         "final_return": np.asarray(final_return, np.float64),
-        **policy.weights(states, env),
+        **weights,
     }
     with output_file.atomic(path) as partial, partial.open("wb") as file:
         np.savez(file, **arrays)

@@ -189,15 +189,20 @@ class AdversarialAgent(Agent):
     discriminator_gradient_penalty: float = number(0.0, 0.0, traced=False)
     discriminator_normalizes_actions: bool = switch(False)
 
-    @property
-    def _network(self) -> Any:
+    def discriminator_network(self) -> Any:
+        """Return the Flax module of the logit: (..., obs), (..., action) -> (...).
+
+        Observations are normalized, and discrete actions one-hot.
+        """
         # Typed as Any because Flax declares that `apply` may also return variables.
         return Discriminator(self.discriminator_hidden_sizes)
 
     def init_discriminator(self, key: jax.Array, sizes: Sizes) -> Learner:
         """Return an untrained discriminator; consumes the key."""
         pair = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
-        return learner.init(self._network.init(key, *pair), learner.adam())
+        return learner.init(
+            self.discriminator_network().init(key, *pair), learner.adam()
+        )
 
     @jax.named_scope("discriminator")
     def update_and_score(
@@ -218,7 +223,8 @@ class AdversarialAgent(Agent):
         discriminator, metrics = self._train(discriminator, source, context, key)
         rollout = context.rollout
         pairs = self._preprocessor(context)(rollout.observation, rollout.action)
-        bonus = BONUSES[self.bonus](self._network.apply(discriminator.params, *pairs))
+        logit = self.discriminator_network().apply(discriminator.params, *pairs)
+        bonus = BONUSES[self.bonus](logit)
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
 
     def discriminator(self, state: Any) -> Learner:
@@ -245,11 +251,11 @@ class AdversarialAgent(Agent):
                 f"{name} is {getattr(self, name)!r}: the reward of a step then depends "
                 "on the batch that it is in"
             )
-        params = self.discriminator(state).params
+        params, network = self.discriminator(state).params, self.discriminator_network()
 
         def reward(observation: jax.Array, action: jax.Array) -> jax.Array:
             observation = normalization.normalize(normalizer, observation)
-            return BONUSES[self.bonus](self._network.apply(params, observation, action))
+            return BONUSES[self.bonus](network.apply(params, observation, action))
 
         return reward
 
@@ -274,7 +280,7 @@ class AdversarialAgent(Agent):
         self, discriminator: Learner, source: Source, context: Context, key: jax.Array
     ) -> tuple[Learner, Metrics]:
         """Take gradient steps on the discriminator, if the source is ready."""
-        network, transform = self._network, learner.adam()
+        network, transform = self.discriminator_network(), learner.adam()
         rollout = context.rollout
         observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
         action = rollout.action.reshape(-1, rollout.action.shape[-1])

@@ -48,6 +48,19 @@ class Agent(struct.PyTreeNode):
     def check(self, sizes: Sizes) -> None:
         """Raise `ValueError`, before anything compiles, if the agent can't run."""
 
+    def policy_network(self, sizes: Sizes) -> Any:
+        """Return a Flax module for the policy, or None for the package's layers.
+
+        It maps normalized observations, (..., obs), to the mean of actions, or to the
+        logits of discrete ones, (..., action), and may only have parameters. It should
+        start near 0: so an untrained policy explores alike in every state.
+        """
+        return None
+
+    def value_network(self, sizes: Sizes) -> Any:
+        """Return a Flax module for values, (..., obs) -> (...); None as above."""
+        return None
+
     def data(self) -> Any:
         """Return arrays that all runs of a program share, such as an expert's steps.
 

@@ -337,7 +337,7 @@ def contact_rows(
     torque = tree.cross(*jnp.broadcast_arrays(arm, axes))
     wrench = jnp.concatenate([torque, jnp.broadcast_to(axes, torque.shape)], axis=2)
     wrench = materialize(wrench)
-    # cdof is (rotation, translation) of a point at the root's centre of mass.
+    # cdof is (rotation, translation) of the point at the centre of mass.
     along = add(wrench[:, :, k, None] * at.cdof[:, k] for k in range(6))
     along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
     scale = [along[:, :1], along[:, 1:] * constants.friction[:, None, None]]

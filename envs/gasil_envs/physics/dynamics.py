@@ -48,8 +48,12 @@ class Dynamics(NamedTuple):
     fields: tuple[str, ...]
 
 
-def unsupported(model: mujoco.MjModel) -> str | None:
-    """Return why `make` does not support this model, or None if it does."""
+#: Fields that are about the centre of mass of each body's own tree.
+_OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
+
+
+def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
+    """Return why `make` does not support this model and fields; None if it does."""
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
     if model.opt.integrator not in integrators:
         return "its integrator is neither Euler nor RK4"
@@ -63,6 +67,9 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         or (model.jnt_type[model.actuator_trnid[:, 0]] == tree.FREE).any()
     ):
         return "it has actuators other than plain motors on slides and hinges"
+    of_one_tree = [x for x in fields if x in _OF_ONE_TREE]
+    if of_one_tree and np.unique(model.body_rootid[1:]).size > 1:
+        return f"it has more than one kinematic tree, and {of_one_tree[0]} is returned"
     return tree.unsupported(model) or constraints.unsupported(model)
 
 

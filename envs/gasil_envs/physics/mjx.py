@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from mujoco import mjx
 
 from gasil_envs.physics import dynamics
@@ -29,6 +30,32 @@ _FIELDS: dict[str, Callable[[mjx.Data], jax.Array]] = {
     "cfrc_ext": lambda data: data._impl.cfrc_ext,
 }
 
+#: Parts of a model that MJX leaves out without a word, and the arrays that have them.
+_LEFT_OUT = {
+    "nonlinear springs": ("jnt_stiffnesspoly", "tendon_stiffnesspoly"),
+    "nonlinear damping": ("dof_dampingpoly", "tendon_dampingpoly"),
+    "actuators with damping": ("actuator_damping", "actuator_dampingpoly"),
+    "actuators with armature": ("actuator_armature",),
+    "adhesion": ("geom_adhesion",),
+    "moving surfaces": ("geom_surfacevel",),
+    "plugins": ("nplugin",),
+}
+
+
+def _left_out(model: mujoco.MjModel) -> str | None:
+    """Return what MJX would leave out of a model, or None if nothing."""
+    for what, names in _LEFT_OUT.items():
+        if any(np.any(getattr(model, name)) for name in names):
+            return what
+    options = ("noslip_iterations", "disableactuator")
+    return next((x for x in options if getattr(model.opt, x)), None)
+
+
+def _refusal(what: str) -> ValueError:
+    return ValueError(
+        f"physics 'mjx' lacks a part of the model that 'mujoco' has: {what}"
+    )
+
 
 class MjxPhysics:
     """Steps a MuJoCo model with MJX; see `interface.Physics`.
@@ -38,12 +65,15 @@ class MjxPhysics:
       fields: names of the ``mjData`` arrays to return.
       solver: "small" uses our own dynamics and Newton's method for small dense problems
         (`dynamics`). For a model that these do not support it falls back to "mjx" and
-        logs a warning. "mjx" uses MJX's own step.
+        logs a warning that says why. "mjx" uses MJX's own step.
       iterations: Newton iterations of either solver.
       ls_iterations: line-search steps of MJX's solver. Float32 never meets MuJoCo's
         tolerance, which is meant for float64, so that all of its 100 iterations would
         run. 4 and 8 give the same result (relative error against C MuJoCo 6e-7 on
         walker2d).
+
+    Raises:
+      ValueError: if MJX does not take the model.
     """
 
     def __init__(
@@ -59,15 +89,23 @@ class MjxPhysics:
         # humanoid.xml specifies PGS, which MJX does not have.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         self._fields = tuple(fields)
-        reason = dynamics.unsupported(model) if solver == "small" else None
+        reason = dynamics.unsupported(model, fields) if solver == "small" else None
         if reason is not None:
-            _LOGGER.warning("MJX's own solver steps this model: %s", reason)
+            _LOGGER.warning(
+                "MJX's own step is used, some ten times slower than ours, because of a "
+                "part of the model that ours lacks: %s",
+                reason,
+            )
         self._small: dynamics.Dynamics | None = None
-        if solver == "small" and reason is None:
-            self._small = dynamics.make(model, fields, iterations)
-        else:
-            self._mjx_model = mjx.put_model(model)
-            self._blank_data = mjx.make_data(model)
+        try:
+            if solver == "small" and reason is None:
+                self._small = dynamics.make(model, fields, iterations)
+            else:
+                self._mjx_model = mjx.put_model(model)
+                self._blank_data = mjx.make_data(model)
+        except NotImplementedError as error:
+            raise _refusal(str(error).partition("\n")[0].rstrip(".")) from None
+        self._left_out = _left_out(model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
@@ -94,7 +132,13 @@ class MjxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
+        """Advance `frame_skip` time steps under one control (nu,).
+
+        Raises:
+          ValueError: if MJX would leave out a part of the model.
+        """
+        if self._left_out is not None:
+            raise _refusal(self._left_out)
         if self._small is not None:
             small = self._small
 

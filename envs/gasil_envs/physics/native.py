@@ -183,7 +183,11 @@ class MujocoPhysics:
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
         # Initial states are computed far more often than they are used, so MJX computes
         # them without a host call.
-        self._at_start = MjxPhysics(copy.copy(model), fields, solver="mjx")
+        placed = copy.copy(model)
+        # MJX may lack some of these, and placing bodies needs none.
+        placed.geom_contype[:] = placed.geom_conaffinity[:] = 0
+        placed.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self._at_start = MjxPhysics(placed, fields, solver="mjx")
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

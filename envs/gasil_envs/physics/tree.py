@@ -5,8 +5,9 @@ the batch as its last axis. The model is known when a program is traced: recursi
 bodies are unrolled, and products with its zeros are left out.
 
 Shape letters: N bodies, the world first; V degrees of freedom; B batch. A spatial
-vector (6, B) is a rotation and then a translation of the point at the tree's centre of
-mass; a rotation matrix is the list of its columns, (3, B) each.
+vector (6, B) is a rotation and then a translation of the point at the centre of mass of
+all bodies that move, of one tree or more; a rotation matrix is the list of its columns,
+(3, B) each.
 """
 
 from collections.abc import Sequence
@@ -34,7 +35,7 @@ class Kinematics(NamedTuple):
       columns: rotation of each body.
       xpos: (N, 3, B), origins of the bodies.
       xipos: (N, 3, B), their centres of mass.
-      com: (3, B), centre of mass of the tree.
+      com: (3, B), centre of mass of all bodies that move.
       cinert: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass
         times offset, mass.
       cdof: (V, 6, B), motion of one unit of each velocity.
@@ -52,8 +53,6 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
     if not np.isin(model.jnt_type, [FREE, SLIDE, HINGE]).all():
         return "it has ball joints"
-    if np.unique(model.body_rootid[1:]).size > 1:
-        return "it has more than one kinematic tree"
     if model.jnt_stiffness[model.jnt_type == FREE].any():
         return "it has free joints with springs"
     tendons = model.tendon_stiffness, model.tendon_damping, model.tendon_armature
@@ -68,6 +67,8 @@ def unsupported(model: mujoco.MjModel) -> str | None:
         flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER | flags.mjDSBL_GRAVITY
     ):
         return "its springs, dampers or gravity are disabled"
+    if model.opt.disableflags & (flags.mjDSBL_CLAMPCTRL | flags.mjDSBL_ACTUATION):
+        return "its actuators or the limits of their controls are disabled"
     return None
 
 
@@ -173,7 +174,9 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
     places = zip(xpos, columns, model.body_ipos, strict=True)
     xipos = jnp.stack([x + rotate(turned, local) for x, turned, local in places])
     mass = model.body_mass.astype(np.float32)[:, None]
-    com = add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
+    # What does not move is not counted: it may be heavy, and far away.
+    moving = mass * (model.body_weldid > 0)[:, None]
+    com = add(m * x for m, x in zip(moving[:, 0], xipos, strict=True)) / moving.sum()
     xipos, com = materialize((xipos, com))
     cinert = _inertia(model, columns, xipos - com, mass=mass)
     axis, anchor, translation = map(jnp.stack, zip(*dofs, strict=True))

@@ -1,0 +1,117 @@
+"""Networks of one's own, as an agent's functions return them."""
+
+import jax
+import numpy as np
+import pytest
+from corridor import Corridor
+from flax import linen as nn
+
+import gasil_jax
+from gasil_envs import wrappers
+from gasil_jax import numpy_policy, policy
+
+SMALL = {"total_steps": 256, "batch_steps": 128, "num_envs": 4, "num_epochs": 1}
+
+
+class Head(nn.Module):
+    """One layer, and no axis at the end if its width is 0."""
+
+    width: int = 0
+
+    @nn.compact
+    def __call__(self, *inputs):
+        """(..., input), ... -> (..., width) or (...)."""
+        x = nn.Dense(max(self.width, 1))(jax.numpy.concatenate(inputs, axis=-1))
+        return x if self.width else x[..., 0]
+
+
+class Own(gasil_jax.PPOGASIL):
+    """All three networks are one layer."""
+
+    def policy_network(self, sizes):
+        """Return the layers of the policy."""
+        return Head(sizes.action)
+
+    def value_network(self, sizes):
+        """Return the network of values."""
+        return Head()
+
+    def discriminator_network(self):
+        """Return the network of the logit."""
+        return Head()
+
+
+@pytest.mark.parametrize("make", [lambda: gasil_jax.make_env("point_mass"), Corridor])
+def test_networks_of_ones_own_are_trained_and_act(make):
+    env = make()
+    algorithm = gasil_jax.Algorithm(Own()).replace(buffer_steps=64, **SMALL)
+    train = gasil_jax.make_train(env, algorithm)
+    keys = jax.random.split(jax.random.key(0), 2)  # of two runs
+    before = gasil_jax.init(env, algorithm, keys[0])
+    states, metrics = jax.jit(jax.vmap(train))(keys)
+    assert np.isfinite(metrics["value_loss"]).all()
+    state = gasil_jax.member(states, 0)
+    for network in (
+        lambda x: x.actor_critic.policy,
+        lambda x: x.actor_critic.values[0],
+        lambda x: x.agent.discriminator,
+    ):
+        params = network(state).params
+        old = network(before).params
+        changed = jax.tree.map(lambda x, y: bool((x != y).any()), params, old)
+        assert all(jax.tree.leaves(changed))
+
+    observation = np.ones((3, env.observation_size), np.float32)
+    act = policy.from_state(state, env)
+    learned = state.actor_critic.policy
+    parameters = learned.network.apply(
+        learned.params, numpy_policy.inputs(policy.weights(state, env), observation)
+    )
+    if hasattr(env, "num_actions"):
+        np.testing.assert_array_equal(act(observation), parameters.argmax(axis=-1))
+    else:
+        expected = np.clip(parameters[0], *wrappers.action_range(env))
+        np.testing.assert_allclose(act(observation), expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="a Flax module of your own, which needs JAX"):
+        numpy_policy.make(policy.weights(state, env))(observation)
+
+
+class WithState(nn.Module):
+    """It has more than parameters."""
+
+    @nn.compact
+    def __call__(self, x):
+        """(..., obs) -> (...)."""
+        return nn.BatchNorm(use_running_average=False)(x)[..., 0]
+
+
+@pytest.mark.parametrize(
+    ("function", "network", "message"),
+    [
+        ("policy_network", Head(3), r"returns float32\[2, 3\] for 2 steps.*\[2, 2\]$"),
+        (
+            "value_network",
+            Head(1),
+            r"returns float32\[2, 1\] .* be float32\[2\]$",
+        ),
+        (
+            "value_network",
+            WithState(),
+            "has batch_stats, params: it must have par",
+        ),
+        ("value_network", 3, "can't be traced: AttributeError: 'int' object has no"),
+        (
+            "discriminator_network",
+            Head(2),
+            r"float32\[2, 2\] for 2 steps: it must",
+        ),
+        ("discriminator_network", WithState(), "can't be traced: TypeError"),
+    ],
+)
+def test_a_network_that_does_not_fit_is_refused_in_a_line(function, network, message):
+    kind = type("Wrong", (gasil_jax.PPOGASIL,), {function: lambda *_: network})
+    with pytest.raises(ValueError, match=f"{function} of agent .* {message}") as told:
+        gasil_jax.make_train(
+            gasil_jax.make_env("point_mass"), gasil_jax.Algorithm(kind())
+        )
+    assert "\n" not in str(told.value)

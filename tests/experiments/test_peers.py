@@ -1,0 +1,31 @@
+"""The benchmark of PPO beside other packages."""
+
+import importlib.util
+
+import jax
+import pytest
+
+from experiments import __main__ as experiments
+from experiments import peers
+
+
+@pytest.mark.parametrize("missing", ["rejax", "ppo_continuous_action"])
+def test_a_peer_that_is_not_installed_is_told_in_a_line(missing, monkeypatch, capsys):
+    found = lambda name: None if name == missing else importlib.machinery.PathFinder
+    monkeypatch.setattr(importlib.util, "find_spec", found)
+    assert experiments.main(["benchmark", "--tables", "peers"]) == 2
+    told = capsys.readouterr().err.strip()
+    name = "rejax" if missing == "rejax" else "purejaxrl"
+    assert told.startswith(f"error: {name} is not installed: ") and "\n" not in told
+    assert "install" in told.partition("installed: ")[2]
+
+
+@pytest.mark.parametrize("name", peers.ENVS)
+def test_ours_has_the_sizes_of_the_others(name):
+    pytest.importorskip("gymnax")
+    train = peers._ours(name, 3 * 32 * 64)
+    state, metrics = jax.eval_shape(train, jax.random.key(0))
+    assert metrics["env_steps"].shape == (3,)
+    assert state.environments.episode_length.shape == (32,)
+    layers = jax.tree.leaves(state.actor_critic.policy.params)
+    assert sum(x.shape == (64, 64) for x in layers) == 1
