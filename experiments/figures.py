@@ -34,6 +34,10 @@ from experiments.search import (
     PAIR,
     PAPER_STEPS_OF,
     PAPERS,
+    SPARSE,
+    SPARSE_BASE,
+    SPARSE_SPACES,
+    SPARSE_STEPS,
     STEPS,
     TASKS,
     PaperSearch,
@@ -41,6 +45,7 @@ from experiments.search import (
     Search,
     SharedValues,
     SingleSetting,
+    SparseSearch,
     searches,
 )
 from gasil_jax import presets
@@ -283,6 +288,45 @@ _LIMITS = joined(
 )
 
 
+#: The sparse tasks that are also tried with noise, and those of the ablation.
+_NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 5, 6)]
+_CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 5)]
+_GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
+_CENTRED = {**_GASIL, "bonus": "centered"}
+_CAUSES = [
+    Arm("ppo", "ppo"),
+    Arm("gasil, as the paper", "ppo+gasil", _GASIL),
+    Arm("gasil, logit", "ppo+gasil", {**_GASIL, "bonus": "logit"}),
+    Arm("gasil, centered", "ppo+gasil", _CENTRED),
+    *(
+        Arm(f"gasil, centered, {name}", "ppo+gasil", {**_CENTRED, **changes})
+        for name, changes in (
+            ("better episodes", {"admission": "better"}),
+            ("newest of ties", {"ties": "newest"}),
+            ("10,000 steps", {"buffer_steps": 10_000}),
+        )
+    ),
+    Arm("cloning", "ppo+bc", _CLONED),
+    *(
+        Arm(f"cloning, {name}", "ppo+bc", {**_CLONED, **changes})
+        for name, changes in (
+            ("better episodes", {"admission": "better"}),
+            ("newest of ties", {"ties": "newest"}),
+            ("10,000 steps", {"buffer_steps": 10_000}),
+            ("one episode", {"buffer_episodes": 1}),
+        )
+    ),
+    Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
+    Arm("novelty", "ppo+novelty"),
+    Arm(
+        "novelty, cloning, oldest",
+        "ppo+bc+novelty",
+        {**_CLONED, "novelty_ties": "arrival"},
+    ),
+    Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
+]
+
+
 FIGURES: Mapping[str, Figure] = {
     "point_mass": Figure(
         "2D point mass (paper, figures 2 to 4)",
@@ -465,5 +509,34 @@ FIGURES: Mapping[str, Figure] = {
             )
         ),
         favourite="whole",
+    ),
+    "sparse": Figure(
+        "Sparse rewards: imitation, and exploration",
+        "",
+        grid(
+            (*SPARSE, *_NOISY),
+            [*SPARSE_SPACES],
+            base=SparseSearch,
+            seeds=20,
+            total_steps=SPARSE_STEPS,
+        ),
+        searches={
+            f"{env} {agent}": SparseSearch(env, agent)
+            for env in SPARSE
+            for agent in SPARSE_SPACES
+        },
+        favourite="ppo+bc+novelty",
+    ),
+    "sparse_causes": Figure(
+        "Sparse rewards: why imitation with a discriminator fails",
+        "",
+        grid(
+            _CAUSE_TASKS,
+            _CAUSES,
+            base=None,
+            changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+            total_steps=SPARSE_STEPS,
+        ),
+        favourite="ppo",
     ),
 }
