@@ -36,6 +36,7 @@ from experiments.search import (
     PAPERS,
     SPARSE,
     SPARSE_BASE,
+    SPARSE_SEARCHED,
     SPARSE_SPACES,
     SPARSE_STEPS,
     STEPS,
@@ -522,7 +523,7 @@ FIGURES: Mapping[str, Figure] = {
         ),
         searches={
             f"{env} {agent}": SparseSearch(env, agent)
-            for env in SPARSE
+            for env in SPARSE_SEARCHED
             for agent in SPARSE_SPACES
         },
         favourite="ppo+bc+novelty",
