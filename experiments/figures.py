@@ -290,8 +290,8 @@ _LIMITS = joined(
 
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
-_NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 5, 6)]
-_CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 5)]
+_NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
+_CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
 _GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
 _CENTRED = {**_GASIL, "bonus": "centered"}
 _CAUSES = [

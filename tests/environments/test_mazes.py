@@ -135,9 +135,12 @@ def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
     env = mazes.ActionNoise(mazes.build("u_maze"), 0.5)
     step = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(2)))
     moved = jax.vmap(step)(jax.random.split(jax.random.key(0), 500))
-    moves = moved.pipeline_state.position - jax.vmap(env.reset)(
-        jax.random.split(jax.random.key(0), 500)
-    ).pipeline_state.position
+    moves = (
+        moved.pipeline_state.position
+        - jax.vmap(env.reset)(
+            jax.random.split(jax.random.key(0), 500)
+        ).pipeline_state.position
+    )
     # Its velocity is the speed times noise of half a deviation.
     assert np.std(moves) == pytest.approx(0.15, rel=0.1)
     np.testing.assert_array_equal(
