@@ -48,6 +48,7 @@ from experiments.search import (
     SingleSetting,
     SparseSearch,
     searches,
+    solved_from,
 )
 from gasil_jax import presets
 
@@ -527,6 +528,7 @@ FIGURES: Mapping[str, Figure] = {
             for agent in SPARSE_SPACES
         },
         favourite="ppo+bc+novelty",
+        solved_from=solved_from,
     ),
     "sparse_causes": Figure(
         "Sparse rewards: why imitation with a discriminator fails",
@@ -539,5 +541,6 @@ FIGURES: Mapping[str, Figure] = {
             total_steps=SPARSE_STEPS,
         ),
         favourite="ppo",
+        solved_from=solved_from,
     ),
 }

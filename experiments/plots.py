@@ -68,7 +68,8 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
             if names:
                 axes.legend(frameon=False, fontsize=7)
     for row in grid:
-        row[0].set_ylabel("episode return")
+        is_share = figure.solved_from is not None
+        row[0].set_ylabel("share of seeds" if is_share else "episode return")
     return picture
 
 
@@ -94,7 +95,10 @@ def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
 
 
 def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
-    """Draw learning curves: interquartile mean and 95% interval over seeds."""
+    """Draw learning curves: interquartile mean and 95% interval over seeds.
+
+    Where tasks are either solved or not, it is the share of seeds that solve the task.
+    """
     color_of = _colors(figure)
     for label in figure.panels[panel]:
         if (panel, label) not in records:
@@ -105,6 +109,12 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
         returns = np.array(
             [np.interp(steps, x.env_steps, x.episode_return) for x in seeds]
         )
+        if figure.solved_from is not None:
+            half = figure.solved_from(figure.panels[panel][label].env) / 2
+            share = np.mean(returns >= half, axis=0)
+            axes.plot(steps / 1e6, share, color=color_of[label], label=label)
+            axes.set_ylim(-0.03, 1.03)
+            continue
         finite = np.isfinite(returns).all(axis=0)
         if finite.any():
             color = color_of[label]

@@ -1,4 +1,4 @@
-"""PPO+NOVELTY and PPO+BC+NOVELTY: visits, the bonus, and which ties the buffer keeps."""
+"""PPO+NOVELTY and PPO+BC+NOVELTY: visits, bonus, and which ties the buffer keeps."""
 
 import jax
 import jax.numpy as jnp
