@@ -47,6 +47,7 @@ from experiments.search import (
     SharedValues,
     SingleSetting,
     SparseSearch,
+    SparseShared,
     searches,
     solved_from,
 )
@@ -292,6 +293,9 @@ _LIMITS = joined(
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
+_SPARSE_SHARED = [
+    Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
+]
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
 _GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
 _CENTRED = {**_GASIL, "bonus": "centered"}
@@ -515,12 +519,12 @@ FIGURES: Mapping[str, Figure] = {
     "sparse": Figure(
         "Sparse rewards: imitation, and exploration",
         "",
-        grid(
-            (*SPARSE, *_NOISY),
-            [*SPARSE_SPACES],
-            base=SparseSearch,
-            seeds=20,
-            total_steps=SPARSE_STEPS,
+        joined(
+            grid(tasks, arms, base=base, seeds=20, total_steps=SPARSE_STEPS)
+            for tasks, arms, base in (
+                ((*SPARSE, *_NOISY), [*SPARSE_SPACES], SparseSearch),
+                (SPARSE, _SPARSE_SHARED, SparseShared),
+            )
         ),
         searches={
             f"{env} {agent}": SparseSearch(env, agent)

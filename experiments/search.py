@@ -407,6 +407,20 @@ class SparseSearch(Search):
         return self.points(store)[chosen], progress[chosen].ravel()
 
 
+@dataclasses.dataclass(frozen=True)
+class SparseShared(SparseSearch):
+    """The search of an agent for one setting, with PPO's learning rate and entropy.
+
+    PPO's search tries learning rates, in place of a coefficient of imitation.
+    """
+
+    def chosen(self, store: Store) -> Point | None:
+        """Return the chosen point with PPO's values, or None if runs lack."""
+        own = super().chosen(store)
+        shared = SparseSearch(self.env, "ppo").chosen(store)
+        return None if own is None or shared is None else {**own, **shared}
+
+
 @functools.cache
 def solved_from(env: str) -> float:
     """Return the return from which on a sparse task is solved."""
