@@ -488,17 +488,22 @@ class Page:
             if results.complete
         }
 
+    def _sparse(self, kind: str) -> list[str]:
+        """Return the panels of tasks with noise, for "noisy", or without."""
+        is_kind = lambda panel: panel.endswith("_noisy") == (kind == "noisy")
+        return [panel for panel in self.figure.panels if is_kind(panel)]
+
     def shares(self, kind: str = "") -> str:
         """Return the share of seeds that solve each task: a column for each curve.
 
         In brackets are the thousands of steps until then, the median over those seeds.
 
         Args:
-          kind: only panels whose names end with this.
+          kind: "noisy" for the tasks with noise; default those without.
         """
         solved, from_ = self._solved(), self.figure.solved_from
-        names = self.figure.names()
-        panels = [x for x in self.figure.panels if x.endswith(kind)]
+        panels = self._sparse(kind)
+        names = self.figure.names(panels)
         rows = []
         for panel in panels:
             cells = [panel.removeprefix("sparse:")]
@@ -531,10 +536,10 @@ class Page:
 
         Args:
           ours: the curve; default the favourite.
-          kind: only panels whose names end with this.
+          kind: "noisy" for the tasks with noise; default those without.
         """
         solved, ours = self._solved(), ours or str(self.figure.favourite)
-        panels = [p for p in self.figure.panels if p.endswith(kind)]
+        panels = self._sparse(kind)
         having = {
             other: [p for p in panels if {(p, ours), (p, other)} <= solved.keys()]
             for other in self.figure.names(panels)

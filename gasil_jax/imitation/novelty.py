@@ -113,7 +113,7 @@ class PPONovelty(Agent):
         """Add the centred novelty to the environment's reward."""
         novelty = self.novelty(self.visits(state), context)
         bonus = self.novelty_coefficient * (novelty - jnp.mean(novelty))
-        metrics = {"novelty": jnp.mean(novelty), "bonus_deviation": jnp.std(bonus)}
+        metrics = {"novelty": jnp.mean(novelty)}
         return state, context.rollout.reward + bonus, metrics
 
 
