@@ -38,6 +38,7 @@ from experiments.search import (
     PROTOCOL,
     SEEDS,
     SPACES,
+    SPARSE,
     TASKS,
     importance,
     mean_ranks,
@@ -644,6 +645,8 @@ class Page:
         results.mkdir(parents=True, exist_ok=True)
         if self.results:
             plots.save_png(self.picture(), results / f"{self.name}.png")
+        if self.name == "sparse":
+            plots.save_png(plots.draw_starts(SPARSE), results / "sparse_tasks.png")
         with output_file.atomic(results / f"{self.name}.md") as partial:
             partial.write_text(self.text())
 
