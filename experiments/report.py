@@ -39,6 +39,7 @@ from experiments.search import (
     SEEDS,
     SPACES,
     SPARSE,
+    SPARSE_PROTOCOL,
     TASKS,
     importance,
     mean_ranks,
@@ -381,7 +382,7 @@ class Page:
 
     def protocol(self) -> str:
         """Return the text that says how a search chooses its point."""
-        return PROTOCOL
+        return SPARSE_PROTOCOL if self.figure.solved_from else PROTOCOL
 
     def searches(self) -> str:
         """Return a table of the results of the figure's searches."""

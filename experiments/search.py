@@ -361,6 +361,19 @@ SPARSE_BASE: Point = {
 }
 
 
+#: How the searches of the sparse tasks choose, for the page.
+SPARSE_PROTOCOL = (
+    f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps, rewards "
+    "normalized. For every agent six points were tried, each with "
+    f"{len(_SPARSE_SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
+    f"{', '.join(x.partition(':')[2] for x in SPARSE_SEARCHED)}: three weights of the "
+    "entropy, and two learning rates for PPO or two weights of imitation or of novelty "
+    "for the others. The point with the highest return over the last fifth of "
+    "training, as a share of a success's, is used on all tasks. The other tasks, and "
+    "all with noise, had no part in the choice."
+)
+
+
 @dataclasses.dataclass(frozen=True)
 class SparseSearch(Search):
     """The search of an agent for one setting for all sparse tasks.
