@@ -9,6 +9,7 @@ import math
 import statistics
 import zlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -124,11 +125,17 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
             p_value = max(p_value, permutation_p(*sides))
         visible = errors * float(np.std(drawn))
         raw[key] = Comparison(middle, low, high, p_value, visible)
-    corrected, least = {}, 0.0
-    for i, key in enumerate(sorted(raw, key=lambda key: raw[key].p)):
-        least = max(least, min(1.0, raw[key].p * (len(raw) - i)))
-        corrected[key] = dataclasses.replace(raw[key], p=least)
-    return {key: corrected[key] for key in raw}
+    p_values = corrected({key: x.p for key, x in raw.items()})
+    return {key: dataclasses.replace(x, p=p_values[key]) for key, x in raw.items()}
+
+
+def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:
+    """Return the p-values of a family, corrected by Holm's method."""
+    higher, least = {}, 0.0
+    for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
+        least = max(least, min(1.0, p_values[key] * (len(p_values) - i)))
+        higher[key] = least
+    return {key: higher[key] for key in p_values}
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:

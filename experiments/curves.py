@@ -117,6 +117,8 @@ class Figure:
         field's value are points of one line.
       early: number of first environment steps whose mean return is compared too, as the
         curve "NAME early".
+      solved_from: (task) -> the return of a success. If it is given, what counts is the
+        share of seeds that solve the task (see `shares`), not their returns.
     """
 
     title: str
@@ -127,6 +129,7 @@ class Figure:
     searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
     over: tuple[str, str] | None = None
     early: int | None = None
+    solved_from: Callable[[str], float] | None = None
 
     def curves(self) -> list[tuple[str, str, Curve]]:
         """Return all curves, each with its panel and name."""

@@ -34,6 +34,11 @@ from experiments.search import (
     PAIR,
     PAPER_STEPS_OF,
     PAPERS,
+    SPARSE,
+    SPARSE_BASE,
+    SPARSE_SEARCHED,
+    SPARSE_SPACES,
+    SPARSE_STEPS,
     STEPS,
     TASKS,
     PaperSearch,
@@ -41,7 +46,10 @@ from experiments.search import (
     Search,
     SharedValues,
     SingleSetting,
+    SparseSearch,
+    SparseShared,
     searches,
+    solved_from,
 )
 from gasil_jax import presets
 
@@ -288,6 +296,48 @@ _LIMITS = joined(
 )
 
 
+#: The sparse tasks that are also tried with noise, and those of the ablation.
+_NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
+_SPARSE_SHARED = [
+    Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
+]
+_CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
+_GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
+_CENTRED = {**_GASIL, "bonus": "centered"}
+_CAUSES = [
+    Arm("ppo", "ppo"),
+    Arm("gasil, as the paper", "ppo+gasil", _GASIL),
+    Arm("gasil, logit", "ppo+gasil", {**_GASIL, "bonus": "logit"}),
+    Arm("gasil, centered", "ppo+gasil", _CENTRED),
+    *(
+        Arm(f"gasil, centered, {name}", "ppo+gasil", {**_CENTRED, **changes})
+        for name, changes in (
+            ("better episodes", {"admission": "better"}),
+            ("newest of ties", {"ties": "newest"}),
+            ("10,000 steps", {"buffer_steps": 10_000}),
+        )
+    ),
+    Arm("cloning", "ppo+bc", _CLONED),
+    *(
+        Arm(f"cloning, {name}", "ppo+bc", {**_CLONED, **changes})
+        for name, changes in (
+            ("better episodes", {"admission": "better"}),
+            ("newest of ties", {"ties": "newest"}),
+            ("10,000 steps", {"buffer_steps": 10_000}),
+            ("one episode", {"buffer_episodes": 1}),
+        )
+    ),
+    Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
+    Arm("novelty", "ppo+novelty"),
+    Arm(
+        "novelty, cloning, oldest",
+        "ppo+bc+novelty",
+        {**_CLONED, "novelty_ties": "arrival"},
+    ),
+    Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
+]
+
+
 FIGURES: Mapping[str, Figure] = {
     "point_mass": Figure(
         "2D point mass (paper, figures 2 to 4)",
@@ -483,5 +533,36 @@ FIGURES: Mapping[str, Figure] = {
             )
         ),
         favourite="whole",
+    ),
+    "sparse": Figure(
+        "Sparse rewards: imitation, and exploration",
+        "",
+        joined(
+            grid(tasks, arms, base=base, seeds=20, total_steps=SPARSE_STEPS)
+            for tasks, arms, base in (
+                ((*SPARSE, *_NOISY), [*SPARSE_SPACES], SparseSearch),
+                (SPARSE, _SPARSE_SHARED, SparseShared),
+            )
+        ),
+        searches={
+            f"{env} {agent}": SparseSearch(env, agent)
+            for env in SPARSE_SEARCHED
+            for agent in SPARSE_SPACES
+        },
+        favourite="ppo+bc+novelty",
+        solved_from=solved_from,
+    ),
+    "sparse_causes": Figure(
+        "Sparse rewards: why imitation with a discriminator fails",
+        "",
+        grid(
+            _CAUSE_TASKS,
+            _CAUSES,
+            base=None,
+            changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+            total_steps=SPARSE_STEPS,
+        ),
+        favourite="ppo",
+        solved_from=solved_from,
     ),
 }

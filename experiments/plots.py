@@ -7,6 +7,7 @@ import pathlib
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
+import jax
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Picture
@@ -18,6 +19,7 @@ from experiments.search import AGENTS
 from experiments.store import Record
 from gasil_jax.figures import plotting
 from gasil_jax.host import output_file
+from gasil_jax.host.environments import make_env
 from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: The color of each agent, the same in all figures.
@@ -61,6 +63,9 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         # this font size a letter is about 0.07 inches wide.
         width = 0.5 + 0.07 * max(map(len, handle_of))
         fitting = max(1, min(4, int(size[0] / width)))
+        # So many names that their legend would leave no room for the panels.
+        lines = math.ceil(len(handle_of) / fitting)
+        picture.set_size_inches(size[0], size[1] + 0.17 * max(0, lines - 6))
         below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
         picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
     else:
@@ -68,7 +73,8 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
             if names:
                 axes.legend(frameon=False, fontsize=7)
     for row in grid:
-        row[0].set_ylabel("episode return")
+        is_share = figure.solved_from is not None
+        row[0].set_ylabel("share of seeds" if is_share else "episode return")
     return picture
 
 
@@ -94,7 +100,10 @@ def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
 
 
 def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
-    """Draw learning curves: interquartile mean and 95% interval over seeds."""
+    """Draw learning curves: interquartile mean and 95% interval over seeds.
+
+    Where tasks are either solved or not, it is the share of seeds that solve the task.
+    """
     color_of = _colors(figure)
     for label in figure.panels[panel]:
         if (panel, label) not in records:
@@ -105,6 +114,12 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
         returns = np.array(
             [np.interp(steps, x.env_steps, x.episode_return) for x in seeds]
         )
+        if figure.solved_from is not None:
+            half = figure.solved_from(figure.panels[panel][label].env) / 2
+            share = np.mean(returns >= half, axis=0)
+            axes.plot(steps / 1e6, share, color=color_of[label], label=label)
+            axes.set_ylim(-0.03, 1.03)
+            continue
         finite = np.isfinite(returns).all(axis=0)
         if finite.any():
             color = color_of[label]
@@ -150,6 +165,22 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, *, axes: Any) -> None
     axes.set(xlabel=label, xscale="log", xlim=limits)
     axes.set_xticks(values, list(map(str, values)))
     axes.minorticks_off()
+
+
+def draw_starts(names: Sequence[str]) -> Picture:
+    """Return pictures of how episodes start in tasks that can draw themselves."""
+    columns = min(5, len(names))
+    rows = math.ceil(len(names) / columns)
+    picture = Picture(figsize=(1.9 * columns, 2.1 * rows), layout="constrained")
+    grid = picture.subplots(rows, columns, squeeze=False)
+    for axes in grid.flat:
+        axes.set_axis_off()
+    for axes, name in zip(grid.flat, names, strict=False):
+        env = make_env(name)
+        state = jax.tree.map(np.asarray, env.reset(jax.random.key(0)).pipeline_state)
+        axes.imshow(env.unwrapped.draw(state, (180, 180)))
+        axes.set_title(name.partition(":")[2], fontsize=9)
+    return picture
 
 
 #: What the best of k points returns, for k from 1 on, by panel and agent.

@@ -15,12 +15,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments import plots
+from experiments import plots, shares
 from experiments.comparisons import (
     FEWEST_SEEDS,
     Comparison,
     Scores,
     compare,
+    corrected,
     counted,
     improvement,
     interval,
@@ -37,6 +38,8 @@ from experiments.search import (
     PROTOCOL,
     SEEDS,
     SPACES,
+    SPARSE,
+    SPARSE_PROTOCOL,
     TASKS,
     importance,
     mean_ranks,
@@ -74,6 +77,19 @@ _READING = """## How to read this
 - **Probability of improvement:** the probability that a random seed of the first curve
   has a higher return than a random seed of the second, where equal ones count half,
   averaged over the tasks."""
+
+_SHARES = """## How to read this
+
+- **A seed solves a task** if its final return is at least half of that of a success.
+  The final return is the mean, over the iterations of the last tenth of training, of
+  the mean return of the episodes that end in an iteration, with the acting policy.
+- **In brackets** are the thousands of steps until the mean return is that high, the
+  median over the seeds that solve the task.
+- **Better, worse:** on a task by Fisher's exact test, and on the mean over tasks by a
+  permutation of seeds within each task, both corrected by Holm's method, the tasks and
+  the means each as one family. Intervals are the bootstrap's over seeds, without
+  correction.
+- **Not clear:** neither; it does not mean that two are equal."""
 
 
 def markdown_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -187,7 +203,7 @@ class Page:
     SLOTS = (
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "grids", "searches", "importance", "ranks", "published"),
-        "passing",
+        *("passing", "shares", "lead", "chosen"),
     )
 
     def __init__(
@@ -372,7 +388,7 @@ class Page:
 
     def protocol(self) -> str:
         """Return the text that says how a search chooses its point."""
-        return PROTOCOL
+        return SPARSE_PROTOCOL if self.figure.solved_from else PROTOCOL
 
     def searches(self) -> str:
         """Return a table of the results of the figure's searches."""
@@ -464,6 +480,108 @@ class Page:
         head = [panel, f"seeds above {threshold}", "interquartile mean"]
         return markdown_table(head, rows)
 
+    def _solved(self) -> shares.Solved:
+        """Return which seeds solve their task, of the curves that are complete."""
+        from_ = self.figure.solved_from
+        if from_ is None:
+            raise self._no_slot("shares")
+        return {
+            key: np.array(
+                [
+                    shares.is_solved(record, from_(results.curve.env))
+                    for record in results.records.values()
+                ]
+            )
+            for key, results in self.results.items()
+            if results.complete
+        }
+
+    def _sparse(self, kind: str) -> list[str]:
+        """Return the panels of tasks with noise, for "noisy", or without."""
+        is_kind = lambda panel: panel.endswith("_noisy") == (kind == "noisy")
+        return [panel for panel in self.figure.panels if is_kind(panel)]
+
+    def shares(self, kind: str = "") -> str:
+        """Return the share of seeds that solve each task: a column for each curve.
+
+        In brackets are the thousands of steps until then, the median over those seeds.
+
+        Args:
+          kind: "noisy" for the tasks with noise; default those without.
+        """
+        solved, from_ = self._solved(), self.figure.solved_from
+        panels = self._sparse(kind)
+        names = self.figure.names(panels)
+        rows = []
+        for panel in panels:
+            cells = [panel.removeprefix("sparse:")]
+            for name in names:
+                cell = ""
+                if (panel, name) in solved and from_ is not None:
+                    results = self.results[panel, name]
+                    steps = [
+                        shares.steps_until(record, from_(results.curve.env))
+                        for record, is_solved in zip(
+                            results.records.values(), solved[panel, name]
+                        )
+                        if is_solved
+                    ]
+                    cell = f"{solved[panel, name].mean():.2f}"
+                    cell += f" ({np.median(steps) / 1000:.0f})" if steps else ""
+                cells.append(cell)
+            rows.append(cells)
+        whole = [
+            (name, [solved[p, name].mean() for p in panels if (p, name) in solved])
+            for name in names
+        ]
+        means = [f"{np.mean(x):.2f}" if len(x) == len(panels) else "" for _, x in whole]
+        return markdown_table(["task", *names], [*rows, ["mean", *means]])
+
+    def lead(self, ours: str = "", kind: str = "") -> str:
+        """Return how a curve's shares of solving seeds compare with each other curve's.
+
+        The verdicts on tasks are one family, and those on the means another.
+
+        Args:
+          ours: the curve; default the favourite.
+          kind: "noisy" for the tasks with noise; default those without.
+        """
+        solved, ours = self._solved(), ours or str(self.figure.favourite)
+        panels = self._sparse(kind)
+        having = {
+            other: [p for p in panels if {(p, ours), (p, other)} <= solved.keys()]
+            for other in self.figure.names(panels)
+            if other != ours
+        }
+        having = {other: x for other, x in having.items() if x}
+        one = shares.compare(
+            solved, [(p, ours, other) for other, x in having.items() for p in x]
+        )
+        mean = {k: shares.overall(solved, x, ours, other=k) for k, x in having.items()}
+        p_values = corrected({other: p for other, (_, _, p) in mean.items()})
+        lines = []
+        for other, x in having.items():
+            middle, (low, high), _ = mean[other]
+            verdict = shares.Difference(middle, p_values[other]).verdict
+            verdicts = [one[p, ours, other].verdict for p in x]
+            lines.append(
+                f"- {ours} against {other}: mean share {middle:+.2f} [{low:+.2f}, "
+                f"{high:+.2f}], {verdict}; {counted(verdicts)} of {len(x)} tasks."
+            )
+        return "\n".join(lines)
+
+    def chosen(self) -> str:
+        """Return a table of what each agent's search chose for all sparse tasks."""
+        first = {x.agent: x for x in self.figure.searches.values()}
+        rows = []
+        for agent, search in first.items():
+            best = search.best(self.searched)
+            cells = ["not complete", ""]
+            if best is not None:
+                cells = [point_in_words(best[0]), f"{best[1].mean():.2f}"]
+            rows.append([agent, f"{len(search.points(self.searched))}", *cells])
+        return markdown_table(["agent", "points", "chosen", "its progress"], rows)
+
     def settings(self) -> str:
         """Return a table of each curve's settings that are not the defaults."""
         rows = []
@@ -519,7 +637,8 @@ class Page:
             parts.append(f"{words}.")
         if self.results:
             sizes = [f"{len(family)}" for family in self.figure.families()]
-            parts += [_READING.format(" and ".join(sizes)), "## Settings"]
+            reading = _READING.format(" and ".join(sizes))
+            parts += [_SHARES if self.figure.solved_from else reading, "## Settings"]
             parts.append(self.settings())
         return "\n\n".join(parts) + "\n"
 
@@ -533,6 +652,8 @@ class Page:
         results.mkdir(parents=True, exist_ok=True)
         if self.results:
             plots.save_png(self.picture(), results / f"{self.name}.png")
+        if self.name == "sparse":
+            plots.save_png(plots.draw_starts(SPARSE), results / "sparse_tasks.png")
         with output_file.atomic(results / f"{self.name}.md") as partial:
             partial.write_text(self.text())
 

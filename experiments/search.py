@@ -22,7 +22,7 @@ import numpy as np
 from experiments.store import Store
 from gasil_jax import statistics
 from gasil_jax.algorithms import Algorithm, algorithm
-from gasil_jax.host.environments import Settings
+from gasil_jax.host.environments import Settings, make_env
 from gasil_jax.sweeps.runs import Run
 
 Point = Mapping[str, Any]
@@ -330,6 +330,114 @@ class PaperSearch(Search):
             return None
         chosen = int(scores.mean(axis=1).argmax())
         return points[chosen], scores[chosen]
+
+
+#: The sparse tasks, and the ways to explore and imitate that are compared on them.
+SPARSE = tuple(
+    f"sparse:{name}"
+    for name in (
+        *("u_maze", "u_maze_short", "key_maze", "key_maze_short", "four_rooms"),
+        *("apple_maze", "key_grid", "deep_sea_10", "deep_sea_20", "mountain_car"),
+    )
+)
+_ENTROPIES: Space = {"entropy_coefficient": (0.0, 0.01, 0.03)}
+#: Those that the searches train on; the others have no part in any choice.
+SPARSE_SEARCHED = tuple(SPARSE[i] for i in (0, 2, 4, 6, 7))
+#: Six points for each agent.
+SPARSE_SPACES: Mapping[str, Space] = {
+    "ppo": {**_ENTROPIES, "learning_rate": (3e-4, 1e-3)},
+    "ppo+bc": {**_ENTROPIES, "behavior_cloning_coefficient": (0.1, 1.0)},
+    "ppo+sil": {**_ENTROPIES, "sil_coefficient": (0.1, 1.0)},
+    "ppo+gasil": {**_ENTROPIES, "alpha": (0.02, 0.1)},
+    "ppo+novelty": {**_ENTROPIES, "novelty_coefficient": (0.1, 1.0)},
+    "ppo+bc+novelty": {**_ENTROPIES, "novelty_coefficient": (0.1, 1.0)},
+}
+_SPARSE_SEEDS, SPARSE_STEPS = range(1000, 1002), 500_000
+#: What does not differ between agents on the sparse tasks.
+SPARSE_BASE: Point = {
+    "total_steps": SPARSE_STEPS,
+    "num_envs": 16,
+    "normalize_rewards": True,
+}
+
+
+#: How the searches of the sparse tasks choose, for the page.
+SPARSE_PROTOCOL = (
+    f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps, rewards "
+    "normalized. For every agent six points were tried, each with "
+    f"{len(_SPARSE_SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
+    f"{', '.join(x.partition(':')[2] for x in SPARSE_SEARCHED)}: three weights of the "
+    "entropy, and two learning rates for PPO or two weights of imitation or of novelty "
+    "for the others. The point with the highest return over the last fifth of "
+    "training, as a share of a success's, is used on all tasks. The other tasks, and "
+    "all with noise, had no part in the choice."
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class SparseSearch(Search):
+    """The search of an agent for one setting for all sparse tasks.
+
+    The point with the highest mean progress, over the tasks of the search and two
+    seeds, is chosen.
+    The progress is the return over the last fifth of training as a share of that from
+    which on the task is solved, between 0 and 1.
+    """
+
+    def _base(self) -> Algorithm:
+        own = {"behavior_cloning_coefficient": 1.0}
+        own = own if self.agent == "ppo+bc+novelty" else {}
+        return algorithm(self.agent, **SPARSE_BASE, **own)
+
+    def points(self, store: Store) -> tuple[Point, ...]:
+        """Return all points of the search."""
+        space = SPARSE_SPACES[self.agent]
+        rows = itertools.product(*space.values())
+        return tuple(dict(zip(space, row, strict=True)) for row in rows)
+
+    def requested(self, store: Store) -> list[Run]:
+        """Return the runs of the search on its own task."""
+        runs = self.runs(self.points(store), _SPARSE_SEEDS)
+        return list(itertools.chain(*runs))
+
+    def progress(self, store: Store) -> np.ndarray | None:
+        """Return the progress, (points, tasks, seeds), or None if runs are missing."""
+        points, every = self.points(store), []
+        for env in SPARSE_SEARCHED:
+            own = dataclasses.replace(self, env=env)
+            scores = own.scores(points, store, _SPARSE_SEEDS)
+            if scores is None:
+                return None
+            every.append(np.clip(scores / solved_from(env), 0.0, 1.0))
+        return np.stack(every, axis=1)
+
+    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
+        """Return the best point and its progress, or None if runs are missing."""
+        progress = self.progress(store)
+        if progress is None:
+            return None
+        chosen = int(progress.mean(axis=(1, 2)).argmax())
+        return self.points(store)[chosen], progress[chosen].ravel()
+
+
+@dataclasses.dataclass(frozen=True)
+class SparseShared(SparseSearch):
+    """The search of an agent for one setting, with PPO's learning rate and entropy.
+
+    PPO's search tries learning rates, in place of a coefficient of imitation.
+    """
+
+    def chosen(self, store: Store) -> Point | None:
+        """Return the chosen point with PPO's values, or None if runs lack."""
+        own = super().chosen(store)
+        shared = SparseSearch(self.env, "ppo").chosen(store)
+        return None if own is None or shared is None else {**own, **shared}
+
+
+@functools.cache
+def solved_from(env: str) -> float:
+    """Return the return from which on a sparse task is solved."""
+    return make_env(env).unwrapped.solved
 
 
 #: Every task with its delay, delayed ones first.

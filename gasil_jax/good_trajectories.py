@@ -209,6 +209,7 @@ def insert(
     episodes: Episodes,
     *,
     max_episodes: int | None = None,
+    newest: bool = False,
 ) -> GoodTrajectories:
     """Return the buffer with the best of its own and the offered episodes.
 
@@ -218,6 +219,7 @@ def insert(
       episodes: the offered episodes. Those whose return is not finite are rejected, so
         an episode in which any number is not finite must have such a return.
       max_episodes: number of episodes to keep at most; None for any number.
+      newest: whether the newer of two episodes with the same return comes first.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
     """
@@ -237,7 +239,14 @@ def insert(
     return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
-    order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
+    key = jnp.where(length > 0, -return_, jnp.inf)
+    if newest:
+        by_age = jnp.concatenate(
+            [jnp.arange(key.shape[0] - 1, capacity - 1, -1), jnp.arange(capacity)]
+        )
+        order = by_age[jnp.argsort(key[by_age], stable=True)]
+    else:
+        order = jnp.argsort(key, stable=True)
     if max_episodes is not None:
         # Entries of length 0 come last, so the first ones are the best episodes.
         length = length.at[order[max_episodes:]].set(0)

@@ -26,6 +26,7 @@ FAMILIES: Mapping[str, tuple[str, str]] = {
     "gymnax": ("gasil_envs.of_gymnax", "gymnax"),
     "navix": ("gasil_envs.of_navix", "navix"),
     "playground": ("gasil_envs.of_playground", "playground"),
+    "sparse": ("gasil_envs.mazes", "gasil_jax"),  # This package's own.
 }
 
 

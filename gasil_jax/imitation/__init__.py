@@ -13,12 +13,24 @@ from gasil_jax.imitation.behavior_cloning import PPOBC
 from gasil_jax.imitation.constant_bonus import PPOBonus
 from gasil_jax.imitation.interface import Agent
 from gasil_jax.imitation.none import PPO
+from gasil_jax.imitation.novelty import PPOBCNovelty, PPONovelty
 from gasil_jax.imitation.self_imitation import PPOSIL
 
 #: The package's own agents by name.
 AGENTS: Mapping[str, type[Agent]] = {
     agent.name: agent
-    for agent in (PPO, PPOBonus, PPOBC, PPOSIL, GASIL, PPOGASIL, PPOGASILAdaptive, GAIL)
+    for agent in (
+        PPO,
+        PPOBonus,
+        PPOBC,
+        PPONovelty,
+        PPOBCNovelty,
+        PPOSIL,
+        GASIL,
+        PPOGASIL,
+        PPOGASILAdaptive,
+        GAIL,
+    )
 }
 
 

@@ -3,9 +3,10 @@
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 
 from gasil_jax import good_trajectories
-from gasil_jax.config import count, switch
+from gasil_jax.config import choice, count, switch
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.imitation.interface import Agent
@@ -26,6 +27,11 @@ class BufferedAgent(Agent):
       sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
         return of their episode and s its standard deviation over the buffer's steps;
         otherwise uniformly.
+      admission: which episodes may enter the good-trajectory buffer: all, as in the
+        paper, or only those that are better than the mean of the episodes that ended in
+        the same batch.
+      ties: which of two episodes with the same return the buffer keeps: the oldest, as
+        in the paper, or the newest.
     """
 
     history_episodes: ClassVar[int] = 1
@@ -34,6 +40,8 @@ class BufferedAgent(Agent):
     buffer_episodes: int | None = count(None)
     buffer_discounts: bool = switch(True)
     sample_by_return: bool = switch(False)
+    admission: str = choice("all", ("all", "better"))
+    ties: str = choice("oldest", ("oldest", "newest"))
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
         """Return an empty buffer as the state."""
@@ -62,13 +70,32 @@ class BufferedAgent(Agent):
     @jax.named_scope("good_trajectories")
     def insert(self, buffer: GoodTrajectories, context: Context) -> GoodTrajectories:
         """Return the buffer with the whole episodes that ended in a batch."""
+        return self.insert_ranked(buffer, context, self.ranked_by(context.rollout))
+
+    def insert_ranked(
+        self, buffer: GoodTrajectories, context: Context, return_: jax.Array
+    ) -> GoodTrajectories:
+        """Return the buffer with episodes that are ranked by a given return.
+
+        Args:
+          buffer: the buffer before the batch.
+          context: the iteration's data.
+          return_: float32 (time, env), the episode's return up to each step.
+        """
         batch, history = context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.
+        if self.admission == "better":
+            own = jnp.where(batch.completed, self.ranked_by(batch), jnp.nan)
+            return_ = jnp.where(own > jnp.nanmean(own), return_, jnp.nan)
         episodes = good_trajectories.ended_episodes(
-            history, batch.ended, self.ranked_by(batch), length=batch.episode_length
+            history, batch.ended, return_, length=batch.episode_length
         )
         return good_trajectories.insert(
-            buffer, history, episodes, max_episodes=self.buffer_episodes
+            buffer,
+            history,
+            episodes,
+            max_episodes=self.buffer_episodes,
+            newest=self.ties == "newest",
         )
 
     def sample(

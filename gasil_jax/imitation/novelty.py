@@ -1,0 +1,186 @@
+"""PPO+NOVELTY, a bonus for what is seldom seen, and PPO+BC+NOVELTY, which also clones.
+
+Each observation falls into one of many cells: it is normalized, projected to a few
+random directions, and rounded. With n the number of visits to its cell so far, its
+novelty is 1 / sqrt(n) (count-based exploration by hashing, Tang et al. 2017). PPO
+maximizes
+
+    r + novelty_coefficient (novelty - its mean over the batch).
+
+The mean is subtracted so that ending an episode costs nothing: a bonus that is never
+negative pays for not arriving. PPO+NOVELTY is the control of PPO+BC+NOVELTY: how much
+better that is, is the effect of imitation.
+
+PPO+BC+NOVELTY also clones its best episodes. Where episodes have the same return, as
+all have before the first reward, the buffer keeps those with the most novelty. So the
+policy clones what is new until something is paid, and then what was paid best.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from gasil_jax import normalization
+from gasil_jax.config import choice, number
+from gasil_jax.context import Context, Metrics, Sizes
+from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.imitation.behavior_cloning import PPOBC
+from gasil_jax.imitation.interface import Agent
+from gasil_jax.ppo import ActorCritic
+
+# Number of counters, which cells share by a hash, and of random directions.
+_COUNTERS, _DIRECTIONS = 2**14, 4
+_PRIMES = (73856093, 19349663, 83492791, 49979687)
+# An episode's mean novelty, from 0 to 1, decides where returns differ by less.
+_TIE = 1e-3
+
+
+class Visits(struct.PyTreeNode):
+    """How often each cell was visited.
+
+    Attributes:
+      count: float32 (counters,), number of visits to the cells of each counter.
+      directions: float32 (obs, directions), random.
+      offset: float32 (directions,), where the cells begin, from 0 to 1.
+    """
+
+    count: jax.Array
+    directions: jax.Array
+    offset: jax.Array
+
+
+class PPONovelty(Agent):
+    """PPO on the environment's reward plus the centred novelty of where a step leads.
+
+    Attributes:
+      novelty_coefficient: weight of the novelty in the reward.
+      novelty_cell: width of a cell, in standard deviations of the observations.
+    """
+
+    name = "ppo+novelty"
+
+    novelty_coefficient: float = number(0.1, 0.0)
+    novelty_cell: float = number(0.5, 0.0, excludes_low=True)
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Any:
+        """Return the state before the first batch."""
+        return self.init_visits(key, sizes)
+
+    def init_visits(self, key: jax.Array, sizes: Sizes) -> Visits:
+        """Return counters of no visits; consumes the key."""
+        direction_key, offset_key = jax.random.split(key)
+        return Visits(
+            count=jnp.zeros(_COUNTERS),
+            directions=jax.random.normal(
+                direction_key, (sizes.observation, _DIRECTIONS)
+            ),
+            offset=jax.random.uniform(offset_key, (_DIRECTIONS,)),
+        )
+
+    def visits(self, state: Any) -> Visits:
+        """Return the counters in a state."""
+        return state
+
+    def count(self, visits: Visits, context: Context) -> Visits:
+        """Return the counters with a batch's visits."""
+        visited = self._counters(visits, context).ravel()
+        return visits.replace(count=visits.count.at[visited].add(1.0))
+
+    def novelty(self, visits: Visits, context: Context) -> jax.Array:
+        """Return the novelty of each next observation, (time, env), from 0 to 1."""
+        count = visits.count[self._counters(visits, context)]
+        return jax.lax.rsqrt(jnp.maximum(count, 1.0))
+
+    def _counters(self, visits: Visits, context: Context) -> jax.Array:
+        """Return the index of each next observation's counter, int32 (time, env)."""
+        observation = normalization.normalize(
+            context.normalizer, context.rollout.next_observation
+        )
+        along = observation @ visits.directions / self.novelty_cell
+        cell = jnp.floor(along + visits.offset).astype(jnp.int32)
+        mixed = jnp.sum(cell * jnp.array(_PRIMES, jnp.int32), axis=-1)
+        return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
+
+    def remember(self, state: Any, context: Context) -> Any:
+        """Count a batch's visits."""
+        return self.count(state, context)
+
+    def update_and_reward(
+        self, state: Any, context: Context, key: jax.Array
+    ) -> tuple[Any, jax.Array, Metrics]:
+        """Add the centred novelty to the environment's reward."""
+        novelty = self.novelty(self.visits(state), context)
+        bonus = self.novelty_coefficient * (novelty - jnp.mean(novelty))
+        metrics = {"novelty": jnp.mean(novelty)}
+        return state, context.rollout.reward + bonus, metrics
+
+
+class Explorer(struct.PyTreeNode):
+    """The state of PPO+BC+NOVELTY.
+
+    Attributes:
+      buffer: the good-trajectory buffer.
+      visits: the counters.
+      novelty: float32 (env,), sum over the running episode.
+    """
+
+    buffer: GoodTrajectories
+    visits: Visits
+    novelty: jax.Array
+
+
+class PPOBCNovelty(PPONovelty, PPOBC):
+    """PPO+NOVELTY, then cloning of the buffer.
+
+    Attributes:
+      novelty_ties: whether the buffer keeps the "novel" ones of episodes with the same
+        return, or, with "arrival", those that `ties` says.
+    """
+
+    name = "ppo+bc+novelty"
+
+    novelty_ties: str = choice("novel", ("novel", "arrival"))
+
+    def init(self, key: jax.Array, sizes: Sizes) -> Explorer:
+        """Return the state before the first batch."""
+        return Explorer(
+            buffer=self.init_buffer(sizes),
+            visits=self.init_visits(key, sizes),
+            novelty=jnp.zeros(sizes.num_envs),
+        )
+
+    def good_trajectories(self, state: Explorer) -> GoodTrajectories:
+        """Return the buffer in a state."""
+        return state.buffer
+
+    def visits(self, state: Explorer) -> Visits:
+        """Return the counters in a state."""
+        return state.visits
+
+    def remember(self, state: Explorer, context: Context) -> Explorer:
+        """Count the batch's visits, and insert its episodes into the buffer."""
+        batch, visits = context.rollout, self.count(state.visits, context)
+
+        def add(total: jax.Array, step: Any) -> Any:
+            novelty, ended = step
+            total += novelty
+            return jnp.where(ended, 0.0, total), total
+
+        steps = self.novelty(visits, context), batch.ended
+        novelty, total = jax.lax.scan(add, state.novelty, steps)
+        ranked_by = self.ranked_by(batch)
+        if self.novelty_ties == "novel":
+            ranked_by = ranked_by + _TIE * total / batch.episode_length
+        buffer = self.insert_ranked(state.buffer, context, ranked_by)
+        return Explorer(buffer, visits, novelty)
+
+    def update_policy(
+        self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
+    ) -> tuple[Any, ActorCritic, Metrics]:
+        """Take gradient steps on the cloning loss, if the buffer is not empty."""
+        buffer, actor_critic, metrics = super().update_policy(
+            state.buffer, actor_critic, context, key
+        )
+        return state.replace(buffer=buffer), actor_critic, metrics

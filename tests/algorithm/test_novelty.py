@@ -1,0 +1,91 @@
+"""PPO+NOVELTY and PPO+BC+NOVELTY: visits, bonus, and which ties the buffer keeps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import gasil_jax
+from gasil_jax import normalization
+from gasil_jax.imitation.novelty import PPOBCNovelty, PPONovelty
+from gasil_jax.testing import example_context
+
+ENV = gasil_jax.make_env("sparse:u_maze", max_episode_steps=8)
+CONFIG = gasil_jax.Config(batch_steps=128, num_envs=4, minibatch_size=64)
+KEY = jax.random.key(0)
+
+
+def context_of(agent):
+    return example_context(ENV, gasil_jax.Algorithm(agent, config=CONFIG), KEY)
+
+
+def test_novelty_is_one_over_the_root_of_the_visits():
+    agent = PPONovelty()
+    context = context_of(agent)
+    # Two places, far apart: one step in one of them, all others in the other.
+    places = jnp.zeros_like(context.rollout.next_observation).at[0, 0].set(1e3)
+    context = context.replace(
+        rollout=context.rollout.replace(next_observation=places),
+        normalizer=normalization.init(ENV.observation_size),
+    )
+    state = agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4))
+    for batches in (1, 2):
+        state = agent.remember(state, context)
+        novelty = np.array(agent.novelty(state, context))
+        assert novelty[0, 0] == np.float32(batches**-0.5)
+        np.testing.assert_allclose(novelty[1:], (127 * batches) ** -0.5, rtol=1e-6)
+    _, reward, metrics = agent.update_and_reward(state, context, KEY)
+    bonus = reward - context.rollout.reward
+    np.testing.assert_allclose(jnp.mean(bonus), 0.0, atol=1e-6)
+    np.testing.assert_allclose(bonus, 0.1 * (novelty - novelty.mean()), atol=1e-6)
+    np.testing.assert_allclose(metrics["novelty"], novelty.mean(), rtol=1e-6)
+
+
+def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
+    def kept(**settings):
+        agent = PPOBCNovelty(buffer_steps=8, buffer_episodes=1, **settings)
+        context = context_of(agent)
+        batch = context.rollout
+        # Environment 2 is alone where it is; the history has its observations too.
+        places = jnp.zeros_like(batch.next_observation).at[:, 2].set(1e3)
+        context = context.replace(
+            rollout=batch.replace(next_observation=places, reward=0.0 * batch.reward),
+            normalizer=normalization.init(ENV.observation_size),
+        )
+        state = agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40))
+        buffer = agent.remember(state, context).buffer
+        assert buffer.size > 0
+        first = np.array(buffer.action[0])
+        return int(np.where((np.array(batch.action) == first).all(-1))[1][0])
+
+    assert kept() == 2
+    assert kept(novelty_ties="arrival") != 2
+
+
+def test_ties_and_admission_of_the_buffer():
+    def kept(**settings):
+        agent = gasil_jax.PPOBC(buffer_steps=8, buffer_episodes=1, **settings)
+        context = context_of(agent)
+        batch, sizes = context.rollout, gasil_jax.context.sizes_of(ENV, 4, 40)
+        buffer = agent.remember(agent.init(KEY, sizes), context)
+        if buffer.size == 0:
+            return None
+        first = np.array(buffer.action[0])
+        return int(np.where((np.array(batch.action) == first).all(-1))[0][0])
+
+    # All episodes return 0.
+    assert kept() < kept(ties="newest")
+    assert kept(admission="better") is None
+
+
+def test_only_better_episodes_are_admitted():
+    agent = gasil_jax.PPOBC(admission="better")
+    context = context_of(agent)
+    batch = context.rollout
+    returns = jnp.zeros_like(batch.discounted_return).at[:, 1].set(1.0)
+    context = context.replace(rollout=batch.replace(discounted_return=returns))
+    buffer = agent.remember(
+        agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40)), context
+    )
+    count = int(np.sum(np.array(batch.ended)[:, 1] & ~np.array(batch.cut_short)[:, 1]))
+    assert buffer.size == 8 * count > 0
+    assert (buffer.return_[: buffer.size] == 1.0).all()

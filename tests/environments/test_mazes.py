@@ -1,0 +1,155 @@
+"""The sparse tasks: the contract, their rules, and that each can be solved."""
+
+import collections
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from environment_contract import check_reset_and_step
+
+import gasil_envs
+from gasil_envs import mazes, own_environment, pictures, wrappers
+
+
+@pytest.mark.parametrize("name", mazes.names())
+def test_reset_and_step(name):
+    env = gasil_envs.make(f"sparse:{name}")
+    own_environment.check(name, env.env, env)
+    check_reset_and_step(
+        env,
+        jax.jit(jax.vmap(env.reset)),
+        jax.jit(jax.vmap(env.step)),
+        same_start=wrappers.is_discrete(env),
+    )
+    state = env.reset(jax.random.key(0)).pipeline_state
+    picture = pictures.painter(env, (60, 40)).draw([jax.tree.map(np.asarray, state)])
+    assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()
+
+
+MAZES = [name for name, x in mazes.TASKS.items() if isinstance(x, mazes.Layout)]
+
+
+def shortest(rows, start, goals, closed):
+    """The cells on a shortest way, the start included, by breadth-first search."""
+    came_from, waiting = {start: None}, collections.deque([start])
+    while waiting:
+        cell = waiting.popleft()
+        if cell in goals:
+            way = [cell]
+            while came_from[way[-1]] is not None:
+                way.append(came_from[way[-1]])
+            return way[::-1]
+        for move in mazes._MOVES.astype(int):
+            other = (cell[0] + int(move[0]), cell[1] + int(move[1]))
+            if rows[other[0]][other[1]] not in closed and other not in came_from:
+                came_from[other] = cell
+                waiting.append(other)
+    raise AssertionError("there is no way")
+
+
+def cells_of(rows, kinds):
+    return {
+        (i, j) for i, row in enumerate(rows) for j, x in enumerate(row) if x in kinds
+    }
+
+
+@pytest.mark.parametrize("name", MAZES)
+def test_a_maze_can_be_solved_in_its_time(name):
+    env = gasil_envs.make(f"sparse:{name}")
+    layout = env.unwrapped.layout
+    rows, at = layout.rows, min(cells_of(layout.rows, "S"))
+    way = [at]
+    for goals, closed in ((cells_of(rows, "K"), "#D"), (cells_of(rows, "GT"), "#")):
+        if goals:
+            way += shortest(rows, way[-1], goals, closed)[1:]
+    state, step, total = env.reset(jax.random.key(0)), jax.jit(env.step), 0.0
+    for cell in way[1:]:
+        # Towards the next cell's middle, as far as one step goes, until it is reached.
+        while True:
+            position = np.asarray(state.pipeline_state.position)
+            ahead = np.array(cell) + 0.5 - position
+            if layout.speed is None:
+                action = jnp.int32(np.argmax(mazes._MOVES @ ahead))
+            else:
+                action = jnp.array(ahead / layout.speed, jnp.float32)
+            state = step(state, action)
+            total += float(state.reward)
+            if state.done or np.abs(ahead).max() <= (layout.speed or 1.0):
+                break
+        if state.done:
+            break
+    assert total >= layout.solved and not wrappers.truncated(state)
+    assert state.info["steps"] < 0.8 * layout.episode_length
+
+
+def test_a_door_opens_with_the_key_alone_and_an_object_pays_once():
+    env = mazes.Maze(mazes.Layout(("#####", "#SKD#", "#A.T#", "#####"), 9, None, 10.0))
+    moves = {"up": 0, "down": 1, "left": 2, "right": 3}
+
+    def walk(*names):
+        state, rewards = env.reset(jax.random.key(0)), []
+        for name in names:
+            state = env.step(state, jnp.int32(moves[name]))
+            rewards.append(float(state.reward))
+        return state, rewards
+
+    state, rewards = walk("right", "left", "right", "right", "down")
+    assert rewards == [1, 0, 0, 0, 10] and state.done
+    shut = mazes.Maze(mazes.Layout(("#####", "#SDT#", "#K..#", "#####"), 9, None, 10.0))
+    state = shut.reset(jax.random.key(0))
+    blocked = shut.step(state, jnp.int32(3))
+    np.testing.assert_array_equal(
+        blocked.pipeline_state.position, state.pipeline_state.position
+    )
+    state, rewards = walk("down", "up", "up")
+    assert rewards == [1, 0, 0] and not state.done  # An apple; then a wall.
+
+
+@pytest.mark.parametrize("size", [10, 20])
+def test_only_the_right_actions_reach_the_chest(size):
+    env = gasil_envs.make(f"sparse:deep_sea_{size}")
+    state, total = env.reset(jax.random.key(0)), 0.0
+    for i in range(size):
+        assert not state.done
+        state = env.step(state, jnp.int32(env.unwrapped._right[i, i]))
+        total += float(state.reward)
+    assert state.done and not wrappers.truncated(state)
+    assert total == pytest.approx(0.99) and total >= env.unwrapped.solved
+
+
+def test_a_car_that_pushes_with_its_velocity_leaves():
+    env = gasil_envs.make("sparse:mountain_car")
+
+    def push(state, _):
+        state = env.step(state, jnp.sign(state.pipeline_state[1:] + 1e-6))
+        return state, (state.reward, state.done)
+
+    start = env.reset(jax.random.key(0))
+    rewards, done = jax.jit(lambda x: jax.lax.scan(push, x, length=300)[1])(start)
+    steps = int(np.argmax(done)) + 1
+    assert done.any() and rewards[:steps].sum() >= env.unwrapped.solved
+
+
+def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
+    env = mazes.ActionNoise(mazes.build("u_maze"), 0.5)
+    step = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(2)))
+    moved = jax.vmap(step)(jax.random.split(jax.random.key(0), 500))
+    moves = (
+        moved.pipeline_state.position
+        - jax.vmap(env.reset)(
+            jax.random.split(jax.random.key(0), 500)
+        ).pipeline_state.position
+    )
+    # Its velocity is the speed times noise of half a deviation.
+    assert np.std(moves) == pytest.approx(0.15, rel=0.1)
+    np.testing.assert_array_equal(
+        step(jax.random.key(3)).obs, step(jax.random.key(3)).obs
+    )
+    grid = mazes.ActionNoise(mazes.build("key_grid"), 0.4)
+    after = jax.vmap(lambda key: grid.step(grid.reset(key), jnp.int32(1)))(
+        jax.random.split(jax.random.key(1), 1000)
+    )
+    other = jax.vmap(grid.reset)(jax.random.split(jax.random.key(1), 1000))
+    down = after.pipeline_state.position[:, 0] - other.pipeline_state.position[:, 0]
+    assert np.mean(down == 1) == pytest.approx(0.7, abs=0.05)

@@ -1,0 +1,98 @@
+"""Shares of seeds that solve a task: against SciPy, and what a page says of them."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import scipy.stats
+
+from experiments import report, shares
+from experiments.figures import FIGURES
+from experiments.search import (
+    SPARSE_SEARCHED,
+    SPARSE_SPACES,
+    SparseSearch,
+    solved_from,
+)
+from experiments.store import Record, Store
+from gasil_jax.errors import InputError
+
+PROVENANCE = {"physics": "mjx", "versions": {}, "commit": "", "device": "none"}
+
+
+def record(*returns):
+    steps = 1000 * np.arange(1, len(returns) + 1)
+    values = np.array(returns, float)
+    return Record(steps, values, values, PROVENANCE)
+
+
+@pytest.mark.parametrize("counts", [(0, 0), (3, 9), (20, 0), (7, 6), (20, 20)])
+def test_the_exact_test_is_scipys(counts):
+    table = [[x, n - x] for x, n in zip(counts, (20, 20))]
+    expected = scipy.stats.fisher_exact(table).pvalue
+    assert shares.fisher_p(counts[0], 20, counts[1], 20) == pytest.approx(expected)
+
+
+def test_a_seed_solves_a_task_with_half_of_a_successs_return():
+    assert shares.is_solved(record(0, 0.5), 1.0)
+    assert not shares.is_solved(record(1, 0.49), 1.0)
+    assert not shares.is_solved(record(0, np.nan), 1.0)
+    assert shares.steps_until(record(0, 0.6, 0, 1), 1.0) == 2000
+    assert np.isnan(shares.steps_until(record(0, 0.4), 1.0))
+
+
+def test_differences_are_corrected_and_the_mean_is_over_panels():
+    some = lambda count: np.arange(20) < count
+    solved = {(p, "a"): some(18) for p in "xyz"} | {(p, "b"): some(4) for p in "xyz"}
+    solved |= {("z", "b"): some(17)}
+    result = shares.compare(solved, [(p, "a", "b") for p in "xyz"])
+    assert [result[p, "a", "b"].verdict for p in "xyz"] == [
+        *("better", "better", "not clear")
+    ]
+    alone = shares.fisher_p(18, 20, 4, 20)
+    assert result["x", "a", "b"].p == pytest.approx(3 * alone)
+    middle, (low, high), p = shares.overall(solved, "xyz", "a", other="b")
+    assert middle == pytest.approx((14 + 14 + 1) / 60) and low < middle < high
+    assert p < 0.001
+    *_, same = shares.overall(solved, "xyz", "a", other="a")
+    assert same == 1.0
+
+
+def test_one_point_is_chosen_for_all_tasks(tmp_path):
+    store = Store(tmp_path)
+    search = SparseSearch(SPARSE_SEARCHED[0], "ppo")
+    good = search.points(store)[3]
+    for env in SPARSE_SEARCHED:
+        assert search.best(store) is None
+        own = dataclasses.replace(search, env=env)
+        store.add(
+            {
+                run: record(
+                    *[solved_from(env) * (run.algorithm == own.algorithm(good))] * 10
+                )
+                for run in own.requested(store)
+            }
+        )
+    point, progress = search.best(store)
+    assert point == good and (progress == 1.0).all()
+    # Other tasks, with noise for example, get the same point.
+    noisy = SparseSearch("sparse:u_maze_noisy", "ppo")
+    assert noisy.chosen(store) == good
+    assert {len(SparseSearch("", x).points(store)) for x in SPARSE_SPACES} == {6}
+
+
+def test_a_page_tells_shares_and_verdicts(tmp_path):
+    store, figure = Store(tmp_path), FIGURES["sparse_causes"]
+    for curves in figure.panels.values():
+        for name, curve in curves.items():
+            best = solved_from(curve.env) if name == "novelty" else 0.0
+            store.add({run: record(*[best] * 10) for run in curve.runs(store)})
+    page = report.Page("sparse_causes", store)
+    table = page.shares()
+    assert "| mean | 0.00 |" in table and "1.00 (1)" in table
+    words = "novelty against ppo: mean share +1.00 [+1.00, +1.00], better; better on 3"
+    assert f"{words} of 3 tasks" in page.lead("novelty")
+    assert "How to read this" in page.text()
+    assert page.picture().axes
+    with pytest.raises(InputError):
+        report.Page("matrix", store).shares()
