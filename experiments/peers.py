@@ -6,6 +6,7 @@ for gymnax before 1.0, so they get its environments through gymnax' own wrapper 
 programs.
 """
 
+import functools
 import importlib.util
 import pathlib
 import time
@@ -193,6 +194,4 @@ def programs(
         compiled = train.lower(keys).compile()
         seconds = time.perf_counter() - began
         jax.block_until_ready(compiled(keys))
-        def run(compiled=compiled, keys=keys):
-            return compiled(keys)
-        yield package, run, seconds, seeds * total_steps
+        yield package, functools.partial(compiled, keys), seconds, seeds * total_steps

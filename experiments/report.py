@@ -498,8 +498,8 @@ class Page:
 
     def _sparse(self, kind: str) -> list[str]:
         """Return the panels of tasks with noise, for "noisy", or without."""
-        is_kind = lambda panel: panel.endswith("_noisy") == (kind == "noisy")
-        return [panel for panel in self.figure.panels if is_kind(panel)]
+        noisy = kind == "noisy"
+        return [x for x in self.figure.panels if x.endswith("_noisy") == noisy]
 
     def shares(self, kind: str = "") -> str:
         """Return the share of seeds that solve each task: a column for each curve.

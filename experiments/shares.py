@@ -42,7 +42,10 @@ def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
       other_seeds: number of its seeds.
     """
     solved, seeds = ours + other, our_seeds + other_seeds
-    ways = lambda x: math.comb(our_seeds, x) * math.comb(other_seeds, solved - x)
+
+    def ways(x: int) -> int:
+        return math.comb(our_seeds, x) * math.comb(other_seeds, solved - x)
+
     counts = range(max(0, solved - other_seeds), min(solved, our_seeds) + 1)
     as_rare = [ways(x) for x in counts if ways(x) <= ways(ours)]
     return sum(as_rare) / math.comb(seeds, solved)
