@@ -102,7 +102,7 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
-        # The functions for NumPy broadcast as NumPy does.
+        # The functions for NumPy, and bounds of actions, broadcast as NumPy does.
         with jax.numpy_rank_promotion("allow"):
             if network is not None:
                 inputs = numpy_policy.inputs(arrays, float32(observation), jnp)
@@ -111,10 +111,10 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
                 parameters = numpy_policy.output(arrays, float32(observation), jnp)
                 if not discrete:
                     parameters = parameters, arrays["log_std"]
-        if key is None:
-            action = distribution.mode(parameters)
-        else:
-            action = distribution.sample(key, parameters)
-        return distribution.executed(action, arrays.get("low"), arrays.get("high"))
+            if key is None:
+                action = distribution.mode(parameters)
+            else:
+                action = distribution.sample(key, parameters)
+            return distribution.executed(action, arrays.get("low"), arrays.get("high"))
 
     return policy
