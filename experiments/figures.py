@@ -296,6 +296,17 @@ _LIMITS = joined(
 )
 
 
+def _changes() -> Comparisons:
+    """Compare each arm of the causes with that from which it differs in one thing."""
+    paper, centred, both = "gasil, as the paper", "gasil, centered", "novelty, cloning"
+    pairs = [(paper, "ppo"), ("gasil, logit", paper), (centred, paper)]
+    pairs += [(x.name, centred) for x in _CAUSES if x.name.startswith(f"{centred},")]
+    pairs += [("cloning", centred), ("cloning", "ppo"), ("novel ties", "cloning")]
+    pairs += [(x.name, "cloning") for x in _CAUSES if x.name.startswith("cloning,")]
+    pairs += [("novelty", "ppo"), (both, "novelty"), (f"{both}, oldest of ties", both)]
+    return {(p, *x): difference(p, *x) for p in _CAUSE_TASKS for x in pairs}
+
+
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
 _SPARSE_SHARED = [
@@ -330,7 +341,7 @@ _CAUSES = [
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
     Arm(
-        "novelty, cloning, oldest",
+        "novelty, cloning, oldest of ties",
         "ppo+bc+novelty",
         {**_CLONED, "novelty_ties": "arrival"},
     ),
@@ -562,7 +573,7 @@ FIGURES: Mapping[str, Figure] = {
             changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
             total_steps=SPARSE_STEPS,
         ),
-        favourite="ppo",
+        comparisons=_changes(),
         solved_from=solved_from,
     ),
 }

@@ -63,9 +63,10 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         # this font size a letter is about 0.07 inches wide.
         width = 0.5 + 0.07 * max(map(len, handle_of))
         fitting = max(1, min(4, int(size[0] / width)))
-        # So many names that their legend would leave no room for the panels.
-        lines = math.ceil(len(handle_of) / fitting)
-        picture.set_size_inches(size[0], size[1] + 0.17 * max(0, lines - 6))
+        if figure.solved_from is not None:
+            # Else the legend of many names takes the panels' room.
+            lines = math.ceil(len(handle_of) / fitting)
+            picture.set_size_inches(size[0], size[1] + 0.17 * lines)
         below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
         picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
     else:

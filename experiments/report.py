@@ -537,37 +537,41 @@ class Page:
         means = [f"{np.mean(x):.2f}" if len(x) == len(panels) else "" for _, x in whole]
         return markdown_table(["task", *names], [*rows, ["mean", *means]])
 
-    def lead(self, ours: str = "", kind: str = "") -> str:
-        """Return how a curve's shares of solving seeds compare with each other curve's.
+    def lead(self, ours: str = "", kind: str = "", *others: str) -> str:
+        """Return how a curve's shares of solving seeds compare with other curves'.
 
         The verdicts on tasks are one family, and those on the means another.
 
         Args:
-          ours: the curve; default the favourite.
+          ours: the curve, which is compared with each other one; default the figure's
+            own comparisons.
           kind: "noisy" for the tasks with noise; default those without.
+          *others: the curves to list the comparisons with; default all.
         """
-        solved, ours = self._solved(), ours or str(self.figure.favourite)
-        panels = self._sparse(kind)
-        having = {
-            other: [p for p in panels if {(p, ours), (p, other)} <= solved.keys()]
-            for other in self.figure.names(panels)
-            if other != ours
+        solved, panels = self._solved(), self._sparse(kind)
+        pairs = [key for key in self.figure.compared() if key[0] in panels]
+        if ours:
+            pairs = [(p, ours, x) for p in panels for x in self.figure.panels[p]]
+        having: dict[tuple[str, str], list[str]] = {}
+        for panel, first, second in pairs:
+            if {(panel, first), (panel, second)} <= solved.keys() and first != second:
+                having.setdefault((first, second), []).append(panel)
+        one = shares.compare(solved, [(p, *x) for x, ps in having.items() for p in ps])
+        mean = {
+            x: shares.overall(solved, ps, x[0], other=x[1]) for x, ps in having.items()
         }
-        having = {other: x for other, x in having.items() if x}
-        one = shares.compare(
-            solved, [(p, ours, other) for other, x in having.items() for p in x]
-        )
-        mean = {k: shares.overall(solved, x, ours, other=k) for k, x in having.items()}
-        p_values = corrected({other: p for other, (_, _, p) in mean.items()})
+        p_values = corrected({x: p for x, (_, _, p) in mean.items()})
         lines = []
-        for other, x in having.items():
-            middle, (low, high), _ = mean[other]
-            verdict = shares.Difference(middle, p_values[other]).verdict
-            verdicts = [one[p, ours, other].verdict for p in x]
-            lines.append(
-                f"- {ours} against {other}: mean share {middle:+.2f} [{low:+.2f}, "
-                f"{high:+.2f}], {verdict}; {counted(verdicts)} of {len(x)} tasks."
-            )
+        for (first, second), on in having.items():
+            middle, (low, high), _ = mean[first, second]
+            verdict = shares.Difference(middle, p_values[first, second]).verdict
+            verdicts = [one[panel, first, second].verdict for panel in on]
+            if second in (others or [second]):
+                lines.append(
+                    f"- {first} against {second}: mean share {middle:+.2f} "
+                    f"[{low:+.2f}, {high:+.2f}], {verdict}; {counted(verdicts)} of "
+                    f"{len(on)} tasks."
+                )
         return "\n".join(lines)
 
     def chosen(self) -> str:

@@ -24,6 +24,7 @@ from experiments.search import (
     TASKS,
     PaperSearch,
     Search,
+    SparseSearch,
     best_of,
 )
 from experiments.store import RESULTS, Store
@@ -320,7 +321,9 @@ class Summary:
                 # Adaptive imitation has one setting for all tasks, and the preset
                 # "paper" has normalized rewards.
                 raw = not getattr(search, "normalize_rewards", True)
-                if point is None or search.agent == ADAPTIVE or raw:
+                # So has each agent on the sparse tasks.
+                single = search.agent == ADAPTIVE or isinstance(search, SparseSearch)
+                if point is None or single or raw:
                     continue
                 settings = report.changed(search.algorithm(point))
                 kind = "delayed" if search.reward_delay > 1 else "dense"

@@ -12,8 +12,10 @@ from .imitation import PPOBC as PPOBC
 from .imitation import PPOGASIL as PPOGASIL
 from .imitation import PPOSIL as PPOSIL
 from .imitation import Agent as Agent
+from .imitation import PPOBCNovelty as PPOBCNovelty
 from .imitation import PPOBonus as PPOBonus
 from .imitation import PPOGASILAdaptive as PPOGASILAdaptive
+from .imitation import PPONovelty as PPONovelty
 from .imitation import agents as agents
 from .policy import load_policy as load_policy
 from .presets import preset as preset

@@ -22,8 +22,9 @@ from gasil_envs import wrappers
 #: The reward of each object, which is collected once, and those that end an episode.
 REWARDS: Mapping[str, float] = {"G": 1.0, "K": 1.0, "A": 1.0, "T": 10.0}
 _ENDING = ("G", "T")
-#: The four moves of a grid, and no noise to a point's start in it.
+#: The moves of a grid, in rows and columns: up, down, left, right.
 _MOVES = np.array([[-1, 0], [1, 0], [0, -1], [0, 1]], np.float32)
+#: How far from its cell's middle a point may start, in cells.
 _SPREAD = 0.4
 _U = (
     "#########",

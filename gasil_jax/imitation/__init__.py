@@ -53,8 +53,10 @@ __all__ = [
     "PPOGASIL",
     "PPOSIL",
     "Agent",
+    "PPOBCNovelty",
     "PPOBonus",
     "PPOGASILAdaptive",
+    "PPONovelty",
     "agents",
     "agents_with",
 ]

@@ -35,6 +35,8 @@ SELF_TAUGHT = (
     gasil_jax.PPOBonus(alpha=0.1),
     # The best two episodes, which differ from the others.
     gasil_jax.PPOBC(buffer_steps=100),
+    gasil_jax.PPONovelty(),
+    gasil_jax.PPOBCNovelty(buffer_steps=100),
     gasil_jax.PPOSIL(),
     gasil_jax.GASIL(alpha=1.0, **DISCRIMINATOR),
     gasil_jax.PPOGASIL(alpha=1.0, **DISCRIMINATOR),
