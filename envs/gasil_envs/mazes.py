@@ -157,7 +157,8 @@ class Maze:
             moved = position.at[axis].add(move[axis])
             row, column = moved.astype(jnp.int32)
             position = jnp.where(closed[row, column], position, moved)
-        here = jnp.all(position.astype(jnp.int32) == self._objects, axis=-1)
+        cell = position.astype(jnp.int32)
+        here = jnp.all(cell[None] == self._objects, axis=-1)
         taken = here & ~before.collected
         after = MazeState(position, before.collected | taken)
         return state.replace(

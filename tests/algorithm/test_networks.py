@@ -64,9 +64,9 @@ def test_networks_of_ones_own_are_trained_and_act(make):
     observation = np.ones((3, env.observation_size), np.float32)
     act = policy.from_state(state, env)
     learned = state.actor_critic.policy
-    parameters = learned.network.apply(
-        learned.params, numpy_policy.inputs(policy.weights(state, env), observation)
-    )
+    with jax.numpy_rank_promotion("allow"):
+        inputs = numpy_policy.inputs(policy.weights(state, env), observation)
+        parameters = learned.network.apply(learned.params, inputs)
     if hasattr(env, "num_actions"):
         np.testing.assert_array_equal(act(observation), parameters.argmax(axis=-1))
     else:

@@ -48,7 +48,7 @@ def test_it_is_the_networks_gaussian(saved, seed):
     np.testing.assert_allclose(in_numpy, expected, atol=1e-5)
 
     key = jax.random.key(3)
-    noise = jnp.exp(log_std) * jax.random.normal(key, mean.shape)
+    noise = jnp.exp(log_std)[None] * jax.random.normal(key, mean.shape)
     expected = jnp.clip(mean + noise, -1.0, 1.0)
     np.testing.assert_allclose(act(observation, key), expected, atol=1e-5)
 
