@@ -99,8 +99,12 @@ class PPONovelty(Agent):
             context.normalizer, context.rollout.next_observation
         )
         along = observation @ visits.directions / self.novelty_cell
-        cell = jnp.floor(along + visits.offset).astype(jnp.int32)
-        mixed = jnp.sum(cell * jnp.array(_PRIMES, jnp.int32), axis=-1)
+        offset, primes = (
+            jax.lax.broadcast_to_rank(x, along.ndim)
+            for x in (visits.offset, jnp.array(_PRIMES, jnp.int32))
+        )
+        cell = jnp.floor(along + offset).astype(jnp.int32)
+        mixed = jnp.sum(cell * primes, axis=-1)
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
     def remember(self, state: Any, context: Context) -> Any:
