@@ -322,6 +322,7 @@ def test_the_python_of_the_documentation_runs(finished_hopper):
     assert names["state"].iteration.shape == (2,)
     assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+    assert names["tried"].metrics["episode_return"].shape == (2, 10, 2)
     result = names["result"]
     assert result.metrics["episode_return"].shape == (10, 2)
     # The untrained policy and the last one.
