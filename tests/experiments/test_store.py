@@ -219,7 +219,7 @@ def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
 
 def test_what_is_checked_in_is_small_and_of_few_files():
     files = [x for x in RESULTS.rglob("[!.]*") if x.is_file()]
-    assert len(files) <= 60 and sum(x.stat().st_size for x in files) < 6e6
+    assert len(files) <= 70 and sum(x.stat().st_size for x in files) < 6e6
     # A pattern of .gitignore would leave them out.
     git = ("git", "-C", str(RESULTS), "check-ignore", "-q", *map(str, files))
     assert subprocess.run(git).returncode != 0
@@ -228,7 +228,7 @@ def test_what_is_checked_in_is_small_and_of_few_files():
 @pytest.mark.parametrize("path", sorted((RESULTS / "runs").glob("*.npz")), ids=str)
 def test_what_is_checked_in_says_what_it_was_trained_with(path):
     for each, kept in read(path).items():
-        assert path.stem == each.env
+        assert path.stem == each.env.replace(":", "-")
         assert {"physics", "versions", "commit", "clean"} <= set(kept.provenance)
         assert (np.diff(kept.env_steps) > 0).all()
         assert kept.env_steps[-1] == 2048 * each.algorithm.config.num_iterations
