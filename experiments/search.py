@@ -338,6 +338,8 @@ SPARSE = tuple(
     for name in (
         *("u_maze", "u_maze_short", "key_maze", "key_maze_short", "four_rooms"),
         *("apple_maze", "key_grid", "deep_sea_10", "deep_sea_20", "mountain_car"),
+        # Chosen for how often PPO solves them; no search trains on them.
+        *("key_grid_large", "u_maze_large", "two_keys_maze", "far_key_maze"),
     )
 )
 _ENTROPIES: Space = {"entropy_coefficient": (0.0, 0.01, 0.03)}

@@ -2,7 +2,7 @@
 
 Nothing is paid until a long sequence of right actions has succeeded once. A maze is
 data: rows of characters, one for each cell. `#` is a wall and `S` the start. `G`, a
-goal, and `T`, a treasure, end the episode. `D` is a door, which opens once the key `K`
+goal, and `T`, a treasure, end the episode. `D` is a door, which opens once each key `K`
 is taken. `A` is an apple, which pays like the key but leads nowhere. In the tasks whose
 names end in _noisy, actions have noise.
 """
@@ -81,6 +81,52 @@ _ROOMS = (
     "#....#...G#",
     "###########",
 )
+_KEY_GRID_LARGE = (
+    "#############",
+    "#K....#....A#",
+    "#.....#.....#",
+    "#.....#.....#",
+    "#.....#...S.#",
+    "#.....#.....#",
+    "#...........#",
+    "######D######",
+    "#...........#",
+    "#...........#",
+    "#T..........#",
+    "#############",
+)
+_U_LARGE = (
+    "###########",
+    "#....G....#",
+    "#.........#",
+    "#.#######.#",
+    "#.#.....#.#",
+    "#.#.....#.#",
+    "#.#..S..#.#",
+    "#.#.....#.#",
+    "#.........#",
+    "###########",
+)
+_TWO_KEYS = (
+    "#########",
+    "#K..#..K#",
+    "#...#...#",
+    "#...S...#",
+    "####D####",
+    "#.......#",
+    "#......T#",
+    "#########",
+)
+_FAR_KEY = (
+    "###########",
+    "#...A.....#",
+    "#....S....#",
+    "#.........#",
+    "#####D###.#",
+    "#.......#.#",
+    "#......T#K#",
+    "###########",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,8 +196,8 @@ class Maze:
             move = jnp.asarray(_MOVES)[action]
         else:
             move = self.layout.speed * jnp.clip(action, -1.0, 1.0)
-        has_key = jnp.any(before.collected & self._is_key)
-        closed = self._wall | (self._door & ~has_key)
+        has_keys = jnp.all(before.collected | ~self._is_key)
+        closed = self._wall | (self._door & ~has_keys)
         position = before.position
         for axis in range(2):
             moved = position.at[axis].add(move[axis])
@@ -187,7 +233,7 @@ class Maze:
             picture[cells == kind] = color
         for at in self._objects[np.asarray(state.collected)]:
             picture[tuple(at)] = 225
-        if np.any(state.collected & self._is_key):
+        if np.all(np.asarray(state.collected) | ~self._is_key):
             picture[self._door] = 225
         return _enlarged(picture, size, np.asarray(state.position))
 
@@ -349,6 +395,10 @@ TASKS: Mapping[str, Any] = {
     "deep_sea_10": 10,
     "deep_sea_20": 20,
     "mountain_car": None,
+    "key_grid_large": Layout(_KEY_GRID_LARGE, 100, speed=None, solved=10.0),
+    "u_maze_large": Layout(_U_LARGE, 150),
+    "two_keys_maze": Layout(_TWO_KEYS, 200, speed=0.25, solved=10.0),
+    "far_key_maze": Layout(_FAR_KEY, 250, speed=0.3, solved=10.0),
 }
 _NOISY, _NOISE = "_noisy", {"point": 0.5, "discrete": 0.1}
 
