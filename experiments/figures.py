@@ -300,6 +300,7 @@ def _changes() -> Comparisons:
     """Compare each arm of the causes with that from which it differs in one thing."""
     paper, centred, both = "gasil, as the paper", "gasil, centered", "novelty, cloning"
     pairs = [(paper, "ppo"), ("gasil, logit", paper), (centred, paper)]
+    pairs += [("gasil, absorbing", paper)]
     pairs += [(x.name, centred) for x in _CAUSES if x.name.startswith(f"{centred},")]
     pairs += [("cloning", centred), ("cloning", "ppo"), ("novel ties", "cloning")]
     pairs += [(x.name, "cloning") for x in _CAUSES if x.name.startswith("cloning,")]
@@ -319,6 +320,7 @@ _CAUSES = [
     Arm("ppo", "ppo"),
     Arm("gasil, as the paper", "ppo+gasil", _GASIL),
     Arm("gasil, logit", "ppo+gasil", {**_GASIL, "bonus": "logit"}),
+    Arm("gasil, absorbing", "ppo+gasil", {**_GASIL, "bonus": "absorbing"}),
     Arm("gasil, centered", "ppo+gasil", _CENTRED),
     *(
         Arm(f"gasil, centered, {name}", "ppo+gasil", {**_CENTRED, **changes})

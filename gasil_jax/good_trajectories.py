@@ -27,6 +27,8 @@ class GoodTrajectories(struct.PyTreeNode):
       return_: float32 (C,), the return of the step's episode; 0 where empty.
       time: int32 (C,), the step's index in its episode.
       size: int32 (), number of filled steps; they are the first ones.
+      terminated: bool (C,), whether the step's episode ended and has no future value;
+        None if it is not kept.
     """
 
     observation: jax.Array
@@ -34,6 +36,7 @@ class GoodTrajectories(struct.PyTreeNode):
     return_: jax.Array
     time: jax.Array
     size: jax.Array
+    terminated: jax.Array | None = None
 
     @property
     def capacity(self) -> int:
@@ -80,16 +83,24 @@ class Episodes(struct.PyTreeNode):
       length: int32 (E,), number of steps.
       env: int32 (E,), index of the environment that the episode ran in.
       last: int32 (E,), index of its last step in that environment's ring.
+      terminated: bool (E,), whether the episode has no future value.
     """
 
     return_: jax.Array
     length: jax.Array
     env: jax.Array
     last: jax.Array
+    terminated: jax.Array | None = None
 
 
-def init(capacity: int, observation_size: int, action_size: int) -> GoodTrajectories:
-    """Return an empty buffer."""
+def init(
+    capacity: int,
+    observation_size: int,
+    action_size: int,
+    *,
+    keep_terminated: bool = False,
+) -> GoodTrajectories:
+    """Return an empty buffer, which keeps how episodes ended if that is wanted."""
     if capacity < 1:
         raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
     return GoodTrajectories(
@@ -98,6 +109,7 @@ def init(capacity: int, observation_size: int, action_size: int) -> GoodTrajecto
         return_=jnp.zeros(capacity, jnp.float32),
         time=jnp.zeros(capacity, jnp.int32),
         size=jnp.int32(0),
+        terminated=jnp.zeros(capacity, bool) if keep_terminated else None,
     )
 
 
@@ -178,7 +190,12 @@ def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
 
 
 def ended_episodes(
-    history: History, ended: jax.Array, return_: jax.Array, *, length: jax.Array
+    history: History,
+    ended: jax.Array,
+    return_: jax.Array,
+    *,
+    length: jax.Array,
+    terminated: jax.Array | None = None,
 ) -> Episodes:
     """Return the episodes that ended in the last recorded batch, oldest first.
 
@@ -188,6 +205,8 @@ def ended_episodes(
       return_: float32 (time, N), the episode's return up to this step, by which it is
         ranked.
       length: int32 (time, N), the episode's number of steps up to this one.
+      terminated: bool (time, N), whether it ended here without a future value; needed
+        if the buffer keeps that.
     """
     chex.assert_equal_shape([ended, return_, length])
     num_steps, num_envs = ended.shape
@@ -200,6 +219,7 @@ def ended_episodes(
         length=jnp.where(ended, length, 0).ravel(),
         env=jnp.broadcast_to(env, ended.shape).ravel(),
         last=jnp.broadcast_to(index[:, None], ended.shape).ravel(),
+        terminated=None if terminated is None else terminated.ravel(),
     )
 
 
@@ -274,12 +294,18 @@ def insert(
             0.0,
         )
 
+    terminated = good_trajectories.terminated
+    if terminated is not None:
+        assert episodes.terminated is not None, "this buffer keeps how episodes ended"
+        both = jnp.concatenate([terminated, episodes.terminated])
+        terminated = filled & both[source]
     return GoodTrajectories(
         observation=gather(good_trajectories.observation, history.observation),
         action=gather(good_trajectories.action, history.action),
         return_=jnp.where(filled, return_[source], 0.0),
         time=jnp.where(filled, time, 0),
         size=size,
+        terminated=terminated,
     )
 
 

@@ -40,6 +40,7 @@ from gasil_jax.imitation.buffered import BufferedAgent
 from gasil_jax.imitation.interface import Agent
 from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
+from gasil_jax.rollout import Rollout
 
 
 def softplus_bonus(logit: jax.Array) -> jax.Array:
@@ -73,13 +74,54 @@ def centered_bonus(logit: jax.Array) -> jax.Array:
     return softplus - jnp.mean(softplus)
 
 
-#: The forms of the bonus, functions of the logit of D on a batch, (time, env).
+_ABSORBING = "absorbing"
+#: The forms of the bonus, functions of the logit of D on a batch, (time, env). With
+#: "absorbing" a step that terminates its episode is also paid for what comes after.
 BONUSES: Mapping[str, Callable[[jax.Array], jax.Array]] = {
     "softplus": softplus_bonus,
     "logit": logit_bonus,
     "dail": dail_bonus,
     "centered": centered_bonus,
+    _ABSORBING: softplus_bonus,
 }
+
+
+def absorbed_share(
+    length: jax.Array, terminated: jax.Array, counted: jax.Array, gamma: Any
+) -> jax.Array:
+    """Return which share of discounted time some episodes spend in an absorbing state.
+
+    An episode that terminates after T steps is in it from then on, for a share of
+    gamma^T of its discounted time, and one that is truncated never. A further episode,
+    of a share of 1/2, keeps the result from 0 and 1.
+
+    Args:
+      length: number of steps of each episode.
+      terminated: whether it has no future value.
+      counted: whether it is an episode at all.
+      gamma: the discount factor.
+    """
+    share = jnp.where(counted & terminated, gamma**length, 0.0)
+    return (jnp.sum(share) + 0.5) / (jnp.sum(counted) + 1.0)
+
+
+def absorbing_logit(
+    buffer: GoodTrajectories, rollout: Rollout, gamma: Any
+) -> jax.Array:
+    """Return the logit of D in the absorbing state, (): its best value in closed form.
+
+    It is the log odds of the policy's absorbed share against the buffer's.
+    """
+    assert buffer.terminated is not None  # Ensured by `keeps_terminated`.
+    step = jnp.arange(buffer.capacity)
+    starts_next = jnp.append(buffer.time[1:] == 0, True) | (step + 1 >= buffer.size)
+    good = absorbed_share(
+        buffer.time + 1, buffer.terminated, starts_next & buffer.filled, gamma
+    )
+    policy = absorbed_share(
+        rollout.episode_length, rollout.terminated, rollout.completed, gamma
+    )
+    return jnp.log(policy) - jnp.log(good)
 
 
 def loss(
@@ -144,6 +186,8 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
+# With a gamma of 1 an absorbing state would be worth infinitely much.
+_LEAST_DISCOUNT = 1e-3
 _NORMALIZES_ACTIONS = "discriminator_normalizes_actions"
 
 
@@ -153,10 +197,13 @@ class Source(NamedTuple):
     Attributes:
       sample: (key, n) -> observation (n, obs), action (n, action).
       is_ready: bool (), whether there is anything to sample.
+      absorbing_logit: (rollout, gamma) -> the logit of D in the absorbing state, ();
+        None where it is not known how the imitated episodes end.
     """
 
     sample: Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
     is_ready: jax.Array
+    absorbing_logit: Callable[[Rollout, Any], jax.Array] | None = None
 
 
 class AdversarialAgent(Agent):
@@ -164,7 +211,7 @@ class AdversarialAgent(Agent):
 
     Attributes:
       bonus: form of the discriminator's reward: softplus (-log D, the paper's), logit,
-        dail or centered.
+        dail, centered or absorbing.
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_updates: gradient steps of the discriminator in an iteration.
       discriminator_minibatch_size: steps of the policy, and as many good steps, in one
@@ -225,6 +272,12 @@ class AdversarialAgent(Agent):
         pairs = self._preprocessor(context)(rollout.observation, rollout.action)
         logit = self.discriminator_network().apply(discriminator.params, *pairs)
         bonus = BONUSES[self.bonus](logit)
+        if self.bonus == _ABSORBING:
+            assert source.absorbing_logit is not None  # Ensured by `check`.
+            gamma = context.config.gamma
+            after = BONUSES[self.bonus](source.absorbing_logit(rollout, gamma))
+            horizon = gamma / jnp.maximum(1.0 - gamma, _LEAST_DISCOUNT)
+            bonus += jnp.where(rollout.terminated, horizon * after, 0.0)
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
 
     def discriminator(self, state: Any) -> Learner:
@@ -245,8 +298,9 @@ class AdversarialAgent(Agent):
         Raises:
           ValueError: if the bonus of a step depends on the batch that it is in.
         """
-        if self.bonus == "centered" or self.discriminator_normalizes_actions:
-            name = "bonus" if self.bonus == "centered" else _NORMALIZES_ACTIONS
+        depends = self.bonus in ("centered", _ABSORBING)
+        if depends or self.discriminator_normalizes_actions:
+            name = "bonus" if depends else _NORMALIZES_ACTIONS
             raise ValueError(
                 f"{name} is {getattr(self, name)!r}: the reward of a step then depends "
                 "on the batch that it is in"
@@ -384,7 +438,13 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
         return Source(
             lambda key, num_samples: self.sample(buffer, key, num_samples),
             buffer.size > 0,
+            lambda rollout, gamma: absorbing_logit(buffer, rollout, gamma),
         )
+
+    @property
+    def keeps_terminated(self) -> bool:
+        """Whether the buffer keeps how its episodes ended."""
+        return self.bonus == _ABSORBING
 
 
 class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
@@ -432,7 +492,13 @@ class GAIL(ShapedRewardAgent):
     expert: str | None = text()
 
     def check(self, sizes: Sizes) -> None:
-        """Raise `ValueError` unless there is an expert that fits the environment."""
+        """Raise `ValueError` unless there is a fitting expert and a fitting bonus."""
+        if self.bonus == _ABSORBING:
+            others = ", ".join(x for x in BONUSES if x != _ABSORBING)
+            raise ValueError(
+                f"bonus is {_ABSORBING!r}: an expert does not say how its episodes "
+                f"end, so it must be one of {others}"
+            )
         expert.check(self.expert, sizes)
 
     def discriminator(self, state: Learner) -> Learner:

@@ -55,10 +55,18 @@ class BufferedAgent(Agent):
         """Return the buffer in a state."""
         return state
 
+    @property
+    def keeps_terminated(self) -> bool:
+        """Whether the buffer keeps how its episodes ended."""
+        return False
+
     def init_buffer(self, sizes: Sizes) -> GoodTrajectories:
         """Return an empty buffer."""
         return good_trajectories.init(
-            self.buffer_steps, sizes.observation, sizes.action
+            self.buffer_steps,
+            sizes.observation,
+            sizes.action,
+            keep_terminated=self.keeps_terminated,
         )
 
     def ranked_by(self, batch: Rollout) -> jax.Array:
@@ -88,7 +96,11 @@ class BufferedAgent(Agent):
             own = jnp.where(batch.completed, self.ranked_by(batch), jnp.nan)
             return_ = jnp.where(own > jnp.nanmean(own), return_, jnp.nan)
         episodes = good_trajectories.ended_episodes(
-            history, batch.ended, return_, length=batch.episode_length
+            history,
+            batch.ended,
+            return_,
+            length=batch.episode_length,
+            terminated=batch.terminated if self.keeps_terminated else None,
         )
         return good_trajectories.insert(
             buffer,

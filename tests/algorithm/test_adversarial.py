@@ -4,7 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+import gasil_jax
 from gasil_jax.imitation import adversarial
+from gasil_jax.testing import example_context
 
 
 def test_gradient_is_the_papers():
@@ -56,3 +58,49 @@ def test_accuracy_is_the_share_that_is_told_apart():
     )[1]
     assert metrics["discriminator_policy_accuracy"] == 0.75
     assert metrics["discriminator_good_accuracy"] == 0.5
+
+
+def test_an_absorbing_state_is_paid_for_ever():
+    """Its logit and the bonus, in NumPy, from the buffer's and the batch's episodes."""
+    env = gasil_jax.make_env("sparse:u_maze", max_episode_steps=8)
+    agent = gasil_jax.PPOGASIL(bonus="absorbing", buffer_steps=20)
+    config = gasil_jax.Config(batch_steps=128, num_envs=4, minibatch_size=64)
+    key = jax.random.key(0)
+    context = example_context(env, gasil_jax.Algorithm(agent, config=config), key)
+    # All episodes of one environment terminate, and return most.
+    batch = context.rollout
+    first = jnp.arange(4) == 1
+    batch = batch.replace(
+        terminated=batch.ended & first[None],
+        truncated=batch.ended & ~first[None],
+        discounted_return=jnp.where(first, 1.0, 0.0)[None] + batch.discounted_return,
+    )
+    context = context.replace(rollout=batch)
+    sizes = gasil_jax.context.sizes_of(env, 4, 40)
+    state = agent.remember(agent.init(key, sizes), context)
+    # 20 steps of episodes of 8: the third is cut.
+    np.testing.assert_array_equal(state.buffer.terminated, True)
+    discounted = lambda lengths: sum(0.99**x for x in lengths) + 0.5
+    good = discounted([8, 8, 4]) / 4
+    ends = np.array(batch.terminated & batch.completed)
+    count = np.sum(np.array(batch.completed)) + 1
+    policy = discounted(np.array(batch.episode_length)[ends]) / count
+    logit = np.log(policy / good)
+    after = 0.99 / (1 - 0.99) * np.log1p(np.exp(-logit))
+    bonuses = [
+        agent.replace(bonus=bonus).update_and_score(
+            state.discriminator, agent.source(state.buffer), context, key
+        )[1]
+        for bonus in ("absorbing", "softplus")
+    ]
+    expected = np.where(batch.terminated, after, 0.0)
+    assert expected.any()
+    np.testing.assert_allclose(bonuses[0] - bonuses[1], expected, rtol=1e-4, atol=1e-4)
+
+
+def test_the_buffer_keeps_how_episodes_ended_only_where_that_is_used():
+    sizes = gasil_jax.context.Sizes(4, 3, 2, 40)
+    assert gasil_jax.PPOGASIL().init_buffer(sizes).terminated is None
+    assert (
+        gasil_jax.PPOGASIL(bonus="absorbing").init_buffer(sizes).terminated.any() == 0
+    )
