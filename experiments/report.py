@@ -530,12 +530,24 @@ class Page:
                     cell += f" ({np.median(steps) / 1000:.0f})" if steps else ""
                 cells.append(cell)
             rows.append(cells)
-        whole = [
-            (name, [solved[p, name].mean() for p in panels if (p, name) in solved])
-            for name in names
-        ]
-        means = [f"{np.mean(x):.2f}" if len(x) == len(panels) else "" for _, x in whole]
+        mean = self.mean_shares(kind)
+        means = [f"{mean[x]:.2f}" if x in mean else "" for x in names]
         return markdown_table(["task", *names], [*rows, ["mean", *means]])
+
+    def mean_shares(self, kind: str = "") -> dict[str, float]:
+        """Return the mean over tasks of the shares of solving seeds, by curve.
+
+        Only of curves that are complete on all tasks.
+
+        Args:
+          kind: "noisy" for the tasks with noise; default those without.
+        """
+        solved, panels = self._solved(), self._sparse(kind)
+        return {
+            name: float(np.mean([solved[p, name].mean() for p in panels]))
+            for name in self.figure.names(panels)
+            if all((p, name) in solved for p in panels)
+        }
 
     def lead(self, ours: str = "", kind: str = "", *others: str) -> str:
         """Return how a curve's shares of solving seeds compare with other curves'.

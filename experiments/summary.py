@@ -110,6 +110,8 @@ def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
 
 
 _OTHERS, _CONTROL = PAPERS[:-1], ("ppo+bonus",)
+#: The agents whose shares of solving seeds the README tells.
+_ON_SPARSE = (*PAPERS, "ppo+novelty", "ppo+bc+novelty")
 _GROWS = [key for key in FIGURES["stochastic_walker2d"].compared() if len(key) == 4]
 CLAIMS = (
     _tuned(
@@ -252,9 +254,9 @@ class Summary:
         return budgets
 
     def front(self) -> str:
-        """Return in three sentences what reproduces, what ends it, and what is better.
+        """Return what reproduces, what ends it, and what is better.
 
-        They are about delayed rewards.
+        First with delayed rewards, then with sparse ones.
         """
         protocol, tuned, decomposed = (
             [self._lead(figure, ours, other) for other in others]
@@ -271,7 +273,20 @@ class Summary:
             "learning rate are [tuned for every agent](experiments/results/matrix.md) "
             f"too, it is better than {', than '.join(tuned)}. PPO that [learns which "
             "steps earned a reward](experiments/results/delayed_rewards.md), without "
-            f"imitation, is better than the tuned {decomposed[0]}."
+            f"imitation, is better than the tuned {decomposed[0]}.\n\n"
+            f"{self._sparse()}"
+        )
+
+    def _sparse(self) -> str:
+        """Return how often agents with one setting each solve the sparse tasks."""
+        mean = self.pages["sparse"].mean_shares()
+        agents = [x for x in _ON_SPARSE if x in mean]
+        listed = ", ".join(f"{x.upper()} {mean[x]:.2f}" for x in agents)
+        return (
+            "**With sparse rewards**, and one setting of each agent for [all of these "
+            "tasks](experiments/results/sparse.md), the mean share of seeds that solve "
+            f"a task is: {listed}. NOVELTY explores what it has seldom seen; BC clones "
+            "the best episodes."
         )
 
     def _lead(self, name: str, ours: str, other: str) -> str:
