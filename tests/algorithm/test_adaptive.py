@@ -116,6 +116,7 @@ def twin(name, logit):
         "logit": ratio,
         "dail": 0.5 * (1 - d) * (np.tanh(ratio) + 1),
         "centered": -np.log(d) - np.mean(-np.log(d)),
+        "absorbing": -np.log(d),
     }[name]
 
 
