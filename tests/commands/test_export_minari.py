@@ -3,6 +3,7 @@
 import shutil
 import sys
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,8 +40,8 @@ def filled(untrained_hopper, tmp_path, monkeypatch):
     env, algorithm, _, states = saved_states.load(out)
     sizes = (env.observation_size, env.action_size)
     kept = buffer(LENGTHS, RETURNS, algorithm.agent.buffer_steps, *sizes)
-    lead = {name: jnp.asarray(value)[None] for name, value in vars(kept).items()}
-    agent = states.agent.replace(buffer=kept.replace(**lead))
+    with_seeds = jax.tree.map(lambda x: x[None], kept)
+    agent = states.agent.replace(buffer=with_seeds)
     states = states.replace(agent=agent)
     checkpoint.write(out / "checkpoints", 1, states, {"score": 1.0})
     return out, kept
