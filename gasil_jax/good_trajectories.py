@@ -100,7 +100,7 @@ def init(
     *,
     keep_terminated: bool = False,
 ) -> GoodTrajectories:
-    """Return an empty buffer, which keeps how episodes ended if that is wanted."""
+    """Return an empty buffer; `keep_terminated`: it keeps how episodes ended."""
     if capacity < 1:
         raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
     return GoodTrajectories(

@@ -11,8 +11,8 @@ from experiments import peers
 
 @pytest.mark.parametrize("missing", ["rejax", "ppo_continuous_action"])
 def test_a_peer_that_is_not_installed_is_told_in_a_line(missing, monkeypatch, capsys):
-    found = lambda name: None if name == missing else importlib.machinery.PathFinder
-    monkeypatch.setattr(importlib.util, "find_spec", found)
+    find_spec = lambda name: None if name == missing else importlib.machinery.PathFinder
+    monkeypatch.setattr(importlib.util, "find_spec", find_spec)
     assert experiments.main(["benchmark", "--tables", "peers"]) == 2
     told = capsys.readouterr().err.strip()
     name = "rejax" if missing == "rejax" else "purejaxrl"
