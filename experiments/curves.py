@@ -6,7 +6,7 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments.search import DELAY, PAPERS, Point, Search
+from experiments.search import DELAY, NEW_TASKS, PAPERS, Point, Search
 from experiments.store import Store
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
@@ -32,10 +32,12 @@ class Curve:
       reward_delay: the task's reward delay, in steps.
       obs_noise: standard deviation of the task's observation noise.
       terminal_limits: whether the task's step limit terminates an episode.
+      observe_phase: whether the observation has the phase of the task's delay.
       base: the settings before the changes: a preset's, by its name; the defaults, by
         None; or what a search chose, by a function of task, agent and
         delay that returns the search.
-      seeds: number of seeds, from seed 0 on.
+      seeds: number of seeds.
+      first_seed: number of the first seed.
       total_steps: environment steps per seed.
     """
 
@@ -45,8 +47,10 @@ class Curve:
     reward_delay: int = 1
     obs_noise: float = 0.0
     terminal_limits: bool = False
+    observe_phase: bool = False
     base: str | Callable[[str, str, int], Search] | None = "tuned"
     seeds: int = 10
+    first_seed: int = 0
     total_steps: int = 1_000_000
 
     @property
@@ -84,17 +88,21 @@ class Curve:
             algorithm = self.search.algorithm({})
         elif isinstance(self.base, str):
             algorithm = presets.preset(
-                self.env, self.agent, self.base, reward_delay=self.reward_delay
+                self.env,
+                self.agent,
+                self.base,
+                reward_delay=self.reward_delay,
+                action_size=NEW_TASKS.get(self.env),
             )
         algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
         settings = Settings(
             reward_delay=self.reward_delay,
             obs_noise=self.obs_noise,
             terminal_limits=self.terminal_limits,
+            observe_phase=self.observe_phase,
         )
-        return tuple(
-            Run(self.env, algorithm, seed, settings) for seed in range(self.seeds)
-        )
+        seeds = range(self.first_seed, self.first_seed + self.seeds)
+        return tuple(Run(self.env, algorithm, seed, settings) for seed in seeds)
 
 
 Panels = Mapping[str, Mapping[str, Curve]]

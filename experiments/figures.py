@@ -31,6 +31,7 @@ from experiments.search import (
     ADAPTIVE,
     CELLS,
     DELAY,
+    NEW_TASKS,
     PAIR,
     PAPER_STEPS_OF,
     PAPERS,
@@ -138,7 +139,18 @@ def _by_root(size: int) -> Point:
 #: PPO on decomposed rewards, and with a network that stays untrained, near 0: then each
 #: step of a window has the same share of its payout.
 _NEVER_TRAINED = {"decomposition_updates": 1, "decomposition_learning_rate": 1e-12}
-_CONTROLS = [_SCALED, Arm("ppo (equal shares, scaled)", "ppo", _NEVER_TRAINED)]
+_CONTROLS = [
+    _SCALED,
+    Arm("ppo (equal shares, scaled)", "ppo", _NEVER_TRAINED),
+    Arm(
+        "ppo (decomposed without next observation, scaled)",
+        "ppo",
+        {"decomposition_inputs": "pair"},
+    ),
+]
+_SEES_PHASE = Arm("ppo (sees the phase, scaled)", "ppo", {"decompose_rewards": False})
+#: The paper's agents without cloning.
+_RIVALS = ("ppo", "ppo+sil", "ppo+gasil")
 
 #: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
 _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
@@ -155,6 +167,25 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
         "gamma": max(0.99, 1 - size / 800),
     },
 }
+
+
+def _decomposition_panels(env: str, delay: int) -> Panels:
+    """Return decomposition and its controls on a task, all with the preset `scaled`."""
+    one = functools.partial(
+        grid, (env,), delays=(delay,), panel="{env} delayed {delay}", seeds=20
+    )
+    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
+    imitating = [Arm(f"{x} (decomposed, scaled)", x, scaled) for x in _RIVALS[1:]]
+    return joined(
+        [
+            one(_CONTROLS, base="scaled"),
+            one([_SEES_PHASE], base="scaled", observe_phase=True),
+            # Their coefficients are the defaults.
+            one(imitating, base=None),
+        ]
+    )
+
+
 _NOT_DECOMPOSED = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
 #: The preset `scaled` had these settings when this was trained, and now similar ones.
 _BY_ROOT = Arm(
@@ -187,6 +218,11 @@ _DELAYED = (
 def _usual_delay(env: str, agent: str, delay: int) -> Search:
     """Return the search with a delay of `DELAY`, whatever the delay is."""
     return Search(env, agent, DELAY)
+
+
+def _best_rank(env: str, agent: str, delay: int) -> Search:
+    """Return the search of one setting for all tasks with a delay of `DELAY`."""
+    return SingleSetting(env, agent, DELAY)
 
 
 def _seeds(env: str, delay: int) -> int:
@@ -427,15 +463,29 @@ FIGURES: Mapping[str, Figure] = {
     "decomposition_controls": Figure(
         "Delayed rewards: what learning which steps earned a reward is worth",
         "",
-        grid(
-            ("hopper", "walker2d", "halfcheetah", "swimmer"),
-            _CONTROLS,
-            (DELAY, 1000),
-            panel="{env} delayed {delay}",
-            base="scaled",
-            seeds=20,
+        joined(
+            _decomposition_panels(env, delay)
+            for env in TASKS[:4]
+            for delay in (DELAY, 1000)
         ),
-        favourite="ppo (decomposed, scaled)",
+        favourite=_SCALED.name,
+    ),
+    "scaled_test": Figure(
+        "Delayed rewards: the preset scaled on new seeds and on new tasks",
+        "",
+        joined(
+            [
+                *(
+                    grid(TASKS, arms, (DELAY,), base=base, seeds=20, first_seed=20)
+                    for arms, base in (([_SCALED], "scaled"), (_RIVALS, Search))
+                ),
+                *(
+                    grid([*NEW_TASKS], arms, (DELAY, 100), base=base)
+                    for arms, base in (([_SCALED], "scaled"), (_RIVALS, _best_rank))
+                ),
+            ]
+        ),
+        favourite=_SCALED.name,
     ),
     "action_dimension": Figure(
         "Delayed rewards: settings that follow the dimension of an action",

@@ -141,6 +141,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise InputError(
             "gymnasium is on: the run must be of a locomotion task of Gymnasium"
         )
+    if options.gymnasium and env.observation_size != env.unwrapped.observation_size:
+        raise InputError(
+            "gymnasium is on: the run must be without observe_phase, which Gymnasium's "
+            "observations lack"
+        )
     if options.gymnasium and options.stochastic:
         raise InputError("gymnasium is on: stochastic must be off")
     if not options.gymnasium:

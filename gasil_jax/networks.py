@@ -141,14 +141,12 @@ class Discriminator(nn.Module):
 
 
 class StepReward(nn.Module):
-    """The reward of a step, for `reward_decomposition`; near 0 before training."""
+    """The reward of a step, for `rewards.decomposition`; near 0 before training."""
 
     hidden_sizes: Sequence[int]
 
     @nn.compact
-    def __call__(
-        self, observation: jax.Array, action: jax.Array, next_observation: jax.Array
-    ) -> jax.Array:
-        """(..., obs), (..., action), (..., obs) -> (...)."""
-        x = jnp.concatenate([observation, action, next_observation], axis=-1)
+    def __call__(self, *step: jax.Array) -> jax.Array:
+        """What is seen of a step, (..., size) each -> (...)."""
+        x = jnp.concatenate(step, axis=-1)
         return MLP(self.hidden_sizes, 1, 0.01)(x)[..., 0]

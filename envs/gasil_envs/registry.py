@@ -36,6 +36,8 @@ class Settings:
         is truncated, and the value of its last observation is bootstrapped.
       max_episode_steps: number of steps after which an episode is truncated; None takes
         the environment's own limit, or 1000 if it has none.
+      observe_phase: whether the observation also says which share of the reward delay
+        has passed since the last payout.
     """
 
     reward_delay: int = 1
@@ -45,6 +47,7 @@ class Settings:
     integrator: str = "model"
     terminal_limits: bool = False
     max_episode_steps: int | None = None
+    observe_phase: bool = False
 
 
 _EPISODE_LENGTH = 1000
@@ -181,8 +184,11 @@ def check(name: str, settings: Settings) -> None:
             f"solver is {settings.solver!r}: it needs physics 'mjx', and physics is "
             f"{settings.physics!r}"
         )
-    if not isinstance(settings.terminal_limits, bool):
-        raise _refusal("terminal_limits", settings.terminal_limits, "True or False")
+    for field in ("terminal_limits", "observe_phase"):
+        if not isinstance(value := getattr(settings, field), bool):
+            raise _refusal(field, value, "True or False")
+    if settings.observe_phase and settings.reward_delay == 1:
+        raise ValueError("observe_phase is True: it needs a reward_delay above 1")
     delay, noise = settings.reward_delay, settings.obs_noise
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
@@ -222,7 +228,7 @@ def make(name: str, **settings: Any) -> Env:
         MODULE:NAME of your own class or function that builds an environment with Brax's
         interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
-        integrator, terminal_limits, max_episode_steps.
+        integrator, terminal_limits, max_episode_steps, observe_phase.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
@@ -243,6 +249,7 @@ def make(name: str, **settings: Any) -> Env:
     env = wrappers.EpisodeLimit(env, limit, terminal=chosen.terminal_limits)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, int(chosen.reward_delay))
+        env = wrappers.DelayPhase(env) if chosen.observe_phase else env
     if chosen.obs_noise > 0:
         env = wrappers.ObservationNoise(env, float(chosen.obs_noise))
     env._made_with = (name, chosen)

@@ -2,7 +2,8 @@
 
 Each keeps its own state in ``State.info`` and leaves the keys of the wrappers
 below it alone. Order, innermost first: `EpisodeLimit` (it decides when an episode
-ends), `RewardDelay` (it must see that end), `ObservationNoise`, `AutoReset`.
+ends), `RewardDelay` (it must see that end), `DelayPhase`, `ObservationNoise`,
+`AutoReset`.
 """
 
 from typing import Any
@@ -161,6 +162,33 @@ class RewardDelay(Wrapper):
             "delay_steps": steps,
         }
         return state.replace(reward=jnp.where(give, held, 0.0), info=info)
+
+
+class DelayPhase(Wrapper):
+    """Add to the observation how far the next payout of a `RewardDelay` is.
+
+    The number is the share of the delay that has passed since the last payout, from 0
+    up to but not 1.
+    """
+
+    @property
+    def observation_size(self) -> int:
+        """The number of numbers in an observation."""
+        return self.env.observation_size + 1
+
+    def _with_phase(self, state: State) -> State:
+        steps = state.info["delay_steps"] % self.env.delay
+        phase = (steps / self.env.delay).astype(state.obs.dtype)
+        return state.replace(obs=jnp.append(state.obs, phase))
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode with phase 0."""
+        return self._with_phase(self.env.reset(rng))
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step, and add the phase; the environment gets its own observation."""
+        state = state.replace(obs=state.obs[:-1])
+        return self._with_phase(self.env.step(state, action))
 
 
 class ObservationNoise(Wrapper):

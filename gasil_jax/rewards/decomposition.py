@@ -2,9 +2,9 @@
 
 A window is the steps between two payouts: it ends where the reward is not zero or the
 episode ends. The rewards alone show where windows end, so this works in any
-environment. A network g of (observation, action, next observation) learns the
-standardized reward of a step. With m and s the running mean and standard deviation of
-payout / length, it takes gradient steps on
+environment. A network g of (observation, action, next observation), or of the first
+two, learns the standardized reward of a step. With m and s the running mean and
+standard deviation of payout / length, it takes gradient steps on
 
     (mean_window g - (payout / length - m) / s)^2.
 
@@ -30,7 +30,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import good_trajectories, learner, normalization
-from gasil_jax.config import count, number, widths
+from gasil_jax.config import choice, count, number, widths
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import History
 from gasil_jax.learner import Learner
@@ -211,8 +211,10 @@ def _train(
     num_windows = settings.decomposition_minibatch_size
     num_rows = settings.decomposition_window_steps
     steps = complete.ends.shape[1]
-    assert history.next_observation is not None  # Ensured by the model's settings.
-    rings = (history.observation, history.action, history.next_observation)
+    rings: tuple[jax.Array, ...] = (history.observation, history.action)
+    if settings.keeps_next_observation:
+        assert history.next_observation is not None
+        rings += (history.next_observation,)
     mean, scale = normalization.moments(rates)
     counts = jnp.cumsum(complete.ends.ravel())
 
@@ -328,10 +330,12 @@ class Decompose(RewardModel):
         end of an episode, 1 leaves few windows.
       decomposition_hidden_sizes: widths of the tanh layers of the network that
         decomposes rewards.
+      decomposition_inputs: what that network sees of a step: transition, the
+        observation, the action and the next observation; or pair, without the next
+        observation.
     """
 
     switch = "decompose_rewards"
-    keeps_next_observation = True
 
     decomposition_learning_rate: float = number(1e-3, 0.0, excludes_low=True)
     decomposition_updates: int = count(20)
@@ -339,6 +343,12 @@ class Decompose(RewardModel):
     decomposition_window_steps: int = count(32)
     decomposition_history_episodes: int = count(1)
     decomposition_hidden_sizes: tuple[int, ...] = widths(100, 100)
+    decomposition_inputs: str = choice("transition", ("transition", "pair"))
+
+    @property
+    def keeps_next_observation(self) -> bool:
+        """Whether the network sees the next observation."""
+        return self.decomposition_inputs == "transition"
 
     @property
     def history_episodes(self) -> int:
@@ -353,7 +363,8 @@ class Decompose(RewardModel):
     def init(self, key: jax.Array, sizes: Sizes) -> Decomposition:
         """Return the state before the first window."""
         observation, action = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
-        params = self._network.init(key, observation, action, observation)
+        inputs = (observation, action, observation)
+        params = self._network.init(key, *inputs[: 2 + self.keeps_next_observation])
         return Decomposition(
             network=learner.init(params, learner.adam()),
             rates=normalization.init(1),
@@ -390,24 +401,21 @@ class Decompose(RewardModel):
             return normalization.normalize(context.normalizer, x)
 
         def predict(
-            params: Any,
-            observation: Any,
-            action: jax.Array,
-            next_observation: jax.Array,
+            params: Any, observation: jax.Array, action: jax.Array, *after: jax.Array
         ) -> jax.Array:
             return network.apply(
                 params,
                 normalize(observation),
                 jnp.clip(action, low, high),
-                normalize(next_observation),
+                *map(normalize, after),
             )
+
+        after = (batch.next_observation,) * self.keeps_next_observation
+        step = (batch.observation, batch.action, *after)
 
         def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
             mean, scale = normalization.moments(rates)
-            output = predict(
-                params, batch.observation, batch.action, batch.next_observation
-            )
-            return mean[0] + scale[0] * output
+            return mean[0] + scale[0] * predict(params, *step)
 
         # Measure how well the batch's ended windows are predicted, then train.
         ends = ends_window(batch.reward, batch.ended)

@@ -18,12 +18,14 @@ class RewardModel(struct.PyTreeNode):
 
     Attributes:
       switch: name of the setting that is true if an algorithm has this model.
-      keeps_next_observation: whether the history must have the observation after each
-        action.
     """
 
     switch: ClassVar[str]
-    keeps_next_observation: ClassVar[bool] = False
+
+    @property
+    def keeps_next_observation(self) -> bool:
+        """Whether the history must have the observation after each action."""
+        return False
 
     @property
     def history_episodes(self) -> int:

@@ -67,7 +67,7 @@ def random_batches(seed, num_batches, delay=5):
 
 
 @functools.cache
-def decompose_once():
+def decompose_once(inputs):
     def step(state, history, batch, key, learning_rate):
         history = good_trajectories.record(
             history,
@@ -88,29 +88,32 @@ def decompose_once():
             distribution=GAUSSIAN,
             value=None,
         )
-        model = MODEL.replace(decomposition_learning_rate=learning_rate)
+        model = MODEL.replace(
+            decomposition_learning_rate=learning_rate, decomposition_inputs=inputs
+        )
         state, context, _, metrics = model.update(state, context, key)
         return state, history, context.rollout.reward, metrics
 
     return jax.jit(step)
 
 
-def decompose_all(batches, failed=()):
+def decompose_all(batches, failed=(), inputs="transition"):
     """Decompose all batches; updates of the network after some of them are infinite."""
+    model = MODEL.replace(decomposition_inputs=inputs)
     history = good_trajectories.init_history(
         NUM_ENVS,
         NUM_STEPS,
         LIMIT,
         observation_size=OBS,
         action_size=ACT,
-        keep_next=True,
+        keep_next=model.keeps_next_observation,
     )
     history_steps = history.reward.shape[1]
-    state = MODEL.init(
+    state = model.init(
         jax.random.key(0), Sizes(CONFIG.num_envs, OBS, ACT, history_steps)
     )
     for i, batch in enumerate(batches):
-        state, history, reward, metrics = decompose_once()(
+        state, history, reward, metrics = decompose_once(inputs)(
             state,
             history,
             batch,
@@ -304,12 +307,16 @@ def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():
     assert abs(float(offset[:, 2].mean()) - 4.0) < 0.5
 
 
-@pytest.mark.parametrize("delay", [2, 12])  # Shorter and longer than the rows of one.
-def test_it_learns_the_reward_behind_the_payouts(delay):
+@pytest.mark.parametrize(
+    ("delay", "inputs"),
+    # Shorter and longer than the rows of a window.
+    [(2, "transition"), (12, "transition"), (2, "pair")],
+)
+def test_it_learns_the_reward_behind_the_payouts(delay, inputs):
     batches = list(random_batches(2, 150, delay))
     errors, fits = [], []
     for batch, (_, _, reward, metrics) in zip(
-        batches, decompose_all(batches), strict=True
+        batches, decompose_all(batches, inputs=inputs), strict=True
     ):
         true = batch.observation[..., 0] + 0.5 * np.clip(batch.action[..., 0], -1, 1)
         errors.append(np.mean((reward - true - 1.0)[~batch.faulty] ** 2))

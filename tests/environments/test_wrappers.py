@@ -58,6 +58,25 @@ def test_delayed_reward_loses_nothing(delay, terminates, limit):
     assert states.done[-1] == 1.0 and not states.done[:-1].any()
 
 
+def test_the_phase_of_a_delay_is_seen():
+    """The environment and the noise see nothing of it, and episodes begin with 0."""
+    delayed = {"reward_delay": 4, "max_episode_steps": 6}
+    envs = [
+        gasil_envs.make("point_mass", **delayed, **more)
+        for more in ({}, {"observe_phase": True})
+    ]
+    (_, plain), (start, seen) = (roll(env, 6) for env in envs)
+    assert envs[1].observation_size == envs[0].observation_size + 1
+    np.testing.assert_array_equal(start.obs[-1], 0.0)
+    np.testing.assert_array_equal(seen.obs[:, -1], [0.25, 0.5, 0.75, 0.0, 0.25, 0.5])
+    np.testing.assert_array_equal(seen.obs[:, :-1], plain.obs)
+    np.testing.assert_array_equal(seen.reward, plain.reward)
+    with pytest.raises(ValueError, match="observe_phase is True: it needs a reward_de"):
+        gasil_envs.make("point_mass", observe_phase=True)
+    with pytest.raises(ValueError, match="observe_phase is 1: it must be True or Fal"):
+        gasil_envs.make("point_mass", reward_delay=4, observe_phase=1)
+
+
 class DoneFromTheStart(Scripted):
     """Says that it has ended in its reset, and leaves that as it is."""
 

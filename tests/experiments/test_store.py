@@ -38,6 +38,8 @@ def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
         run(alpha=0.2),
         run(stagger_episodes=False),
         run(total_steps=5),
+        run(decompose_rewards=True),
+        run(decompose_rewards=True, decomposition_inputs="pair"),
         run(alpha_schedule=((1e3, 0.0), (2e3, 1.0))),
         *(
             dataclasses.replace(one, **change)
@@ -46,6 +48,7 @@ def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
                 {"settings": Settings(obs_noise=0.1)},
                 {"settings": Settings(integrator="euler")},
                 {"settings": Settings(max_episode_steps=50)},
+                {"settings": Settings(reward_delay=20, observe_phase=True)},
                 {"algorithm_version": 99},
             )
         ),
@@ -84,10 +87,11 @@ def test_stored_runs_keep_their_keys(path):
 
 
 def test_a_newer_setting_is_in_the_key_unless_it_is_what_stored_runs_had():
-    every = {**run().algorithm.settings, **dataclasses.asdict(run().settings)}
+    one = run(decompose_rewards=True)
+    every = {**one.algorithm.settings, **dataclasses.asdict(one.settings)}
     for name, value in NEWER.items():
         # A stored run that lacks the setting is read with the default.
-        assert every[name] == value and f'"{name}"' not in run().experiment
+        assert every[name] == value and f'"{name}"' not in one.experiment
     limited = dataclasses.replace(run(), settings=Settings(max_episode_steps=50))
     assert '"max_episode_steps": 50' in limited.experiment
 

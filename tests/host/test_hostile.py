@@ -149,6 +149,7 @@ CASES = [
             ("obs_noise", is_real),
             ("physics", is_one_of("mjx", "mujoco")),
             ("terminal_limits", is_bool),
+            ("observe_phase", lambda x: x is False),  # Without a delay.
             ("max_episode_steps", lambda x: x is None or is_whole(x, 1, 100)),
         )
     ],
@@ -176,7 +177,7 @@ CASES = [
     (
         "index",
         lambda x: gasil_jax.member({"a": np.zeros(4)}, x),
-        lambda x: is_whole(x, -4, 3),
+        lambda x: is_whole(x, -4, 3, in_array=True),
     ),
     *[
         (name, use, lambda x: False)
