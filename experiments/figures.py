@@ -385,6 +385,32 @@ _CAUSES = [
     ),
     Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
 ]
+#: Deep sea with rewards as they are, beside normalized ones. The last two arms have the
+#: weight of novelty that a few runs had suggested, on seeds of their own.
+_RAW = {"normalize_rewards": False}
+_STRONG = {**_RAW, "novelty_coefficient": 1.0}
+_DEEP_SEA: list[Arm | str] = [
+    *SPARSE_SPACES,
+    *(Arm(f"{agent} (raw)", agent, _RAW) for agent in SPARSE_SPACES),
+    *(Arm(f"{x} (raw, strong)", x, _STRONG) for x in SPARSE_SPACES if "novelty" in x),
+]
+
+
+def _with_exploration(env: str) -> Panels:
+    """Return the agents that explore on a delayed task, with the preset `scaled`."""
+    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
+    arms = [
+        Arm("ppo+novelty (decomposed, scaled)", "ppo+novelty", scaled),
+        Arm(
+            "ppo+bc+novelty (decomposed, scaled)",
+            "ppo+bc+novelty",
+            {**scaled, **_CLONED},
+        ),
+    ]
+    return joined(
+        grid((env,), own, (DELAY,), base=base, seeds=20)
+        for own, base in (([_SCALED], "scaled"), (arms, None))
+    )
 
 
 FIGURES: Mapping[str, Figure] = {
@@ -485,6 +511,12 @@ FIGURES: Mapping[str, Figure] = {
                 ),
             ]
         ),
+        favourite=_SCALED.name,
+    ),
+    "exploration_delayed": Figure(
+        "Delayed rewards: exploration and cloning on top of decomposition",
+        "",
+        joined(map(_with_exploration, TASKS[:4])),
         favourite=_SCALED.name,
     ),
     "action_dimension": Figure(
@@ -626,6 +658,23 @@ FIGURES: Mapping[str, Figure] = {
             total_steps=SPARSE_STEPS,
         ),
         comparisons=_changes(),
+        solved_from=solved_from,
+    ),
+    "deep_sea": Figure(
+        "Deep sea: rewards normalized, and as they are",
+        "",
+        grid(
+            ("sparse:deep_sea_10", "sparse:deep_sea_20"),
+            _DEEP_SEA,
+            base=SparseSearch,
+            seeds=20,
+            total_steps=SPARSE_STEPS,
+        ),
+        comparisons={
+            (panel, f"{agent} (raw)", agent): difference(panel, f"{agent} (raw)", agent)
+            for panel in ("sparse:deep_sea_10", "sparse:deep_sea_20")
+            for agent in SPARSE_SPACES
+        },
         solved_from=solved_from,
     ),
 }
