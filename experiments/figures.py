@@ -385,14 +385,17 @@ _CAUSES = [
     ),
     Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
 ]
-#: Deep sea with rewards as they are, beside normalized ones. The last two arms have the
-#: weight of novelty that a few runs had suggested, on seeds of their own.
+#: Deep sea with rewards as they are, beside normalized ones. The last has the weight of
+#: novelty that `ppo+novelty` has.
 _RAW = {"normalize_rewards": False}
-_STRONG = {**_RAW, "novelty_coefficient": 1.0}
 _DEEP_SEA: list[Arm | str] = [
     *SPARSE_SPACES,
     *(Arm(f"{agent} (raw)", agent, _RAW) for agent in SPARSE_SPACES),
-    *(Arm(f"{x} (raw, strong)", x, _STRONG) for x in SPARSE_SPACES if "novelty" in x),
+    Arm(
+        "ppo+bc+novelty (raw, more novelty)",
+        "ppo+bc+novelty",
+        {**_RAW, "novelty_coefficient": 1.0},
+    ),
 ]
 
 
