@@ -22,7 +22,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 from gasil_jax import algorithms
 from gasil_jax.errors import InputError
@@ -61,7 +61,7 @@ class Options(run_options.Options):
     random: int | None = None
     points_file: str | None = None
     shard: str | None = None
-    launcher: str | None = None
+    launcher: Literal["ray"] | None = None
     shards: int | None = None
 
 
@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run_options.check(options)
     shard = None if options.shard is None else shards.parse(options.shard)
     if options.launcher is not None:
-        _launch(options, options.launcher, arguments, stored=stored)
+        _launch(options, arguments, stored=stored)
         return 0
     if options.shards is not None:
         raise InputError(
@@ -255,13 +255,11 @@ def _train_shard(
 
 def _launch(
     options: Options,
-    launcher: str,
     arguments: Sequence[str] | None,
     *,
     stored: StoredRun | None,
 ) -> None:
     """Train all shards with a launcher, one command for each."""
-    launch.check(launcher)
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")
     if options.shards is None or options.shards < 1:
@@ -281,7 +279,7 @@ def _launch(
         f"shard {shard}": [*others, *resumed, "--shard", str(shard)] for shard in every
     }
     try:
-        launch.LAUNCHERS[launcher](_PROGRAM, jobs, options.devices)
+        launch.run_on_ray(_PROGRAM, jobs, options.devices)
     except Interrupted as interrupted:
         interrupted.add_note("continue with the same command and --resume")
         raise

@@ -1,16 +1,15 @@
 """Run a sweep's shards on a Ray cluster: ``python -m gasil_jax.sweep --launcher ray``.
 
-To add a launcher, add a function like `run_on_ray` to `LAUNCHERS`. It gets the
-arguments of each job, runs each in a process of its own and, if that dies, again, so
-that the job continues from its checkpoint. It returns when all jobs are done.
+Each job is a process of its own. If that dies it is run again, and continues from its
+checkpoint.
 """
 
 import contextlib
 import importlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from gasil_jax.errors import InputError, unknown
+from gasil_jax.errors import InputError
 from gasil_jax.host.interruption import Interrupted, Interruption
 
 #: The largest number of times that a job is run again after its process died.
@@ -19,13 +18,6 @@ _SECONDS_BETWEEN_POLLS = 1.0
 _BAD_INPUT = 2
 
 Jobs = Mapping[str, Sequence[str]]
-Launcher = Callable[[str, Jobs, int | None], None]
-
-
-def check(name: str) -> None:
-    """Raise `InputError` for a launcher that is unknown."""
-    if name not in LAUNCHERS:
-        raise InputError(unknown("launcher", name, tuple(LAUNCHERS)))
 
 
 def _raise_failures(failed: Mapping[str, str], num_jobs: int) -> None:
@@ -158,6 +150,3 @@ def _wait(ray: Any, references: list[Any]) -> None:
                 ray.cancel(reference, force=False)
             ray.wait(references, num_returns=len(references))
             raise Interrupted(interruption.signal)
-
-
-LAUNCHERS: Mapping[str, Launcher] = {"ray": run_on_ray}

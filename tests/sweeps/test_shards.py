@@ -455,8 +455,8 @@ def test_shards_need_no_file_of_points_once_one_has_begun(
 
 def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):
     launched = []
-    monkeypatch.setitem(
-        launch.LAUNCHERS, "ray", lambda program, jobs, devices: launched.append(jobs)
+    monkeypatch.setattr(
+        launch, "run_on_ray", lambda program, jobs, devices: launched.append(jobs)
     )
     out = tmp_path / "out"
     train(out)
