@@ -21,6 +21,11 @@ ALGORITHM_VERSION = 2
 #: Settings of an environment that compute the same thing in different ways.
 _WAYS = ("physics", "solver")
 
+#: Settings that are newer than stored runs, of algorithms or of environments, with the
+#: value that those runs had, which is the default. A setting with this value is left
+#: out of a run's key, so that stored runs keep theirs.
+NEWER: Mapping[str, Any] = {"max_episode_steps": None}
+
 
 @dataclasses.dataclass(frozen=True)
 class Run:
@@ -44,7 +49,7 @@ class Run:
 
     @functools.cached_property
     def _fields(self) -> dict[str, Any]:
-        """All settings but the seed by name, those of the algorithm in "algorithm"."""
+        """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
         for name, value in values.items():
             if callable(value):
@@ -58,8 +63,10 @@ class Run:
                     values[name] = (int if allowed.whole else float)(values[name])
         settings = dataclasses.asdict(self.settings)
         settings["obs_noise"] = float(settings["obs_noise"])
-        if settings["max_episode_steps"] is None:
-            del settings["max_episode_steps"]
+        for group in (values, settings):
+            for name in NEWER.keys() & group.keys():
+                if group[name] == NEWER[name]:
+                    del group[name]
         return {
             "env": self.env,
             **{name: x for name, x in settings.items() if name not in _WAYS},
@@ -69,12 +76,12 @@ class Run:
 
     @functools.cached_property
     def experiment(self) -> str:
-        """All settings but the seed as JSON, which the runs of a curve share."""
+        """The settings in the key but the seed as JSON, which a curve's runs share."""
         return json.dumps(self._fields, sort_keys=True)
 
     @functools.cached_property
     def key(self) -> str:
-        """A hash of all settings, which identifies the run."""
+        """A hash of the settings, which identifies the run; see `NEWER`."""
         return run_key(self.experiment, self.seed)
 
     @functools.cached_property

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import json
 import subprocess
 import threading
 
@@ -16,7 +17,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host.descriptions import find_agent
 from gasil_jax.host.environments import Settings
 from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps.runs import NEWER, Run, read_run
 
 
 def run(seed=0, env="hopper", **changes):
@@ -60,12 +61,35 @@ def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
 def test_every_setting_is_in_the_experiment():
     text = run(decompose_rewards=True, normalize_rewards=True).experiment
     for part in (Config, PPOGASIL, Decompose, Normalize):
-        for field in dataclasses.fields(part):
-            assert f'"{field.name}"' in text
+        for name in {field.name for field in dataclasses.fields(part)} - set(NEWER):
+            assert f'"{name}"' in text
     for model in (Decompose, Normalize):
         assert f'"{model.switch}": true' in text
         assert f'"{model.switch}": false' in run().experiment
     assert '"agent": "ppo+gasil"' in text
+
+
+#: Settings that runs of the point mass, and of no other task, are stored without.
+_ADDED_TO_THE_KEY = {"activation", "layer_norm", "admission", "ties"}
+
+
+@pytest.mark.parametrize("path", sorted((RESULTS / "runs").glob("*.npz")), ids=str)
+def test_stored_runs_keep_their_keys(path):
+    for stored in json.loads(str(npz.read(path)["index"]))["experiments"]:
+        now = json.loads(read_run(stored, 0).experiment)
+        for name in now["algorithm"].keys() - stored["algorithm"].keys():
+            assert path.stem == "point_mass" and name in _ADDED_TO_THE_KEY
+            del now["algorithm"][name]
+        assert now == stored
+
+
+def test_a_newer_setting_is_in_the_key_unless_it_is_what_stored_runs_had():
+    every = {**run().algorithm.settings, **dataclasses.asdict(run().settings)}
+    for name, value in NEWER.items():
+        # A stored run that lacks the setting is read with the default.
+        assert every[name] == value and f'"{name}"' not in run().experiment
+    limited = dataclasses.replace(run(), settings=Settings(max_episode_steps=50))
+    assert '"max_episode_steps": 50' in limited.experiment
 
 
 def test_a_schedule_without_points_has_no_place():
