@@ -24,7 +24,7 @@ _WAYS = ("physics", "solver")
 #: Settings that are newer than stored runs, of algorithms or of environments, with the
 #: value that those runs had, which is the default. A setting with this value is left
 #: out of a run's key, so that stored runs keep theirs.
-NEWER: Mapping[str, Any] = {"max_episode_steps": None}
+NEWER: Mapping[str, Any] = {"max_episode_steps": None, "policy_components": 1}
 
 
 @dataclasses.dataclass(frozen=True)
