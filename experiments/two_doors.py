@@ -35,8 +35,9 @@ from gasil_jax.imitation import AGENTS
 
 ENV = "sparse:two_doors"
 COMPONENTS = (1, 4)
-#: Episodes of the data on each side, and those that are counted for each seed.
-_EACH_WAY, _COUNTED = 32, 64
+#: Episodes of the data on each side, so many that a network can't tell the sides by
+#: where each of them happened to start; and those that are counted for each seed.
+_EACH_WAY, _COUNTED = 256, 64
 #: A policy keeps a way if this share of its episodes takes it, and solves the maze if
 #: this share reaches the goal.
 _KEPT, _SOLVED = 0.1, 0.9
@@ -246,8 +247,9 @@ def table(rows: list[dict[str, Any]]) -> str:
     """
     lines = [
         "| agent | Gaussians | seeds | solve, drawn | solve, most probable | episodes "
-        "at the goal, drawn | keep both ways, drawn | buffer has both ways |",
-        "| --- " * 8 + "|",
+        "at the goal, drawn | at the goal, most probable | keep both ways, drawn | "
+        "buffer has both ways |",
+        "| --- " * 9 + "|",
     ]
     every = dict.fromkeys((row["agent"], row["policy_components"]) for row in rows)
     for key in every:
@@ -258,9 +260,10 @@ def table(rows: list[dict[str, Any]]) -> str:
             )
             for column in _COLUMNS
         }
-        solved = [np.mean(ways[x].sum(axis=1) >= _SOLVED) for x in _COLUMNS[:2]]
+        reached = [ways[x].sum(axis=1) for x in _COLUMNS[:2]]
+        solved = [np.mean(x >= _SOLVED) for x in reached]
         both = [np.mean((ways[x] >= _KEPT).all(axis=1)) for x in ("drawn", "buffer")]
-        numbers = [*solved, ways["drawn"].sum(axis=1).mean(), *both]
+        numbers = [*solved, *(x.mean() for x in reached), *both]
         cells = [*key, len(own), *(f"{x:.2f}" for x in numbers)]
         if np.isnan(ways["buffer"]).any():
             cells[-1] = "-"
