@@ -18,6 +18,7 @@ from experiments import (
     point_mass_moments,
     profile,
     store,
+    two_doors,
     zoo,
 )
 from experiments.curves import Curve, Figure
@@ -240,6 +241,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "zoo": (zoo.Options, zoo.run),
     "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
     "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
+    "two_doors": (two_doors.Options, two_doors.run),
 }
 
 

@@ -11,6 +11,7 @@ from gasil_jax import algorithms, networks
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.context import Sizes, sizes_of
 from gasil_jax.errors import refusal, shown
+from gasil_jax.imitation import Agent
 
 
 def check_environment(env: Any) -> None:
@@ -37,7 +38,22 @@ def check(env: Any, algorithm: Algorithm) -> None:
     sizes = sizes_of(env, num_envs)
     with own_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
         agent.check(sizes)
+    _check_components(algorithm, sizes)
     _check_networks(agent, sizes)
+
+
+def _check_components(algorithm: Algorithm, sizes: Sizes) -> None:
+    """Raise `ValueError` if the policy can't be a mixture of Gaussians but is to be."""
+    count, agent = algorithm.config.policy_components, algorithm.agent
+    if count == 1:
+        return
+    if sizes.discrete:
+        reason = "the environment's actions are discrete"
+    elif type(agent).policy_network is not Agent.policy_network:
+        reason = f"agent {agent.name!r} has a policy_network of its own, with one mean"
+    else:
+        return
+    raise ValueError(f"policy_components is {count}: it must be 1, {reason}")
 
 
 def _check_networks(agent: Any, sizes: Sizes) -> None:

@@ -155,6 +155,9 @@ class Config(struct.PyTreeNode):
       hidden_sizes: widths of the hidden layers, in the policy and in the value.
       activation: what follows each of these layers: tanh, relu or swish.
       layer_norm: whether layer normalization comes before it.
+      policy_components: number of Gaussians that the policy's distribution of actions
+        is a mixture of, with weights and means that depend on the state. One can hold
+        one way to succeed; several can hold several. Not for discrete actions.
       stagger_episodes: whether each environment's first episode begins at a random age,
         so that a batch holds steps from all parts of an episode. Otherwise all begin at
         age 0 and, if none ends early, a batch holds the same few steps of each episode.
@@ -185,6 +188,7 @@ class Config(struct.PyTreeNode):
     hidden_sizes: tuple[int, ...] = widths(64, 64)
     activation: str = choice("tanh", ("tanh", "relu", "swish"))
     layer_norm: bool = switch(False)
+    policy_components: int = count(1)
     stagger_episodes: bool = switch(True)
     learning_rate: float = number(3e-4, 0.0, excludes_low=True)
     learning_rate_decay: float = number(1.0, 0.0, 1.0)

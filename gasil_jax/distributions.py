@@ -1,4 +1,4 @@
-"""The distributions of actions: a Gaussian, or a categorical where they are discrete.
+"""The distributions of actions: Gaussians, or a categorical where they are discrete.
 
 Each is a small table of pure functions. `of` chooses one where a policy is made, and
 nothing else asks whether actions are discrete: everything but the environment sees a
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from gasil_envs import wrappers
-from gasil_jax.networks import CategoricalPolicy, GaussianPolicy
+from gasil_jax.networks import CategoricalPolicy, GaussianPolicy, MixturePolicy
 
 _LOG_2PI = 1.8378770664093453
 
@@ -21,7 +21,9 @@ class Distribution(NamedTuple):
     """The functions of a kind of distribution.
 
     Its parameters are what the policy's network returns: mean (..., action) and log
-    standard deviation (action,) of a Gaussian; logits (..., action) of a categorical.
+    standard deviation (action,) of a Gaussian; logits (..., action) of a categorical;
+    means (..., component, action), log standard deviation (action,) and the components'
+    logits (..., component) of a mixture of Gaussians.
 
     Attributes:
       network: class of the policy's network.
@@ -29,8 +31,9 @@ class Distribution(NamedTuple):
         have this standard deviation, if the distribution has one.
       sample: (key, parameters) -> action (..., action); consumes the key.
       log_prob: (parameters, action) -> log density or log probability, (...).
-      entropy: parameters -> the entropy in nats, () or (...).
-      mode: parameters -> the most probable action (..., action).
+      entropy: parameters -> the entropy in nats, or a lower bound, () or (...).
+      mode: parameters -> the most probable action (..., action); of a mixture, the mean
+        of the most probable component.
       executed: (action, low, high) -> what the environment's step gets.
     """
 
@@ -85,6 +88,62 @@ def _one_hot(index: jax.Array, logits: jax.Array) -> jax.Array:
     return jax.nn.one_hot(index, logits.shape[-1], dtype=logits.dtype)
 
 
+def _spread(params: Any, deviation: jax.Array) -> Any:
+    def scaled(path: Any, x: jax.Array) -> jax.Array:
+        # Those of hidden layers are still 0.
+        return x * deviation if path[-1].key == "bias" else x
+
+    return jax.tree_util.tree_map_with_path(scaled, _with_deviation(params, deviation))
+
+
+def _mean_of(index: jax.Array, parameters: Any) -> jax.Array:
+    """Return the mean of one component, (..., action)."""
+    mean, _, logits = parameters
+    return jnp.sum(_one_hot(index, logits)[..., None] * mean, axis=-2)
+
+
+def _mixture_sample(key: jax.Array, parameters: Any) -> jax.Array:
+    _, log_std, logits = parameters
+    component_key, noise_key = jax.random.split(key)
+    component = jax.random.categorical(component_key, logits)
+    return _gaussian_sample(noise_key, (_mean_of(component, parameters), log_std))
+
+
+def _mixture_log_prob(parameters: Any, action: jax.Array) -> jax.Array:
+    mean, log_std, logits = parameters
+    each = _gaussian_log_prob((mean, log_std), action[..., None, :])
+    return jax.nn.logsumexp(jax.nn.log_softmax(logits) + each, axis=-1)
+
+
+def _mixture_entropy(parameters: Any) -> jax.Array:
+    """Return a lower bound: a mixture's entropy has no closed form.
+
+    It is that of Kolchinsky and Tracey (2017, "Estimating mixture entropy with pairwise
+    distances") with Bhattacharyya distances. It is exact where all means are the same
+    and where all are far apart, and rises in between as they part.
+    """
+    mean, log_std, logits = parameters
+    scaled = mean * jax.lax.broadcast_to_rank(jnp.exp(-log_std), mean.ndim)
+    between = scaled[..., :, None, :] - scaled[..., None, :, :]
+    distance = jnp.sum(between**2, axis=-1) / 8.0
+    log_weight = jax.nn.log_softmax(logits)
+    overlap = jax.nn.logsumexp(log_weight[..., None, :] - distance, axis=-1)
+    added = -jnp.sum(jnp.exp(log_weight) * overlap, axis=-1)
+    return _gaussian_entropy((mean, log_std)) + added
+
+
+#: Several Gaussians with weights, all with the same deviations.
+MIXTURE = Distribution(
+    network=MixturePolicy,
+    explore=_spread,
+    sample=_mixture_sample,
+    log_prob=_mixture_log_prob,
+    entropy=_mixture_entropy,
+    mode=lambda parameters: _mean_of(jnp.argmax(parameters[2], axis=-1), parameters),
+    executed=jnp.clip,
+)
+
+
 def _categorical_entropy(logits: jax.Array) -> jax.Array:
     return -jnp.sum(jax.nn.softmax(logits) * jax.nn.log_softmax(logits), axis=-1)
 
@@ -103,6 +162,13 @@ CATEGORICAL = Distribution(
 )
 
 
-def of(env: Any) -> Distribution:
-    """Return the distribution of a policy's actions in an environment."""
-    return CATEGORICAL if wrappers.is_discrete(env) else GAUSSIAN
+def of(env: Any, components: int) -> Distribution:
+    """Return the distribution of a policy's actions in an environment.
+
+    Args:
+      env: the environment.
+      components: number of Gaussians where actions are vectors.
+    """
+    if wrappers.is_discrete(env):
+        return CATEGORICAL
+    return MIXTURE if components > 1 else GAUSSIAN

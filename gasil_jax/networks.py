@@ -1,11 +1,14 @@
 """The networks, in Flax linen."""
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
+
+from gasil_jax import numpy_policy
 
 #: The functions that may follow a hidden layer.
 ACTIVATIONS: Mapping[str, Callable[[jax.Array], jax.Array]] = {
@@ -48,6 +51,7 @@ class MLP(nn.Module):
       activation: a key of `ACTIVATIONS`.
       layer_norm: whether what a hidden layer computes is normalized before the
         activation (Ba, Kiros, Hinton 2016).
+      output_bias: initializer of the output layer's bias.
     """
 
     hidden_sizes: Sequence[int]
@@ -55,6 +59,7 @@ class MLP(nn.Module):
     output_scale: float = 1.0
     activation: str = "tanh"
     layer_norm: bool = False
+    output_bias: nn.initializers.Initializer = nn.initializers.zeros
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
@@ -64,8 +69,9 @@ class MLP(nn.Module):
             x = nn.Dense(size, kernel_init=kernel_init)(x)
             x = nn.LayerNorm()(x) if self.layer_norm else x
             x = ACTIVATIONS[self.activation](x)
-        kernel_init = orthogonal(self.output_scale)
-        return nn.Dense(self.output_size, kernel_init=kernel_init)(x)
+        kernel_init, bias_init = orthogonal(self.output_scale), self.output_bias
+        last = nn.Dense(self.output_size, kernel_init=kernel_init, bias_init=bias_init)
+        return last(x)
 
 
 class _Policy(nn.Module):
@@ -79,18 +85,20 @@ class _Policy(nn.Module):
     activation: str = "tanh"
     layer_norm: bool = False
     own: nn.Module | None = None
+    components: int = 1
 
-    def layers(self, observation: jax.Array) -> jax.Array:
-        """(..., obs) -> (..., action)."""
+    def layers(self, observation: jax.Array, **output: Any) -> jax.Array:
+        """(..., obs) -> (..., action), or the output of an `MLP` with these fields."""
         if self.own is not None:
             return self.own(observation)
+        output = {"output_size": self.action_size, **output}
         return MLP(
             self.hidden_sizes,
-            self.action_size,
-            0.01,
-            self.activation,
-            self.layer_norm,
+            output_scale=0.01,
+            activation=self.activation,
+            layer_norm=self.layer_norm,
             name=POLICY_LAYERS[self.activation],
+            **output,
         )(observation)
 
 
@@ -103,6 +111,42 @@ class GaussianPolicy(_Policy):
         mean = self.layers(observation)
         log_std = self.param("log_std", nn.initializers.zeros, (self.action_size,))
         return mean, log_std
+
+
+class MixturePolicy(_Policy):
+    """A mixture of Gaussians with one log standard deviation, the same in all states.
+
+    Components with the same mean would get the same gradients and stay together. So
+    their first means, which are biases, are drawn at random. In each dimension half of
+    the variance of an untrained policy's actions is within the components, and half
+    between them: two components are then two of their deviations apart, far enough that
+    an action is ascribed to one of them. The whole mixture has mean 0 and standard
+    deviation 1, as a Gaussian has, and its components are nearly equally probable.
+    """
+
+    @nn.compact
+    def __call__(
+        self, observation: jax.Array
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
+        """Return the parameters of the mixture, (..., obs) -> three arrays.
+
+        They are the means (..., component, action), the log standard deviation
+        (action,) and the logits of the components (..., component).
+        """
+        count, size = self.components, self.action_size
+
+        def apart(key: jax.Array, shape: Sequence[int], dtype: Any) -> jax.Array:
+            drawn = jax.random.normal(key, (count, size), dtype)
+            mean = 0.5**0.5 * nn.standardize(drawn, axis=0)
+            return jnp.append(mean, jnp.zeros(count, dtype))
+
+        output = self.layers(
+            observation, output_size=count * (size + 1), output_bias=apart
+        )
+        within = nn.initializers.constant(-0.5 * math.log(2.0))
+        log_std = self.param("log_std", within, (size,))
+        mean, logits = numpy_policy.components(output, size)
+        return mean, log_std, logits
 
 
 class CategoricalPolicy(_Policy):

@@ -11,7 +11,9 @@
     about (), JSON, only in the zoo: see `about`
 
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
-the last is followed by tanh; the output is the mean of a Gaussian. Where actions are
+the last is followed by tanh; the output is the mean of a Gaussian. With
+policy_components () it has the means of that many Gaussians, one after the other, and
+then the logits of their weights; the policy is a mixture of them. Where actions are
 discrete the file has num_actions () in place of log_std, low and high, the output is
 the actions' logits, and an action is an int. With activation_relu () or
 activation_swish () that function takes the place of tanh. With norm_scale_0 (S, width),
@@ -38,7 +40,10 @@ CLIP = 10.0
 _PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
 #: The arrays that are the same for all seeds of a file.
 OWN_NETWORK = "the policy's network is a Flax module of your own, which needs JAX"
-SHARED = ("low", "high", "num_actions", "activation_relu", "activation_swish")
+SHARED = (
+    *("low", "high", "num_actions", "policy_components"),
+    *("activation_relu", "activation_swish"),
+)
 
 
 def zoo() -> tuple[str, ...]:
@@ -115,9 +120,12 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
         )
         if not (low < high).all():
             raise ValueError("low isn't below high")
+    num_outputs = num_actions
+    if is_mixture(arrays):
+        num_outputs = int(number("policy_components")) * (num_actions + 1)
     last = max(1, sum(name.startswith("kernel_") for name in arrays)) - 1
     for i in range(last + 1):
-        outputs = num_actions if i == last else None
+        outputs = num_outputs if i == last else None
         *_, width = number(f"kernel_{i}", count, width, outputs).shape
         number(f"bias_{i}", count, width)
         if i < last and _is_normalized(arrays):
@@ -174,6 +182,25 @@ def is_discrete(weights: Mapping[str, Any]) -> bool:
     return "num_actions" in weights
 
 
+def is_mixture(weights: Mapping[str, Any]) -> bool:
+    """Return whether a policy is a mixture of Gaussians."""
+    return "policy_components" in weights and not is_discrete(weights)
+
+
+def components(output: Any, action_size: int) -> tuple[Any, Any]:
+    """Return the means and the logits of a mixture's Gaussians.
+
+    The means are (..., component, action), and the logits (..., component).
+
+    Args:
+      output: of the network, (..., component * (action + 1)).
+      action_size: dimension of an action.
+    """
+    shape, count = output.shape[:-1], output.shape[-1] // (action_size + 1)
+    mean, logits = output[..., :-count], output[..., -count:]
+    return mean.reshape(*shape, count, action_size), logits
+
+
 def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
     """Return normalized observations, (..., obs), as `output` describes."""
     size = weights["mean"].shape[-1]
@@ -185,6 +212,8 @@ def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
 
 def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
     """Return the mean of the policy's actions, or their logits, (..., action).
+
+    Of a mixture it is what `components` splits.
 
     Args:
       weights: the arrays from `read`.
@@ -250,8 +279,9 @@ def load(
 
     The function is ``act(observation, generator=None)``, (..., obs) -> (..., action).
     It clips actions to their range. With a `numpy.random.Generator` the action is drawn
-    from the policy; without one it is the policy's mean. Discrete actions are int32
-    (...), without a generator the most probable ones.
+    from the policy; without one it is the policy's mean, or that of a mixture's most
+    probable Gaussian. Discrete actions are int32 (...), without a generator the most
+    probable ones.
 
     Raises:
       ValueError: as in `read`.
@@ -271,6 +301,12 @@ def make(weights: Mapping[str, np.ndarray]) -> Callable[..., np.ndarray]:
                 # The largest of logits with Gumbel noise is drawn by probability.
                 action = action + generator.gumbel(size=action.shape)
             return np.asarray(action.argmax(axis=-1), np.int32)
+        if is_mixture(weights):
+            mean, logits = components(action, weights["log_std"].shape[-1])
+            if generator is not None:
+                logits = logits + generator.gumbel(size=logits.shape)
+            chosen = logits.argmax(axis=-1)[..., None, None]
+            action = np.take_along_axis(mean, chosen, axis=-2)[..., 0, :]
         if generator is not None:
             noise = generator.standard_normal(action.shape)
             action = action + np.exp(weights["log_std"]) * noise

@@ -12,7 +12,7 @@ from flax import struct
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import normalization, numpy_policy
-from gasil_jax.distributions import CATEGORICAL, GAUSSIAN
+from gasil_jax.distributions import CATEGORICAL, GAUSSIAN, MIXTURE
 from gasil_jax.networks import POLICY_LAYERS
 
 
@@ -52,6 +52,11 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
         kind, _, i = name.partition("_")
         prefix = "norm_" if kind == "LayerNorm" else ""
         arrays |= {f"{prefix}{x}_{i}": array for x, array in own.items()}
+    # A mixture has a mean and a logit for each component.
+    last = sum(name.startswith("kernel_") for name in arrays) - 1
+    each = wrappers.action_size(env) + 1
+    if components := arrays[f"bias_{last}"].shape[-1] // each:
+        arrays["policy_components"] = np.int32(components)
     return arrays
 
 
@@ -62,8 +67,9 @@ def load_policy(
 
     The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
     float32. It clips actions to their range. Without a key the action is the policy's
-    mean; with a key it is drawn from the policy. The key is consumed. Discrete actions
-    are int32 (...), without a key the most probable ones.
+    mean, or that of a mixture's most probable Gaussian; with a key it is drawn from the
+    policy. The key is consumed. Discrete actions are int32 (...), without a key the
+    most probable ones.
 
     Args:
       path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
@@ -98,7 +104,8 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
     arrays = jax.tree.map(float32, dict(weights))
     network = arrays.pop("network", None)
     discrete = numpy_policy.is_discrete(arrays)
-    distribution = CATEGORICAL if discrete else GAUSSIAN
+    mixture = numpy_policy.is_mixture(arrays)
+    distribution = CATEGORICAL if discrete else MIXTURE if mixture else GAUSSIAN
 
     @full_precision
     def policy(observation: jax.Array, key: jax.Array | None = None) -> jax.Array:
@@ -109,7 +116,11 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
                 parameters = network.module.apply(network.params, inputs)
             else:
                 parameters = numpy_policy.output(arrays, float32(observation), jnp)
-                if not discrete:
+                if mixture:
+                    log_std = arrays["log_std"]
+                    mean, logits = numpy_policy.components(parameters, len(log_std))
+                    parameters = mean, log_std, logits
+                elif not discrete:
                     parameters = parameters, arrays["log_std"]
             if key is None:
                 action = distribution.mode(parameters)

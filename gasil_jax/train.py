@@ -180,11 +180,14 @@ def _networks(env: Any, algorithm: Algorithm) -> tuple[Any, Any, Distribution]:
     """Return the policy's network, the value's, and the distribution of actions."""
     # Typed as Any because Flax declares that `apply` may also return variables.
     agent, config = algorithm.agent, algorithm.config
-    widths, distribution = config.hidden_sizes, distributions.of(env)
+    widths, components = config.hidden_sizes, config.policy_components
+    distribution = distributions.of(env, components)
     layers = (config.activation, config.layer_norm)
     sizes = sizes_of(env, config.num_envs)
     own_policy, own_value = agent.policy_network(sizes), agent.value_network(sizes)
-    policy = distribution.network(widths, sizes.action, *layers, own=own_policy)
+    policy = distribution.network(
+        widths, sizes.action, *layers, own=own_policy, components=components
+    )
     return policy, own_value or Value(widths, *layers), distribution
 
 

@@ -48,6 +48,7 @@ NOT_RUN = {
     "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
     "python -m experiments profile": "it measures for minutes",
+    "python -m experiments two_doors": "test_two_doors.py trains a small one",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
@@ -455,7 +456,7 @@ def test_the_list_of_metrics_is_complete(agent, tmp_path):
 
 #: Arrays of discrete actions, and of layers that are not the default.
 OF_OTHER_POLICIES = {"num_actions", "activation_relu", "activation_swish"}
-OF_OTHER_POLICIES |= {"norm_scale_0", "norm_bias_0"}
+OF_OTHER_POLICIES |= {"norm_scale_0", "norm_bias_0", "policy_components"}
 
 
 def test_the_list_of_a_policys_arrays_is_complete(finished_hopper):

@@ -127,6 +127,19 @@ _FAR_KEY = (
     "#......T#K#",
     "###########",
 )
+#: A way leads around either side of a wall, and the mean of both into its dead end.
+#: Steps are long: after one the ways are apart, and the start is all that they share.
+_TWO_DOORS = (
+    "#########",
+    "#...G...#",
+    "#.......#",
+    "#..###..#",
+    "#..#.#..#",
+    "#.......#",
+    "#.......#",
+    "#...S...#",
+    "#########",
+)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -399,6 +412,7 @@ TASKS: Mapping[str, Any] = {
     "u_maze_large": Layout(_U_LARGE, 150),
     "two_keys_maze": Layout(_TWO_KEYS, 200, speed=0.25, solved=10.0),
     "far_key_maze": Layout(_FAR_KEY, 250, speed=0.3, solved=10.0),
+    "two_doors": Layout(_TWO_DOORS, 25, speed=1.0),
 }
 _NOISY, _NOISE = "_noisy", {"point": 0.5, "discrete": 0.1}
 

@@ -28,6 +28,7 @@ NEWER: Mapping[str, Any] = {
     "max_episode_steps": None,
     "observe_phase": False,
     "decomposition_inputs": "transition",
+    "policy_components": 1,
 }
 
 

@@ -83,6 +83,37 @@ def test_a_maze_can_be_solved_in_its_time(name):
     assert state.info["steps"] < 0.8 * layout.episode_length
 
 
+def walked(env, way):
+    """Return the number of steps from the start's middle to the goal, or None."""
+    state = env.reset(jax.random.key(0))
+    start = state.pipeline_state.replace(position=jnp.asarray(env.unwrapped._start))
+    state, step = state.replace(pipeline_state=start), jax.jit(env.step)
+    for count in range(1, env.unwrapped.episode_length):
+        state = step(state, jnp.array(way(*np.asarray(state.pipeline_state.position))))
+        if state.done:
+            return count
+    return None
+
+
+def test_both_ways_to_the_goal_are_as_long_and_their_mean_leads_into_the_wall():
+    env = gasil_envs.make("sparse:two_doors")
+    rows = env.unwrapped.layout.rows
+    assert all(row == row[::-1] for row in rows)
+
+    def way(side):
+        def action(row, column):
+            if row > 5.2:  # Before the wall, beside it, and behind it.
+                return 5.2 - row, 4.5 + 2.1 * side - column
+            return (-1.0, 0.0) if row > 2.5 else (1.5 - row, 4.5 - column)
+
+        return action
+
+    left, right = way(-1.0), way(1.0)
+    mean = lambda *at: np.mean([left(*at), right(*at)], axis=0)
+    counts = [walked(env, x) for x in (left, right, mean)]
+    assert counts[0] == counts[1] < 12 and counts[2] is None
+
+
 def test_a_door_opens_with_the_key_alone_and_an_object_pays_once():
     env = mazes.Maze(mazes.Layout(("#####", "#SKD#", "#A.T#", "#####"), 9, None, 10.0))
     moves = {"up": 0, "down": 1, "left": 2, "right": 3}

@@ -1,0 +1,296 @@
+"""Policies that are mixtures of Gaussians: their formulas, files, and refusals."""
+
+import csv
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from corridor import Corridor
+from flax import linen as nn
+from small_training import DISCRIMINATOR, DISCRIMINATOR_FLAGS, FLAGS, SETTINGS
+
+import gasil_jax
+from gasil_jax import evaluate, normalization, numpy_policy, policy, run, sweep
+from gasil_jax.distributions import GAUSSIAN, MIXTURE
+from gasil_jax.host import policy_file
+from gasil_jax.networks import MixturePolicy
+
+
+def softmax(logits):
+    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
+    return exponentials / exponentials.sum(axis=-1, keepdims=True)
+
+
+def draw(seed=0, batch=5, components=4, size=3, spread=1.0):
+    """Return means, log standard deviation and logits, in NumPy."""
+    rng = np.random.default_rng(seed)
+    mean = spread * rng.normal(size=(batch, components, size))
+    return mean, 0.5 * rng.normal(size=size), rng.normal(size=(batch, components))
+
+
+def given(parameters):
+    return tuple(jnp.asarray(x, jnp.float32) for x in parameters)
+
+
+def log_density(parameters, action):
+    """Return the logarithm of the weighted sum of the components' densities."""
+    mean, log_std, logits = parameters
+    z = (action[:, None] - mean) / np.exp(log_std)
+    each = np.exp(-0.5 * z**2) / (np.exp(log_std) * np.sqrt(2 * np.pi))
+    return np.log(np.sum(softmax(logits) * each.prod(axis=-1), axis=-1))
+
+
+def entropy_bound(parameters):
+    """Return the bound by loops over pairs of components."""
+    mean, log_std, logits = parameters
+    bounds, weights = [], softmax(logits)
+    for means, own in zip(mean, weights, strict=True):
+        bound = np.sum(0.5 * np.log(2 * np.pi * np.e * np.exp(2 * log_std)))
+        for one, w in zip(means, own, strict=True):
+            z = ((one - means) / np.exp(log_std)) ** 2
+            bound -= w * np.log(np.sum(own * np.exp(-z.sum(axis=1) / 8)))
+        bounds.append(bound)
+    return np.array(bounds)
+
+
+def test_the_density_and_the_bound_are_their_formulas():
+    parameters = draw()
+    action = np.random.default_rng(1).normal(size=(5, 3))
+    log_prob = MIXTURE.log_prob(given(parameters), jnp.asarray(action, jnp.float32))
+    np.testing.assert_allclose(log_prob, log_density(parameters, action), rtol=1e-5)
+    np.testing.assert_allclose(
+        MIXTURE.entropy(given(parameters)), entropy_bound(parameters), rtol=1e-5
+    )
+    mean, _, logits = parameters
+    np.testing.assert_allclose(
+        MIXTURE.mode(given(parameters)), mean[np.arange(5), logits.argmax(axis=1)]
+    )
+
+
+def test_far_from_all_components_the_density_is_finite():
+    parameters = given(draw())
+    distant = jnp.full((5, 3), 1e3)
+    value, gradient = jax.value_and_grad(lambda x: MIXTURE.log_prob(x, distant).sum())(
+        parameters
+    )
+    for x in (value, *gradient):
+        assert np.isfinite(x).all()
+
+
+@pytest.mark.parametrize("spread", [0.0, 0.3, 1.0, 100.0])
+def test_the_bound_is_below_the_entropy_of_draws(spread):
+    mean, log_std, logits = draw(batch=1, spread=spread)
+    count = 50_000
+    parameters = mean.repeat(count, 0), log_std, logits.repeat(count, 0)
+    drawn = MIXTURE.sample(jax.random.key(0), given(parameters))
+    entropy = -log_density(parameters, np.asarray(drawn, float)).mean()
+    bound = entropy_bound((mean, log_std, logits))[0]
+    assert bound < entropy + 0.02
+    if spread in (0.0, 100.0):
+        assert bound == pytest.approx(entropy, abs=0.02)
+    # It is never below a single component's.
+    assert bound > GAUSSIAN.entropy(given((mean, log_std))) - 1e-4
+
+
+def test_the_bound_rises_with_deviation_distance_and_even_weights():
+    mean, log_std, logits = given(draw())
+
+    def bound(deviation, distance, evenness):
+        parameters = distance * mean, log_std + deviation, logits / evenness
+        return MIXTURE.entropy(parameters).sum()
+
+    slopes = jax.grad(bound, argnums=(0, 1, 2))
+    for distance in (0.3, 1.0, 3.0):
+        assert all(slope > 0.0 for slope in slopes(0.0, distance, 1.0))
+
+
+def test_a_component_is_drawn_by_its_weight():
+    mean = np.array([[-50.0, 5.0], [50.0, 5.0], [0.0, -80.0]])
+    log_std, logits = np.log([0.5, 2.0]), np.log([0.5, 0.3, 0.2])
+    tiled = np.tile(mean, (20_000, 1, 1)), log_std, np.tile(logits, (20_000, 1))
+    drawn = np.asarray(MIXTURE.sample(jax.random.key(0), given(tiled)))
+    nearest = np.abs(drawn[:, None] - mean).sum(axis=-1).argmin(axis=1)
+    share = np.bincount(nearest, minlength=3) / 20_000
+    np.testing.assert_allclose(share, [0.5, 0.3, 0.2], atol=0.015)
+    within = (drawn - mean[nearest]).std(axis=0)
+    np.testing.assert_allclose(within, [0.5, 2.0], rtol=0.03)
+
+
+@pytest.mark.parametrize("components", [2, 5])
+def test_an_untrained_policy_has_the_initial_deviation_and_components_apart(components):
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.algorithm(
+        "ppo", policy_components=components, initial_deviation=0.25
+    )
+    state = gasil_jax.init(env, algorithm, jax.random.key(0))
+    network = MixturePolicy((64, 64), 2, components=components)
+    observation = jax.random.normal(jax.random.key(1), (9, env.observation_size))
+    parameters = network.apply(state.actor_critic.policy.params, observation)
+    mean, log_std, logits = parameters
+    np.testing.assert_allclose(np.exp(log_std), 0.25 * 0.5**0.5, rtol=1e-5)
+    np.testing.assert_allclose(mean.std(axis=1), 0.25 * 0.5**0.5, rtol=0.2)
+    np.testing.assert_allclose(mean.mean(axis=1), 0.0, atol=0.02)
+    np.testing.assert_allclose(jax.nn.softmax(logits), 1 / components, atol=0.02)
+    tiled = (x[:1].repeat(20_000, axis=0) for x in (mean, logits))
+    drawn = MIXTURE.sample(jax.random.key(0), (next(tiled), log_std, next(tiled)))
+    np.testing.assert_allclose(drawn.std(axis=0), 0.25, rtol=0.1)
+
+
+def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
+    """Actions of -1 and 1 in the same state: the gradient parts the components."""
+    action = jnp.array([[-1.0], [1.0]]).repeat(32, axis=0)
+
+    def cloned(distribution, components):
+        network = distribution.network((8,), 1, components=components)
+        params = network.init(jax.random.key(0), jnp.zeros(2))
+        params = distribution.explore(params, 0.5)
+
+        def loss(params):
+            parameters = network.apply(params, jnp.zeros((64, 2)))
+            return -distribution.log_prob(parameters, action).mean()
+
+        def step(params, _):
+            gradient = jax.grad(loss)(params)
+            return jax.tree.map(lambda p, g: p - 0.02 * g, params, gradient), None
+
+        params, _ = jax.lax.scan(step, params, length=1000)
+        parameters = network.apply(params, jnp.zeros((5_000, 2)))
+        return np.asarray(distribution.sample(jax.random.key(1), parameters))
+
+    between = lambda drawn: np.mean(np.abs(drawn) < 0.5)
+    assert between(cloned(GAUSSIAN, 1)) > 0.3
+    drawn = cloned(MIXTURE, 2)
+    assert between(drawn) < 0.02 and np.mean(drawn > 0) == pytest.approx(0.5, abs=0.05)
+
+
+# The others use nothing of a policy that one of these does not.
+@pytest.mark.parametrize("agent", ["ppo+bc", "ppo+sil", "ppo+gasil-adaptive"])
+def test_agents_train_it(agent):
+    env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm(agent)
+    more = DISCRIMINATOR if "gasil" in agent else {}
+    algorithm = algorithm.replace(**SETTINGS, **more, policy_components=3)
+    algorithm = algorithm.replace(entropy_coefficient=0.01)
+    state, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
+    assert np.isfinite(metrics["entropy"]).all()
+    assert (metrics["skipped_updates"] == 0).all()
+    layers = state.actor_critic.policy.params["params"]["MLP_0"]
+    assert layers["Dense_1"]["bias"].shape == (3 * (2 + 1),)
+
+
+def save(path):
+    """Save two policies with random layers, and return what they are of."""
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.algorithm("ppo", **SETTINGS, policy_components=3)
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
+    states, rng = init(jnp.arange(2, dtype=jnp.uint32)), np.random.default_rng(0)
+    other = lambda x: x + jnp.asarray(0.3 * rng.normal(size=x.shape), x.dtype)
+    learner = states.actor_critic.policy
+    learner = learner.replace(params=jax.tree.map(other, learner.params))
+    states = states.replace(actor_critic=states.actor_critic.replace(policy=learner))
+    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
+    return env, states
+
+
+def test_a_saved_policy_acts_as_the_network(tmp_path):
+    env, states = save(tmp_path / "policy.npz")
+    state = gasil_jax.member(states, 1)
+    observation = 3 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
+    network = MixturePolicy(SETTINGS["hidden_sizes"], 2, components=3)
+    normalized = normalization.normalize(state.normalizer, observation)
+    parameters = network.apply(state.actor_critic.policy.params, normalized)
+    mean, log_std, logits = (np.asarray(x, float) for x in parameters)
+    chosen = logits.argmax(axis=1)
+    assert len(set(chosen.tolist())) > 1  # Or the order of the output is not tested.
+    expected = np.clip(mean[np.arange(9), chosen], -1.0, 1.0)
+    act, in_numpy = gasil_jax.load_policy(tmp_path), numpy_policy.load(tmp_path)
+    for action in (act(observation), jax.vmap(act)(observation)):
+        np.testing.assert_allclose(action, expected, atol=1e-5)
+    drawn = in_numpy(np.asarray(observation))
+    assert drawn.dtype == np.float32
+    np.testing.assert_allclose(drawn, expected, atol=1e-5)
+    np.testing.assert_allclose(in_numpy(np.asarray(observation[3])), expected[3], 1e-4)
+
+    # Both draw from the same mixture, here without the clip.
+    weights = numpy_policy.read(tmp_path, 4)
+    weights |= {"low": np.full(2, -99.0), "high": np.full(2, 99.0)}
+    many = np.tile(observation[0], (20_000, 1))
+    w = softmax(logits[0])[:, None]
+    center = np.sum(w * mean[0], axis=0)
+    variance = np.sum(w * (mean[0] - center) ** 2, axis=0) + np.exp(2 * log_std)
+    for drawn in (
+        numpy_policy.make(weights)(many, np.random.default_rng(0)),
+        policy.make(weights)(many, jax.random.key(0)),
+    ):
+        np.testing.assert_allclose(drawn.mean(axis=0), center, atol=0.03)
+        np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(variance), rtol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"policy_components": np.int32(2)}, r"kernel_1 has the shape .*, 6\)"),
+        ({"policy_components": np.int32(-3)}, "kernel_1 has the shape"),
+        ({"policy_components": np.ones(2)}, "policy_components has the shape"),
+        ({"policy_components": np.float32(np.nan)}, "policy_components has numbers"),
+        ({"policy_components": None}, r"kernel_1 has the shape .*, 2\)"),
+    ],
+)
+def test_a_file_with_another_number_of_components_is_refused(tmp_path, changes, reason):
+    path = tmp_path / "policy.npz"
+    save(path)
+    arrays = {**np.load(path), **changes}
+    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
+    with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
+        gasil_jax.load_policy(path)
+
+
+def test_a_run_and_a_sweep_from_end_to_end(tmp_path, capsys):
+    flags = [*FLAGS, *DISCRIMINATOR_FLAGS, "--policy-components", "3"]
+    flags += ["--learning-rate-decay", "0"]
+    whole, parts = str(tmp_path / "whole"), str(tmp_path / "parts")
+    assert run.main([*flags, "--total-steps", "512", "--out", whole]) == 0
+    assert run.main([*flags, "--out", parts]) == 0
+    assert run.main(["--resume", "--out", parts, "--total-steps", "512"]) == 0
+    read = lambda out: list(csv.DictReader(open(f"{out}/metrics.csv")))
+    assert read(parts) == read(whole) and len(read(whole)) == 4
+    for more in ((), ("--stochastic",)):
+        assert evaluate.main([parts, "--episodes", "2", *more]) == 0
+    out = str(tmp_path / "sweep")
+    grid = ("--grid", "policy_components=1,3", "--out", out)
+    assert sweep.main([*FLAGS, *DISCRIMINATOR_FLAGS, *grid]) == 0
+    assert evaluate.main([out, "--episodes", "2"]) == 0
+
+
+class Own(gasil_jax.PPO):
+    """Its policy is one layer."""
+
+    def policy_network(self, sizes):
+        """Return the layer."""
+        return nn.Dense(sizes.action)
+
+
+@pytest.mark.parametrize(
+    ("env", "agent", "reason"),
+    [
+        (Corridor(), gasil_jax.PPO(), "the environment's actions are discrete"),
+        (None, Own(), "agent '.*:Own' has a policy_network of its own, with one mean"),
+    ],
+)
+def test_what_can_be_no_mixture_is_refused(env, agent, reason):
+    env = gasil_jax.make_env("point_mass") if env is None else env
+    algorithm = gasil_jax.Algorithm(agent).replace(policy_components=4)
+    message = f"^policy_components is 4: it must be 1, {reason}$"
+    with pytest.raises(ValueError, match=message):
+        gasil_jax.make_train(env, algorithm)
+
+
+def test_a_command_refuses_it_before_anything_compiles(tmp_path, capsys):
+    out = tmp_path / "run"
+    flags = ("--env", "sparse:key_grid", "--agent", "ppo", "--out", str(out))
+    assert run.main([*flags, "--policy-components", "4"]) == 2
+    assert "policy_components is 4: it must be 1, the" in capsys.readouterr().err
+    grid = ("--grid", "policy_components=1,4")
+    assert sweep.main([*flags, *grid]) == 2
+    assert "policy_components is 4: it must be 1, the" in capsys.readouterr().err
+    assert not out.exists()
