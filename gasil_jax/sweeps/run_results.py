@@ -84,7 +84,7 @@ def write(
     trained = {
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
+        "env_steps_per_second": speed(outcome.new_steps, outcome.train_seconds),
         "device": members.device_kind,
         "device_count": len(members.devices),
         "versions": metrics_files.versions(),
@@ -113,6 +113,18 @@ def write(
     return summary
 
 
+def speed(env_steps: int, seconds: float) -> float | None:
+    """Return the environment steps per second; None if a process took no step."""
+    return env_steps / max(seconds, 1e-9) if env_steps else None
+
+
+def speed_in_words(summary: Mapping[str, Any]) -> str:
+    """Return what a command prints of the speed, which may be unknown, and devices."""
+    known = summary["env_steps_per_second"]
+    steps = "" if known is None else f"{known:,.0f} steps/s "
+    return f"{steps}on {summary['device']}"
+
+
 def _by_seed_and_over_seeds(
     seeds: Sequence[int], quantities: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
@@ -137,7 +149,7 @@ class _Trained(TypedDict):
 
     compile_seconds: float
     train_seconds: float
-    env_steps_per_second: float
+    env_steps_per_second: float | None
     device: str
     device_count: int
     versions: dict[str, str | None]
