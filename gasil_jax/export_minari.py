@@ -127,7 +127,7 @@ def write(
     complete: Sequence[Episode],
     *,
     num_actions: int | None = None,
-    **metadata: str,
+    **metadata: Any,
 ) -> None:
     """Create a Minari data set; the module's docstring says what is filled in.
 
