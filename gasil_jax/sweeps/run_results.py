@@ -81,10 +81,11 @@ def write(
             if np.isfinite(value)
         }
 
+    speed = outcome.new_steps / (outcome.train_seconds or 1)
     trained = {
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": speed(outcome.new_steps, outcome.train_seconds),
+        "env_steps_per_second": speed or None,
         "device": members.device_kind,
         "device_count": len(members.devices),
         "versions": metrics_files.versions(),
@@ -113,13 +114,8 @@ def write(
     return summary
 
 
-def speed(env_steps: int, seconds: float) -> float | None:
-    """Return the environment steps per second; None if a process took no step."""
-    return env_steps / max(seconds, 1e-9) if env_steps else None
-
-
 def speed_in_words(summary: Mapping[str, Any]) -> str:
-    """Return what a command prints of the speed, which may be unknown, and devices."""
+    """Return what a command prints of the devices, and of the speed if it is known."""
     known = summary["env_steps_per_second"]
     steps = "" if known is None else f"{known:,.0f} steps/s "
     return f"{steps}on {summary['device']}"
