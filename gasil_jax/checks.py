@@ -134,6 +134,16 @@ def _levels(env: Any) -> Iterator[Any]:
         level = getattr(level, "__dict__", {}).get("env")
 
 
+def check_state(state: Any) -> None:
+    """Raise `ValueError` unless this is the training state of one run."""
+    if not hasattr(state, "iteration"):
+        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
+    if shape := jnp.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
+
+
 def check_key(key: Any) -> None:
     """Raise `ValueError` unless this is one random key, typed or of the older kind."""
     dtype = getattr(key, "dtype", None)

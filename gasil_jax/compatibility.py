@@ -1,7 +1,8 @@
-"""Refuse, on import, releases of jaxlib that compute wrong numbers."""
+"""Refuse, on import, other systems, and releases of jaxlib with wrong numbers."""
 
 import contextlib
 import importlib.metadata
+import sys
 
 #: Releases that compute batched reductions wrongly on a CPU (jax issue 39103).
 _MISCOMPILES = ("0.10.2",)
@@ -16,5 +17,7 @@ def check(jaxlib_version: str) -> None:
         )
 
 
+if sys.platform == "win32":
+    raise ImportError("gasil_jax runs on Linux and macOS: on Windows, use WSL")
 with contextlib.suppress(importlib.metadata.PackageNotFoundError):
     check(importlib.metadata.version("jaxlib"))

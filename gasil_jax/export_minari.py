@@ -4,7 +4,7 @@
 
 The data set holds complete episodes, best first. Observations and actions are exact;
 actions are as the policy drew them, before the environment limits them to its range;
-discrete ones are numbers.
+discrete ones are numbers. Minari can recover the environment of the package's tasks.
 The buffer does not hold an episode's rewards or its final observation, so these are
 filled in: the last step's reward is the episode's return, discounted as the buffer
 ranks it, and the others are 0; the final observation repeats the one before it; and
@@ -27,6 +27,7 @@ import jax
 import numpy as np
 import tyro
 
+from gasil_envs import registry
 from gasil_jax import train
 from gasil_jax.errors import InputError
 from gasil_jax.good_trajectories import GoodTrajectories
@@ -126,7 +127,7 @@ def write(
     complete: Sequence[Episode],
     *,
     num_actions: int | None = None,
-    **metadata: str,
+    **metadata: Any,
 ) -> None:
     """Create a Minari data set; the module's docstring says what is filled in.
 
@@ -223,9 +224,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
         env=f"{described['env']} {settings}",
         discounted=discounted,
     )
+    spec = None
+    if described["env"] in registry.names():
+        from gasil_envs.gymnasium_adapter import gymnasium
+
+        spec = gymnasium.spec(f"gasil_envs/{described['env']}")
+        spec = dataclasses.replace(spec, kwargs={**spec.kwargs, **settings})
     write(
         options.name,
         complete,
+        env=spec,
         num_actions=getattr(env, "num_actions", None),
         algorithm_name=agent.name,
         description=description,

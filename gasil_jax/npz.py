@@ -27,7 +27,7 @@ def read(
                 return {name: file[name] for name in file.files if needs(name)}
     # What is wrong in a file decides the type of the error, of which there are dozens.
     except Exception as error:
-        reason = str(error).partition("\n")[0] or type(error).__name__
+        reason = str(error).partition("\n")[0][:300] or type(error).__name__
         raise ValueError(reason) from None
 
 

@@ -11,7 +11,7 @@ from flax import struct
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import normalization, numpy_policy
+from gasil_jax import checks, normalization, numpy_policy
 from gasil_jax.distributions import CATEGORICAL, GAUSSIAN, MIXTURE
 from gasil_jax.networks import POLICY_LAYERS
 
@@ -86,12 +86,9 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
     """Return the policy of a single `TrainState`, as `load_policy` does for a file.
 
     Raises:
-      ValueError: if it is a batch of states.
+      ValueError: if it is a batch of states, or none.
     """
-    if shape := jnp.shape(state.iteration):
-        raise ValueError(
-            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
-        )
+    checks.check_state(state)
     return make(weights(state, env))
 
 
@@ -125,6 +122,7 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
             if key is None:
                 action = distribution.mode(parameters)
             else:
+                checks.check_key(key)
                 action = distribution.sample(key, parameters)
             return distribution.executed(action, arrays.get("low"), arrays.get("high"))
 

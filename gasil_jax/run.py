@@ -100,8 +100,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if name in summary
     }
     print(
-        f"{statistics.in_words(scores)}, {summary['env_steps_per_second']:,.0f} "
-        f"steps/s on {summary['device']}, in {folder}"
+        f"{statistics.in_words(scores)}, {run_results.speed_in_words(summary)}, "
+        f"in {folder}"
     )
     _print_next(env, folder)
     if summary["unhealthy_seeds"]:

@@ -29,7 +29,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.sweeps import assembly, launch, programs, shards, tables
+from gasil_jax.sweeps import assembly, launch, programs, run_results, shards, tables
 from gasil_jax.sweeps.plan import Plan
 from gasil_jax.sweeps.points import Point, check_saved, make_points
 from gasil_jax.sweeps.runs import Run
@@ -241,10 +241,7 @@ def _train_shard(
     speed = tables.speed(
         [x.training for x in trained if not own.isdisjoint(x.program.runs)]
     )
-    print(
-        f"shard {shard} is done, {speed['env_steps_per_second']:,.0f} steps/s "
-        f"on {speed['device']}, in {folder}"
-    )
+    print(f"shard {shard} is done, {run_results.speed_in_words(speed)}, in {folder}")
     if missing := plan.missing(trained):
         print(f"{len(missing)} of {len(plan.runs)} runs of the sweep are missing")
         return

@@ -216,10 +216,7 @@ def _init_actor_critic(
 
 def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
     """Raise `ValueError` where arrays would be broadcast, or steps lost, unnoticed."""
-    if shape := jnp.shape(state.iteration):
-        raise ValueError(
-            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
-        )
+    checks.check_state(state)
     check_numbers(algorithm, state.hyperparameters)
     key = jax.random.key(0)
     needed = jax.eval_shape(lambda: _init_memory(env, algorithm, key, rewards_key=key))

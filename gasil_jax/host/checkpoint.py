@@ -14,7 +14,6 @@ training continues from an older one.
 
 import contextlib
 import hashlib
-import json
 import logging
 import math
 import os
@@ -31,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gasil_jax.host import json_reader, output_file
+from gasil_jax.host import json_reader, metrics_files, output_file
 
 _STATE, _MANIFEST = "state", "manifest.json"
 #: The name of the only array of a state that has none.
@@ -234,7 +233,7 @@ def write(
         partial.mkdir()
         save(partial / _STATE, state)
         manifest = {"files": _hashes(partial), "record": record}
-        (partial / _MANIFEST).write_text(json.dumps(manifest, allow_nan=False))
+        metrics_files.write_json(partial / _MANIFEST, manifest)
         for path in [*partial.rglob("*"), partial]:
             _flush(path)
         shutil.rmtree(folder, ignore_errors=True)  # A damaged checkpoint.

@@ -1,6 +1,7 @@
 """Read the JSON files of a run folder, and check their content against a type."""
 
 import dataclasses
+import hashlib
 import json
 import math
 import pathlib
@@ -19,9 +20,17 @@ _DESCRIPTIONS = {
     types.NoneType: "null",
 }
 
+#: The field that `metrics_files.write_json` adds, with the hash of the others.
+HASH = "sha256"
+
+
+def digest(content: Any) -> str:
+    """Return the SHA-256 of the content of a JSON file, however it is laid out."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
 
 def read(path: pathlib.Path, kind: Any) -> Any:
-    """Return the content of a JSON file, checked against a type.
+    """Return the content of a JSON file, checked against a type and its own hash.
 
     Args:
       path: the file.
@@ -31,12 +40,18 @@ def read(path: pathlib.Path, kind: Any) -> Any:
         these; or `Any`, which is not checked, but whose lists become tuples.
 
     Raises:
-      InputError: if the content has another type; the message names the field.
+      InputError: if the content has another type, which the message names, or if it
+        has changed since it was written.
       NotImportable: if it names an agent that can't be imported here.
       OSError: if there is no such file.
     """
     try:
-        return as_type(kind, json.loads(path.read_text()), "")
+        content = json.loads(path.read_text())
+        written = content.pop(HASH, None) if isinstance(content, dict) else None
+        value = as_type(kind, content, "")
+        if written not in (None, digest(content)):
+            raise ValueError(f"it was changed: to use it as it is, delete its {HASH}")
+        return value
     except NotImportable:
         raise
     # Deeply nested brackets cause a RecursionError.

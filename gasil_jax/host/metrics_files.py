@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import output_file
+from gasil_jax.host import json_reader, output_file
 
 #: Metrics that every metrics.csv has, in this order; the agent's own metrics follow.
 COLUMNS = (
@@ -63,8 +63,9 @@ def _version(package: str) -> str | None:
 
 
 def write_json(path: pathlib.Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file atomically."""
-    text = to_json(content)
+    """Write a JSON file atomically, with a hash by which its reader sees changes."""
+    plain = json.loads(to_json(content))
+    text = to_json({**plain, json_reader.HASH: json_reader.digest(plain)})
     with output_file.atomic(path) as partial:
         partial.write_text(text + "\n")
 
@@ -186,7 +187,9 @@ class MetricsWriter:
 def _cut(path: pathlib.Path, size: int) -> None:
     """Shorten a file to `size` bytes, and move the rest to a new file beside it."""
     with path.open("rb+") as file:
-        file.seek(size)
+        file.seek(max(0, size - 1))
+        if size and file.read(1) != b"\n":
+            raise ValueError(f"{path} is damaged: it has changed since the checkpoint")
         rest = file.read()
         if not rest:
             return
@@ -257,6 +260,9 @@ def read_metrics(
     for name in ("env_steps", *required):
         if name not in metrics:
             raise InputError(f"{path} is damaged: it has no column {name}")
+    steps = metrics["env_steps"]
+    if not (steps == steps[0]).all() or not (np.diff(steps[0]) > 0).all():
+        raise InputError(f"{path} is damaged: its env_steps are not in order")
     return metrics
 
 

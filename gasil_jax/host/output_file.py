@@ -12,8 +12,8 @@ from gasil_jax.errors import InputError
 
 #: Errors of calls that a file system does not have, such as those for locks.
 MISSING_CALL = (errno.ENOSYS, errno.EINVAL, errno.EOPNOTSUPP)
-#: Errors of a disk, or a user's share of it, that is full. Windows has no EDQUOT.
-_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))
+#: Errors of a disk, or a user's share of it, that is full.
+_FULL = (errno.ENOSPC, errno.EDQUOT)
 
 
 class WriteError(OSError):

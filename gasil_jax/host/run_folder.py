@@ -3,6 +3,7 @@
 import contextlib
 import dataclasses
 import errno
+import fcntl
 import functools
 import hashlib
 import os
@@ -11,7 +12,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import IO, Any, NamedTuple, Required, TypedDict
+from typing import Any, NamedTuple, Required, TypedDict
 
 import jax
 
@@ -135,30 +136,21 @@ def _note_missing_locks(folder: pathlib.Path, why: str) -> None:
     )
 
 
-def _lock_file(file: IO[str]) -> None:
-    """Lock an open file until it is closed; raise `OSError` if it can't be."""
-    try:
-        import fcntl
-    except ImportError:  # Windows.
-        raise OSError(errno.ENOSYS, "the system has no fcntl") from None
-    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-
-
 @contextlib.contextmanager
 def lock(folder: pathlib.Path, *, option: str = "out") -> Iterator[None]:
     """Lock the folder against other processes inside the `with` block.
 
     What a killed process had half written is deleted.
 
-    The operating system frees the lock when the process ends, however it ends. Where it
-    or the file system has no locks, a note says so, and nothing is locked.
+    The operating system frees the lock when the process ends, however it ends. Where
+    the file system has no locks, a note says so, and nothing is locked.
 
     Raises:
       InputError: if another process holds the lock.
     """
     with (folder / _LOCK).open("a+") as file:
         try:
-            _lock_file(file)
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
             raise InputError(

@@ -2,7 +2,6 @@
 
 import contextlib
 import json
-import os
 import pathlib
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -61,7 +60,7 @@ def fit(
     *,
     seeds: int | Sequence[int] | np.ndarray | jax.Array = 1,
     points: Sequence[Mapping[str, float]] | None = None,
-    folder: str | os.PathLike[str] | None = None,
+    folder: str | pathlib.Path | None = None,
     resume: bool = False,
     checkpoint_every: int | None = None,
     evaluate_every: int | None = None,
@@ -126,6 +125,10 @@ def fit(
         if value not in _COUNT and not default:
             raise refusal(name, value, _COUNT)
     validate_switch("resume", resume)
+    if not isinstance(folder, str | pathlib.PurePath | None):
+        raise refusal("folder", folder, "a string or a pathlib.Path")
+    if callback is not None and not callable(callback):
+        raise refusal("callback", callback, "a function")
     if folder is None and (resume or checkpoint_every is not None):
         name = "resume" if resume else "checkpoint_every"
         raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")

@@ -21,7 +21,7 @@ import numpy as np
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
 from gasil_jax.host import json_reader, metrics_files, run_folder
-from gasil_jax.sweeps.runs import Run, read_run, run_key
+from gasil_jax.sweeps.runs import Run, read_run
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
 
@@ -60,12 +60,8 @@ class Program:
     @functools.cached_property
     def name(self) -> str:
         """A hash of its runs, the name of its folder."""
-        return _name(run.key for run in self.runs)
-
-
-def _name(keys: Iterable[str]) -> str:
-    """Return the name of the program whose runs have these keys."""
-    return hashlib.sha256(" ".join(keys).encode()).hexdigest()[:16]
+        keys = " ".join(run.key for run in self.runs)
+        return hashlib.sha256(keys.encode()).hexdigest()[:16]
 
 
 def group(
@@ -235,21 +231,13 @@ def _read(path: pathlib.Path, total_steps: int | None) -> ProgramFolder:
     try:
         experiments = listed["experiments"]
         every = [read_run(experiments[index], seed) for index, seed in listed["runs"]]
-        # An earlier version may have had fewer settings: the hash is of those listed.
-        texts = [json.dumps(experiment, sort_keys=True) for experiment in experiments]
-        keys = (run_key(texts[index], seed) for index, seed in listed["runs"])
-        if not every or _name(keys) != path.parent.name:
-            raise ValueError("its runs are not those of its folder")
-        labels = listed["labels"]
-        if {len(values) for values in labels.values()} != {len(every)}:
-            raise ValueError("its labels are not those of its runs")
         if total_steps is not None:
             every = [run.with_total_steps(total_steps) for run in every]
     except NotImportable:
         raise
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-    return ProgramFolder(Program(tuple(every)), path.parent, labels)
+    return ProgramFolder(Program(tuple(every)), path.parent, listed["labels"])
 
 
 def unfinished(

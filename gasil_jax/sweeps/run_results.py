@@ -81,10 +81,11 @@ def write(
             if np.isfinite(value)
         }
 
+    speed = outcome.new_steps / (outcome.train_seconds or 1)
     trained = {
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": outcome.new_steps / max(outcome.train_seconds, 1e-9),
+        "env_steps_per_second": speed or None,
         "device": members.device_kind,
         "device_count": len(members.devices),
         "versions": metrics_files.versions(),
@@ -113,6 +114,13 @@ def write(
     return summary
 
 
+def speed_in_words(summary: Mapping[str, Any]) -> str:
+    """Return what a command prints of the devices, and of the speed if it is known."""
+    known = summary["env_steps_per_second"]
+    steps = "" if known is None else f"{known:,.0f} steps/s "
+    return f"{steps}on {summary['device']}"
+
+
 def _by_seed_and_over_seeds(
     seeds: Sequence[int], quantities: Mapping[str, np.ndarray]
 ) -> dict[str, Any]:
@@ -137,7 +145,7 @@ class _Trained(TypedDict):
 
     compile_seconds: float
     train_seconds: float
-    env_steps_per_second: float
+    env_steps_per_second: float | None
     device: str
     device_count: int
     versions: dict[str, str | None]

@@ -87,7 +87,8 @@ class Run:
     @functools.cached_property
     def key(self) -> str:
         """A hash of the settings, which identifies the run; see `NEWER`."""
-        return run_key(self.experiment, self.seed)
+        text = f"{self.experiment} {self.seed}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @functools.cached_property
     def shapes(self) -> str:
@@ -103,11 +104,6 @@ class Run:
         """Return the run with another length of training."""
         algorithm = self.algorithm.replace(total_steps=total_steps)
         return dataclasses.replace(self, algorithm=algorithm)
-
-
-def run_key(experiment: str, seed: int) -> str:
-    """Return the key of the run with this `Run.experiment` and seed."""
-    return hashlib.sha256(f"{experiment} {seed}".encode()).hexdigest()[:16]
 
 
 def read_run(experiment: Mapping[str, Any], seed: int) -> Run:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import math
 import pathlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -15,7 +16,8 @@ from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import numpy_policy, policy, train
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError
+from gasil_jax.config import Range
+from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     checkpoint,
     command_line,
@@ -124,6 +126,11 @@ def load(
         seed, or if "best" is requested of a point that shares its checkpoints with
         other points.
     """
+    for name, number in (("point", point), ("seed", seed)):
+        if number is not None and number not in Range(-math.inf, whole=True):
+            raise refusal(name, number, "a whole number")
+    if not isinstance(which, str) or which not in ("last", "best"):
+        raise refusal("which", which, "'last' or 'best'")
     description = run_folder.read(folder)
     every = find(folder, description, point)
     settings = dataclasses.asdict(description["settings"])
@@ -251,6 +258,8 @@ def load_reward(
       ValueError: as `load` does, or if the run's agent has no discriminator, or a bonus
         that depends on the batch that a step is in.
     """
+    if not isinstance(folder, str | pathlib.PurePath):
+        raise refusal("folder", folder, "a string or a pathlib.Path")
     env, algorithm, _, states = load(pathlib.Path(folder), which, point, seed=seed)
     agent, state = algorithm.agent, member(states, 0)
     if not isinstance(agent, AdversarialAgent):

@@ -13,7 +13,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.host import command_line, metrics_files, output_file, policy_file
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
-from gasil_jax.sweeps import saved_states
+from gasil_jax.sweeps import run_results, saved_states
 from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.programs import ProgramFolder
@@ -248,11 +248,12 @@ def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return sum(training[name] for training in trainings)
 
     devices = _joined([{"device": training["device"]} for training in trainings])
+    per_second = total("env_steps") / (total("train_seconds") or 1)
     evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
     return {
         "compile_seconds": total("compile_seconds"),
         "train_seconds": total("train_seconds"),
-        "env_steps_per_second": total("env_steps") / max(total("train_seconds"), 1e-9),
+        "env_steps_per_second": per_second or None,
         **({"evaluation_seconds": total("evaluation_seconds")} if evaluated else {}),
         **devices,
         "device_count": max(training["device_count"] for training in trainings),
@@ -309,10 +310,7 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
     seconds = f"{summary['train_seconds']:,.0f} s of training"
     if "evaluation_seconds" in summary:
         seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
-    lines = [
-        f"{summary['env_steps_per_second']:,.0f} steps/s on {summary['device']}"
-        f" ({seconds})"
-    ]
+    lines = [f"{run_results.speed_in_words(summary)} ({seconds})"]
     for title in ("best_by_mean", "best_by_worst_seed"):
         best = summary[title]
         if best is None:

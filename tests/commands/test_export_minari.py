@@ -65,6 +65,8 @@ def test_whole_episodes_come_back(filled, capsys):
         assert not episode.terminations.any()
         assert np.flatnonzero(episode.truncations).tolist() == [length - 1]
         np.testing.assert_array_equal(*episode.observations[-2:])
+    env = dataset.recover_environment().unwrapped
+    assert env.reset(seed=0)[0].shape == (11,) and env.spec.id == "gasil_envs/hopper"
     metadata = dataset.storage.metadata
     assert metadata["algorithm_name"] == "ppo+gasil"
     assert "its return, discounted by 0.99 a step, and" in metadata["description"]

@@ -75,6 +75,17 @@ def test_a_policy_that_cannot_act_is_refused(name, value, why, tmp_path):
         numpy_policy.load(tmp_path)
 
 
+def test_a_name_of_thousands_of_bytes_is_cut(tmp_path):
+    path = tmp_path / "policy.npz"
+    np.savez(path, **POLICY)
+    content = bytearray(path.read_bytes())
+    content[26:28] = b"\xff\x0f"  # the length of the first array's name
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match="File name in directory") as told:
+        numpy_policy.load(path)
+    assert len(str(told.value)) < len(str(path)) + 400
+
+
 def test_a_policy_of_another_byte_order_and_with_a_further_array_acts(tmp_path):
     swapped = {name: x.astype(x.dtype.newbyteorder()) for name, x in POLICY.items()}
     np.savez(tmp_path / "policy.npz", **swapped, bias_9=np.ones(()))

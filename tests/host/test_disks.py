@@ -252,24 +252,14 @@ def test_a_full_disk_has_a_hint(tmp_path):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-def test_a_system_without_fcntl_trains(tmp_path):
-    program = (
-        "import sys; sys.modules['fcntl'] = None; from gasil_jax import run; "
-        "sys.exit(run.main(sys.argv[1:]))"
-    )
-    arguments = [*SMALL, "--out", str(tmp_path / "out")]
+def test_windows_is_refused_in_a_line():
+    program = "import sys; sys.platform = 'win32'; import gasil_jax"
     ended = subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        capture_output=True,
-        text=True,
+        [sys.executable, "-c", program], capture_output=True, text=True
     )
-    assert ended.returncode == 0, ended.stderr
-    notes = re.findall("note: .*locked.*", ended.stderr)
-    assert notes == [
-        f"note: {tmp_path / 'out'} can't be locked (the system has no fcntl): make "
-        "sure that no other process writes to it"
-    ]
-    assert (tmp_path / "out" / "policy.npz").exists()
+    assert ended.stderr.splitlines()[-1] == (
+        "ImportError: gasil_jax runs on Linux and macOS: on Windows, use WSL"
+    )
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):

@@ -11,10 +11,12 @@ from hostile_values import drawn, is_real, is_whole
 import gasil_jax
 from gasil_jax import algorithms, config, evaluation, numpy_policy
 from gasil_jax.imitation import AGENTS
-from gasil_jax.sweeps import fitting
+from gasil_jax.policy import from_state
+from gasil_jax.sweeps import fitting, saved_states
 
 ENV = gasil_jax.make_env("point_mass")
 SMALL = gasil_jax.algorithm(num_envs=4, batch_steps=64, minibatch_size=16)
+POLICY = gasil_jax.load_policy("zoo:walker2d-delayed")
 ZOO_SEED = numpy_policy.about("zoo:walker2d-delayed")["seed"]
 ENVIRONMENTS = "point_mass hopper walker2d halfcheetah swimmer ant humanoid".split()
 
@@ -51,6 +53,14 @@ def episodes(**arguments):
     act = lambda observation, key: jnp.zeros((*observation.shape[:-1], 2))
     key = given.pop("key", jax.random.key(0))
     return jax.eval_shape(lambda: evaluation.run_episodes(ENV, act, key, **given))
+
+
+def reward(seed=None, **arguments):
+    with mock.patch.object(saved_states.run_folder, "read", side_effect=AcceptedError):
+        try:
+            gasil_jax.load_reward("no", seed, **arguments)
+        except AcceptedError:
+            pass
 
 
 def is_key(value):
@@ -172,6 +182,18 @@ CASES = [
             ("key", is_key),
         )
     ],
+    *[
+        (name, lambda x, name=name: reward(**{name: x}), valid)
+        for name, valid in (
+            ("seed", lambda x: x is None or is_whole(x, -1e308, 1e308)),
+            ("point", lambda x: x is None or is_whole(x, -1e308, 1e308)),
+            ("which", is_one_of("last", "best")),
+        )
+    ],
+    ("callback", lambda x: fit(callback=x), lambda x: x is None or callable(x)),
+    ("key", lambda x: POLICY(np.zeros(17), x), lambda x: x is None or is_key(x)),
+    ("state", lambda x: gasil_jax.iterate(ENV, SMALL, x), lambda x: False),
+    ("state", lambda x: from_state(x, ENV), lambda x: False),
     ("env", lambda x: gasil_jax.make_train(x, SMALL), lambda x: False),
     ("algorithm", lambda x: gasil_jax.make_train(ENV, x), lambda x: False),
     (

@@ -213,6 +213,7 @@ def test_settings_that_changed_before_the_lock_are_refused(whole, tmp_path):
     path = out / "config.json"
     changed = json.loads(path.read_text())
     changed["algorithm"]["total_steps"] *= 2
+    del changed["sha256"]
     path.write_text(json.dumps(changed))
     with pytest.raises(InputError, match="total_steps was 102400, is 51200"):
         with run_options.open_folder(options, "gasil_jax.run"):
@@ -277,6 +278,12 @@ def test_resume_needs_a_folder(capsys):
             lambda path: path.write_text(path.read_text().replace(",0.", ",z.")),
             "metrics.csv",
         ),
+        (
+            lambda path: path.write_bytes(
+                path.read_bytes().replace(b",0.", b",00.", 3)
+            ),
+            "metrics.csv is damaged: it has changed since the checkpoint",
+        ),
     ],
 )
 def test_a_damaged_table_is_reported_in_a_line(
@@ -298,6 +305,15 @@ def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
         for name in theirs:
             np.testing.assert_array_equal(ours[name], theirs[name])
     assert checkpoints(out) == checkpoints(whole)
+
+
+def test_a_run_that_was_killed_before_its_summary_has_no_speed(whole, tmp_path, capsys):
+    out = copy(whole, tmp_path)
+    (out / "summary.json").unlink()
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert "steps/s" not in capsys.readouterr().out
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["env_steps_per_second"] is None
 
 
 def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
