@@ -264,8 +264,8 @@ def test_a_system_without_fcntl_is_told(tmp_path):
     assert ended.returncode == 0, ended.stderr
     notes = re.findall("note: .*locked.*", ended.stderr)
     assert notes == [
-        f"note: {tmp_path} can't be locked (the system has no fcntl): make sure that no "
-        "other process writes to it"
+        f"note: {tmp_path} can't be locked (the system has no fcntl): make sure that "
+        "no other process writes to it"
     ]
 
 
