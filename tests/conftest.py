@@ -78,10 +78,12 @@ def equal_members_share_a_program():
     """Trace and compile the training of equal members once in a session.
 
     Members are equal if they are trained by the same algorithm, with equal numbers, in
-    an environment that was made by the same name with the same settings.
+    an environment that was made by the same name with the same settings. Yields the
+    programs, for a test that needs one to be compiled.
     """
     import jax
 
+    jax.devices()  # The first run would start as many as it has members.
     compile_ = Members.compile
 
     def compiled(self, states=None):
@@ -101,7 +103,7 @@ def equal_members_share_a_program():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Members, "compile", compiled)
-        yield
+        yield _programs
 
 
 @pytest.hookimpl(tryfirst=True)
