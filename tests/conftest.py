@@ -23,8 +23,10 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
     _flags = os.environ.get("XLA_FLAGS", "")
     os.environ["XLA_FLAGS"] = f"{_flags} --xla_cpu_use_fusion_emitters=false".strip()
 
+from gasil_envs import registry
 from gasil_envs.physics import native
 from gasil_jax.host import run_options
+from gasil_jax.host.members import Members
 
 native.reserve_threads(2)
 
@@ -64,6 +66,44 @@ def pytest_runtest_setup(item):
         jax.config.update("jax_disable_most_optimizations", plainly)
         # JAX keeps compiled programs whatever the setting, and they round otherwise.
         jax.clear_caches()
+        _programs.clear()
+
+
+# The compiled training of members, by all that it depends on.
+_programs = {}
+
+
+@pytest.fixture(autouse=True, scope="session")
+def equal_members_share_a_program():
+    """Trace and compile the training of equal members once in a session.
+
+    Members are equal if they are trained by the same algorithm, with equal numbers, in
+    an environment that was made by the same name with the same settings. Yields the
+    programs, for a test that needs one to be compiled.
+    """
+    import jax
+
+    jax.devices()  # The first run would start as many as it has members.
+    compile_ = Members.compile
+
+    def compiled(self, states=None):
+        made = registry.made_with(self.env)
+        named = made is not None and ":" not in made[0]
+        if not named or jax.tree.leaves(self.data):
+            return compile_(self, states)
+        padded = self.num_members + self._padding
+        key = (made, self.algorithm, padded, *self.devices)
+        if key not in _programs:
+            states, _programs[key] = compile_(self, states)
+        elif states is None:
+            states = self.init()
+        else:
+            states = self.to_devices(states)
+        return states, _programs[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Members, "compile", compiled)
+        yield _programs
 
 
 @pytest.hookimpl(tryfirst=True)

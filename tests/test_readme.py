@@ -91,6 +91,9 @@ def my_tasks(tmp_path_factory):
     agent, test, network, task, robot = re.findall(
         r"```python\n(.*?)```", text, re.DOTALL
     )
+    # Its step on the fast physics, slow to compile, is in test_robots.py.
+    robot = robot.replace("Locomotion(task)", "Locomotion(task, physics='mujoco')")
+    assert "physics='mujoco'" in robot
     # Whatever its attributes are called, it is none of ours.
     names = "Line.model = Line.layout = Line.task = None"
     folder = tmp_path_factory.mktemp("my_tasks")
@@ -209,32 +212,39 @@ def as_toy(line, finished, locomotion, folder):
     return PROGRAMS[program], arguments
 
 
+def parts_of(line):
+    """Return what a command uses: its program and options, what it reads and writes."""
+    _, _, program, *arguments = shlex.split(line)
+    options = {word for word in arguments if word.startswith("--")}
+    read = {word for word in arguments[:1] if not word.startswith("--")}
+    written = set(re.findall(r"--out \S+(\.\w+)", line))
+    return {program, *options, *read, *written}
+
+
 @pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
 def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_tasks):
-    """Training commands run first, on the point mass and for some hundred steps."""
+    """On the point mass and for some hundred steps; each kind of command once.
+
+    The settings of the other runs are understood, by the test above, and are trained
+    with in the tests of agents.
+    """
     pytest.importorskip("minari")
     pytest.importorskip("imageio_ffmpeg")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     lines = [line for line in OURS if not line.startswith(tuple(NOT_RUN))]
-    training = [line for line in lines if line.startswith("python -m gasil_jax.run")]
-    assert training
-    finished = tmp_path / "0"
-    rest = [line for line in lines if line not in training]
-    ran, swept = [], []
-    for number, line in enumerate([*training, *rest]):
-        # Made small, some commands are the same. A sweep with no other options than
-        # one before it is that sweep, over other values.
-        program, arguments = as_toy(line, finished, untrained_hopper, tmp_path)
-        if program is sweep:
-            options = {word for word in arguments if word.startswith("--")}
-            if any(options <= others for others in swept):
-                continue
-            swept.append(options)
-        elif (program, arguments) in ran:
+    # The first command's run is what the others take.
+    is_run = lambda line: line.startswith("python -m gasil_jax.run")
+    first, *others = sorted(lines, key=is_run, reverse=True)
+    # A command with no other parts than one before it is that one, with other values.
+    others = [line for line in others if not is_run(line)]
+    others.sort(key=lambda line: -len(parts_of(line)))
+    finished, ran = tmp_path / "0", []
+    for number, line in enumerate([first, *others]):
+        if any(parts_of(line) <= parts for parts in ran):
             continue
-        ran.append((program, arguments))
+        ran.append(parts_of(line))
         folder = tmp_path / str(number)
-        if line in rest:
+        if line != first:
             folder.mkdir()
         program, arguments = as_toy(line, finished, untrained_hopper, folder)
         status = program.main(arguments)
@@ -245,6 +255,9 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_ta
         for option, value in itertools.pairwise(shlex.split(line)):
             if option == "--out":
                 assert (folder / value).stat().st_size > 0, line
+    assert {program for parts in ran for program in parts} >= PROGRAMS.keys() - {
+        "gasil_jax.merge"
+    }
 
 
 def test_options_in_the_table_exist():
@@ -294,10 +307,12 @@ def run_python(path):
     assert blocks
     env = gasil_jax.make_env("point_mass")
     small = {"batch_steps": 512, "num_envs": 4, "num_epochs": 1}
-    small |= {"hidden_sizes": (8,), "discriminator_hidden_sizes": (8,)}
+    small |= {"hidden_sizes": (8,)}
     names = {"observation": np.zeros(env.observation_size, np.float32), "small": small}
     changes = {
         r'"(walker2d|hopper)", ': '"point_mass", ',
+        # It has an alpha too, and compiles in half the time.
+        r'"ppo\+gasil"': '"ppo+bonus"',
         r"(gasil_jax\.preset\(.*\))": r"\1.replace(**small, total_steps=1024)",
         "1_000_000": "1024",
         r"key\(0\), \d+\)": "key(0), 2)",
@@ -360,7 +375,7 @@ def test_the_links_of_the_readme_lead_somewhere():
 
 
 def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
-    out, swept = tmp_path / "out", tmp_path / "swept"
+    out = tmp_path / "out"
     small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
     both = ["--env", "my_tasks:Line", "--agent", "my_tasks:Scaled", *small.split()]
     arguments = ["--reward-factor", "0.3", "--first-seed", "5", "--out", str(out)]
@@ -376,12 +391,6 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     assert evaluate.main([str(out), "--gymnasium"]) == 2
     assert "must be of a locomotion task" in capsys.readouterr().err
 
-    grid = ["--grid", "reward_factor=0.1,0.3", "--out", str(swept)]
-    assert sweep.main([*both, *grid]) == 0
-    scaled = np.load(swept / "curves.npz")["scaled_reward"][:, 0, 0]
-    # The first batch is that of the same policy.
-    np.testing.assert_allclose(scaled[1] / scaled[0], 3.0, rtol=1e-5)
-
 
 def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
     env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
@@ -389,9 +398,6 @@ def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
     assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
     metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
     assert (metrics["faulty_steps"] == 0).all()
-    assert (
-        evaluate.main([str(out), "--episodes", "1", "--out", str(out / "a.csv")]) == 0
-    )
     page = tmp_path / "walk.html"
     assert render.main([str(out), "--steps", "2", "--out", str(page)]) == 0
     assert page.stat().st_size > 1000
@@ -410,10 +416,6 @@ def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
     params = states.actor_critic.policy.params
     assert params["params"]["own"]["Conv_0"]["kernel"].shape == (2, 3, 3, 4, 16)
     assert evaluate.main([str(out), "--episodes", "2"]) == 0
-    more = ["--resume", "--out", str(out), "--total-steps", "512"]
-    assert run.main(more) == 0
-    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 2)
-    assert metrics["value_loss"].shape[-1] == 4
 
 
 def test_the_documented_test_of_an_agent_passes(my_tasks):

@@ -77,11 +77,10 @@ def read(values: Mapping[str, Any]) -> Algorithm:
         for model in REWARD_MODELS
     }
     algorithm = algorithm.replace(**switches)
-    kinds = {
-        name: get_type_hints(type(part))[name]
-        for part in algorithm.parts
-        for name in names(part)
-    }
+    kinds = {}
+    for part in algorithm.parts:
+        hints = get_type_hints(type(part))
+        kinds |= {name: hints[name] for name in names(part)}
     for name in settings:
         if name not in kinds:
             raise InputError(algorithm.why_not(name))

@@ -176,19 +176,26 @@ def test_a_form_that_does_not_exist_is_refused():
 
 
 @functools.cache
+def longer_context():
+    """The context of a first iteration that is long enough to fill a buffer."""
+    algorithm = SMALL["gasil"].replace(batch_steps=1024)
+    return jax.jit(lambda key: example_context(ENV, algorithm, key))(jax.random.key(0))
+
+
+@functools.cache
 def first_update(**changes):
     """The discriminator after an iteration of GASIL, (parameters,), and the buffer."""
-    settings = {"batch_steps": 1024, "buffer_steps": 300, **changes}
-    algorithm = SMALL["gasil"].replace(**settings)
+    agent, key = SMALL["gasil"].agent.replace(buffer_steps=300), jax.random.key(0)
+    agent = agent.replace(**changes)
+    sizes = Sizes(ADAPTIVE.config.num_envs, ENV.observation_size, ENV.action_size)
 
     @jax.jit
-    def first(key):
-        agent, context = algorithm.agent, example_context(ENV, algorithm, key)
-        state = agent.remember(gasil_jax.init(ENV, algorithm, key).agent, context)
+    def first(context):
+        state = agent.remember(agent.init(key, sizes), context)
         state, *_ = agent.update_and_reward(state, context, key)
         return ravel_pytree(state.discriminator.params)[0], state.buffer
 
-    return first(jax.random.key(0))
+    return first(longer_context())
 
 
 @pytest.mark.parametrize(

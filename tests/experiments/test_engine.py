@@ -21,13 +21,14 @@ from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.members import Members
 from gasil_jax.host.periodic_evaluation import evaluation_key
 from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.runs import Run
 from gasil_jax.sweeps.shards import Shard
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
-SMALL |= {"total_steps": 1024}
+SMALL |= {"total_steps": 12 * 256}
 
 
 def run(seed=0, **changes):
@@ -117,33 +118,30 @@ def test_a_record_is_what_make_train_gives(trained):
     _, _, records = trained
     assert set(records) == set(RUNS)
     env = gasil_jax.make_env("point_mass")
+    train = jax.jit(gasil_jax.make_train(env, RUNS[0].algorithm))
+    score = jax.jit(
+        lambda state, key: evaluate(
+            env, RUNS[0].algorithm, state, key=key, num_episodes=2
+        )
+    )
     for each, record in records.items():
-        train = jax.jit(gasil_jax.make_train(env, each.algorithm))
-        state, metrics = train(jax.random.key(each.seed))
-        assert record.env_steps.tolist() == [256, 512, 768, 1024]
+        numbers = each.algorithm.hyperparameters
+        state, metrics = train(jax.random.key(each.seed), numbers)
+        assert record.env_steps.tolist() == [256 * i for i in range(1, 13)]
         for name in ("episode_return", "episode_length"):
             np.testing.assert_allclose(getattr(record, name), metrics[name], rtol=2e-3)
         assert record.provenance["commit"] == "c" and record.provenance["clean"]
         assert record.provenance["physics"] == "mjx" and record.provenance["device"]
-        # A program of four iterations is evaluated after each of them.
-        assert record.evaluation_steps.tolist() == [256, 512, 768, 1024]
-        key = evaluation_key(each.seed, 4)
-        scores = evaluate(env, each.algorithm, state, key=key, num_episodes=2)
+        # At most ten evaluations are spread over training.
+        assert record.evaluation_steps.tolist() == [512 * i for i in range(1, 7)]
+        scores = score(state, evaluation_key(each.seed, 12))
         expected = scores["episode_return"].mean()
         assert record.evaluation_return[-1] == pytest.approx(expected, rel=2e-3)
 
 
-def test_evaluations_are_spread_over_training(tmp_path):
-    setup = Setup(tmp_path, evaluate_episodes=1)
-    (program,) = engine.unfinished([run(total_steps=30 * 256)], setup)
-    (record,) = engine.train(program, setup).values()
-    assert record.evaluation_steps.tolist() == [3 * 256 * i for i in range(1, 11)]
-    assert np.isfinite(record.evaluation_return).all()
-
-
 def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
     setup, _, records = trained
-    monkeypatch.setattr(gasil_jax.train, "iterate", None)
+    monkeypatch.setattr(Members, "compile", None)
     store = Store(tmp_path)
     # Unless that is asked for, training in the scratch folder is not continued.
     with pytest.raises(InputError, match=r"holds training of these runs.*--resume"):

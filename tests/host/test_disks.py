@@ -396,10 +396,10 @@ def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
 
 def test_a_full_disk_is_one_line_that_says_how_to_continue(tmp_path):
     out = tmp_path / "out"
-    flags = ("--total-steps", str(10**6), "--checkpoint-every", str(10**9))
+    flags = ("--total-steps", str(10**6), "--checkpoint-every", str(500 * 128))
     child = start(out, *SMALL, *flags)
     table = out / "metrics.csv"
-    wait_for(lambda: table.exists() and table.stat().st_size > 0, child)
+    wait_for(lambda: (out / "checkpoints" / "00000500").exists(), child)
     # No file may grow beyond this: writing fails as on a full disk.
     largest = table.stat().st_size + 20_000
     resource.prlimit(child.pid, resource.RLIMIT_FSIZE, (largest, largest))
@@ -412,3 +412,5 @@ def test_a_full_disk_is_one_line_that_says_how_to_continue(tmp_path):
         f"error: {table} can't be written: File too large; continue with: "
         f"python -m gasil_jax.run --resume --out {out}"
     )
+    newest, errors = checkpoint.latest(out / "checkpoints")
+    assert newest.iteration == 500 and errors == []

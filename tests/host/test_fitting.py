@@ -83,6 +83,11 @@ def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
     )
 
 
+def test_without_a_discriminator_there_is_no_reward(commanded):
+    with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
+        gasil_jax.load_reward(commanded)
+
+
 def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     """What stops it is a state, which is still there when training has gone on."""
     states, late, out = [], [], tmp_path / "out"

@@ -65,8 +65,9 @@ def test_only_commands_of_the_package_take_ctrl_c_for_themselves(monkeypatch):
 
 @pytest.mark.parametrize("twice", [False, True])
 def test_ctrl_c_while_compiling_is_answered_at_once(
-    twice, tmp_path, monkeypatch, capsys
+    twice, tmp_path, monkeypatch, capsys, equal_members_share_a_program
 ):
+    equal_members_share_a_program.clear()
     ready, ended = jax.block_until_ready, threading.Event()
 
     def slow(states):

@@ -61,13 +61,6 @@ def test_a_grid_is_every_combination():
         {"alpha": 1.0, "discriminator_updates": 1},
         {"alpha": 1.0, "discriminator_updates": 5},
     ]
-    plan = Plan("point_mass", Settings(), gasil_jax.algorithm(), points, [7, 8])
-    every = programs.group(plan.runs.values())
-    assert [plan.labels(program)["point"] for program in every] == [
-        (0, 0, 2, 2),
-        (1, 1, 3, 3),
-    ]
-    assert [x.algorithm.agent.discriminator_updates for x in every] == [1, 5]
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
@@ -320,8 +313,8 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(
 
 
 def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
-    long = (*SMALL, "--total-steps", str(60 * 256), "--seeds", "2")
-    grid = ("--grid", "alpha=0.1,1", "discriminator_updates=1,2")
+    long = (*FLAGS, "--agent", "ppo", "--total-steps", str(60 * 128), "--seeds", "2")
+    grid = ("--grid", "gamma=0.9,0.99", "num_epochs=1,2")
     whole, out = tmp_path / "whole", tmp_path / "interrupted"
     assert sweep.main([*long, *grid, "--out", str(whole)]) == 0
     train = Members.train
@@ -330,7 +323,7 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
         """Send SIGTERM in a program's chunk that ends there or later."""
 
         def interrupted(self, advance, states, first, count):
-            number = self.algorithm.agent.discriminator_updates - 1
+            number = self.config.num_epochs - 1
             if number == program and first + count >= at_least:
                 os.kill(os.getpid(), signal.SIGTERM)
             return train(self, advance, states, first, count)
