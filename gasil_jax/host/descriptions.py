@@ -77,7 +77,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
         for model in REWARD_MODELS
     }
     algorithm = algorithm.replace(**switches)
-    kinds = {}
+    kinds: dict[str, Any] = {}
     for part in algorithm.parts:
         hints = get_type_hints(type(part))
         kinds |= {name: hints[name] for name in names(part)}
