@@ -124,6 +124,11 @@ class MjxPhysics:
         """Return the fields at `state`, with all forces 0."""
         if self._small is not None:
             return batch_last(partial(dynamics.kinematics, self._small))(state)
+        return self._kinematics(state)
+
+    # MJX takes a second to trace this, and every reset needs it.
+    @partial(jax.jit, static_argnums=0)
+    def _kinematics(self, state: PhysicsState) -> Fields:
         data = mjx.kinematics(self._mjx_model, self._data(state))
         data = mjx.com_pos(self._mjx_model, data)
         return self._pick(mjx.com_vel(self._mjx_model, data))
