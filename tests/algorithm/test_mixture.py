@@ -165,7 +165,7 @@ def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
 
 
 # The others use nothing of a policy that one of these does not.
-@pytest.mark.parametrize("agent", ["ppo+bc", "ppo+sil", "ppo+gasil-adaptive"])
+@pytest.mark.parametrize("agent", ["ppo+sil", "ppo+gasil-adaptive"])
 def test_agents_train_it(agent):
     env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm(agent)
     more = DISCRIMINATOR if "gasil" in agent else {}

@@ -20,7 +20,8 @@ def test_a_peer_that_is_not_installed_is_told_in_a_line(missing, monkeypatch, ca
     assert "install" in told.partition("installed: ")[2]
 
 
-@pytest.mark.parametrize("name", peers.ENVS)
+# Brax's hopper takes a quarter of a minute to trace.
+@pytest.mark.parametrize("name", peers.ENVS[:2])
 def test_ours_has_the_sizes_of_the_others(name):
     pytest.importorskip("gymnax")
     train = peers._ours(name, 3 * 32 * 64)
