@@ -32,6 +32,7 @@ from jax.sharding import PartitionSpec as P
 
 import gasil_envs
 from experiments import peers
+from experiments.comparisons import interval
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
@@ -89,6 +90,7 @@ class Row:
       run: takes some steps and returns how many per second.
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
+      returns: what trained policies return, (seeds,); None if it is not measured.
     """
 
     env: str
@@ -97,6 +99,7 @@ class Row:
     run: Callable[[], float]
     compile_seconds: float = 0.0
     error: float | None = None
+    returns: np.ndarray | None = None
 
 
 def _make(env_name: str, variant: str) -> Any:
@@ -361,12 +364,12 @@ def peers_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """The rows of each number of seeds."""
     for seeds in (1, 10):
         rows = []
-        for name, train, seconds, steps in peers.programs(
+        for name, train, seconds, steps, returns in peers.programs(
             env_name, seeds, options.iterations
         ):
             name = f"{name}, {seeds} seed{'s' * (seeds > 1)}"
             run = functools.partial(_speed, train, steps)
-            rows.append(Row(env_name, name, 32 * seeds, run, seconds))
+            rows.append(Row(env_name, name, 32 * seeds, run, seconds, returns=returns))
         yield rows
 
 
@@ -375,6 +378,7 @@ def measure(rows: Sequence[Row], repeats: int) -> None:
     speeds = np.median([[row.run() for row in rows] for _ in range(repeats)], axis=0)
     for row, speed in zip(rows, speeds, strict=True):
         error = "" if row.error is None else f"{row.error:17.1e}"
+        error += "" if row.returns is None else f"  {interval(row.returns)}"
         print(
             f"{row.env:16} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
             f"{speed / speeds[0]:6.2f} {row.compile_seconds:9.1f}{error}",
@@ -412,7 +416,9 @@ def run(options: Options) -> None:
     print(f"{len(devices)} x {devices[0].device_kind}, {available_cores()} cores")
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     for table in options.tables:
-        print(f"{table:54}  envs     steps/s  ratio compile s  error of a step")
+        print(
+            f"{table:54}  envs     steps/s  ratio compile s  error of a step, or return"
+        )
         for env_name in peers.ENVS if table == "peers" else options.envs:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)

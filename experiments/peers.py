@@ -3,7 +3,9 @@
 All train with the same sizes on the same environments, in this process. The peers are
 imported from where they are installed; none of their code is here. They were written
 for gymnax before 1.0, so they get its environments through gymnax' own wrapper for old
-programs.
+programs. Returns are of the policies as they act: ours and purejaxrl's of the episodes
+that end in the last tenth of training; rejax' of 128 episodes afterwards, since it
+keeps none of training.
 """
 
 import functools
@@ -17,6 +19,7 @@ from typing import Any
 import brax.envs
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 import gasil_envs
 import gasil_jax
@@ -30,6 +33,11 @@ _INSTALL = {
     "github.com/luchris429/purejaxrl to PYTHONPATH, and python -m pip install distrax "
     "gymnax six navix",
 }
+
+
+#: Training, key -> result; and the mean return of its last policy, (seeds,), of a batch
+#: of results.
+Trained = tuple[Callable[[jax.Array], Any], Callable[[Any], np.ndarray]]
 
 
 def _is_brax(name: str) -> bool:
@@ -83,7 +91,7 @@ def _not_copied(env: Any) -> Any:
     return env
 
 
-def _ours(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
+def _ours(name: str, total_steps: int) -> Trained:
     if _is_brax(name):
         env = brax.envs.get_environment(name, backend="spring")
     else:
@@ -98,11 +106,20 @@ def _ours(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
         hidden_sizes=(_WIDTH, _WIDTH),
         normalize_rewards=_is_brax(name),
     )
-    return gasil_jax.make_train(env, algorithm)
+    train = gasil_jax.make_train(env, algorithm)
+    return train, lambda result: _of_last_tenth(result[1]["episode_return"])
 
 
-def _rejax(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
+def _of_last_tenth(returns: Any) -> np.ndarray:
+    """Return the mean over the last tenth of (seeds, iterations, ...), without NaNs."""
+    returns = np.asarray(returns)
+    last = returns[:, -max(1, returns.shape[1] // 10) :]
+    return np.nanmean(last.reshape(len(last), -1), axis=1)
+
+
+def _rejax(name: str, total_steps: int) -> Trained:
     from rejax import PPO
+    from rejax.evaluate import evaluate
 
     if _is_brax(name):
         env, params = _not_copied(_Brax(name)), None
@@ -127,11 +144,18 @@ def _rejax(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
             "hidden_layer_sizes": (_WIDTH, _WIDTH),
         },
     )
+
+    def score(result: Any) -> jax.Array:
+        act, limit = algorithm.make_act(result[0]), 1000
+        limit = limit if params is None else params.max_steps_in_episode
+        return evaluate(act, jax.random.PRNGKey(1), env, params, 128, limit)[1].mean()
+
     # It would evaluate at the end; here only training is timed.
-    return algorithm.replace(eval_callback=lambda *_: ()).train
+    train = algorithm.replace(eval_callback=lambda *_: ()).train
+    return train, lambda result: np.asarray(jax.vmap(score)(result))
 
 
-def _purejaxrl(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
+def _purejaxrl(name: str, total_steps: int) -> Trained:
     module = "ppo_continuous_action" if _is_brax(name) else "ppo"
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None
@@ -141,7 +165,7 @@ def _purejaxrl(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
     exec(compile(source, spec.origin, "exec"), names)
     names["BraxGymnaxWrapper"] = _Brax
     names["gymnax"] = types.SimpleNamespace(make=_gymnax)
-    return names["make_train"](
+    train = names["make_train"](
         {
             "LR": 3e-4,
             "NUM_ENVS": _NUM_ENVS,
@@ -162,6 +186,14 @@ def _purejaxrl(name: str, total_steps: int) -> Callable[[jax.Array], Any]:
         }
     )
 
+    def returns(result: Any) -> np.ndarray:
+        info = result["metrics"]
+        ended = info["returned_episode"]
+        returned = jnp.where(ended, info["returned_episode_returns"], jnp.nan)
+        return _of_last_tenth(returned)
+
+    return train, returns
+
 
 _PACKAGES = {"ours": _ours, "rejax": _rejax, "purejaxrl": _purejaxrl}
 
@@ -178,8 +210,11 @@ def check() -> None:
 
 def programs(
     name: str, seeds: int, iterations: int
-) -> Iterator[tuple[str, Callable[[], Any], float, int]]:
-    """Yield each package's name, its training, seconds of compiling, and its steps.
+) -> Iterator[tuple[str, Callable[[], Any], float, int, np.ndarray]]:
+    """Yield what is measured of each package.
+
+    That is its name, its training, seconds of compiling, its steps, and what the
+    trained policies return, (seeds,).
 
     Args:
       name: one of `ENVS`.
@@ -189,9 +224,10 @@ def programs(
     total_steps = iterations * _NUM_ENVS * _NUM_STEPS
     for package, make in _PACKAGES.items():
         keys = jax.random.split(jax.random.PRNGKey(0), seeds)
-        train = jax.jit(jax.vmap(make(name, total_steps)))
+        one, returns = make(name, total_steps)
+        train = jax.jit(jax.vmap(one))
         began = time.perf_counter()
         compiled = train.lower(keys).compile()
         seconds = time.perf_counter() - began
-        jax.block_until_ready(compiled(keys))
-        yield package, functools.partial(compiled, keys), seconds, seeds * total_steps
+        run = functools.partial(compiled, keys)
+        yield package, run, seconds, seeds * total_steps, returns(run())

@@ -24,9 +24,16 @@ def test_a_peer_that_is_not_installed_is_told_in_a_line(missing, monkeypatch, ca
 @pytest.mark.parametrize("name", peers.ENVS[:2])
 def test_ours_has_the_sizes_of_the_others(name):
     pytest.importorskip("gymnax")
-    train = peers._ours(name, 3 * 32 * 64)
+    train, _ = peers._ours(name, 3 * 32 * 64)
     state, metrics = jax.eval_shape(train, jax.random.key(0))
     assert metrics["env_steps"].shape == (3,)
     assert state.environments.episode_length.shape == (32,)
     layers = jax.tree.leaves(state.actor_critic.policy.params)
     assert sum(x.shape == (64, 64) for x in layers) == 1
+
+
+def test_the_last_tenth_counts_and_steps_without_an_end_do_not():
+    nan = float("nan")
+    returns = [[[9.0]] * 18 + [[nan, 2.0], [4.0, nan]]]
+    padded = [[x if len(x) == 2 else [*x, nan] for x in seed] for seed in returns]
+    assert peers._of_last_tenth(padded).tolist() == [3.0]
