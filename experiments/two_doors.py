@@ -7,6 +7,9 @@ the reward and their own buffer. After training, episodes are counted that reach
 goal on each side: of the policy, with drawn actions and with the most probable ones,
 and in the buffer. A seed solves the maze if nine in ten of its episodes reach the goal,
 and keeps both ways if one in ten takes each.
+
+The maze and the number of given episodes were chosen with a few seeds of cloning, for
+how often one Gaussian fails. Settings are not tuned.
 """
 
 import csv
@@ -58,7 +61,7 @@ class Options:
     """
 
     seeds: int = 20
-    total_steps: int = 500_000
+    total_steps: int = 200_000
     only: tuple[str, ...] = ()
     runs: pathlib.Path = pathlib.Path("runs", "two_doors")
     out: ResultsFolder = RESULTS
