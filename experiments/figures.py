@@ -169,13 +169,21 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
 }
 
 
+def _like_scaled(env: str, arms: Iterable[Arm]) -> list[Arm]:
+    """Return arms of agents without rows in `scaled`, with its settings for PPO."""
+    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
+    return [
+        Arm(f"{name} (decomposed, scaled)", agent, {**scaled, **changes})
+        for name, agent, changes in arms
+    ]
+
+
 def _decomposition_panels(env: str, delay: int) -> Panels:
     """Return decomposition and its controls on a task, all with the preset `scaled`."""
     one = functools.partial(
         grid, (env,), delays=(delay,), panel="{env} delayed {delay}", seeds=20
     )
-    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
-    imitating = [Arm(f"{x} (decomposed, scaled)", x, scaled) for x in _RIVALS[1:]]
+    imitating = _like_scaled(env, [Arm(x, x) for x in _RIVALS[1:]])
     return joined(
         [
             one(_CONTROLS, base="scaled"),
@@ -385,6 +393,7 @@ _CAUSES = [
     ),
     Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
 ]
+_SEAS = ("sparse:deep_sea_10", "sparse:deep_sea_20")
 #: Deep sea with rewards as they are, beside normalized ones. The last has the weight of
 #: novelty that `ppo+novelty` has.
 _RAW = {"normalize_rewards": False}
@@ -401,15 +410,11 @@ _DEEP_SEA: list[Arm | str] = [
 
 def _with_exploration(env: str) -> Panels:
     """Return the agents that explore on a delayed task, with the preset `scaled`."""
-    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
-    arms = [
-        Arm("ppo+novelty (decomposed, scaled)", "ppo+novelty", scaled),
-        Arm(
-            "ppo+bc+novelty (decomposed, scaled)",
-            "ppo+bc+novelty",
-            {**scaled, **_CLONED},
-        ),
+    exploring = [
+        Arm("ppo+novelty", "ppo+novelty"),
+        Arm("ppo+bc+novelty", "ppo+bc+novelty", _CLONED),
     ]
+    arms = _like_scaled(env, exploring)
     return joined(
         grid((env,), own, (DELAY,), base=base, seeds=20)
         for own, base in (([_SCALED], "scaled"), (arms, None))
@@ -667,7 +672,7 @@ FIGURES: Mapping[str, Figure] = {
         "Deep sea: rewards normalized, and as they are",
         "",
         grid(
-            ("sparse:deep_sea_10", "sparse:deep_sea_20"),
+            _SEAS,
             _DEEP_SEA,
             base=SparseSearch,
             seeds=20,
@@ -675,7 +680,7 @@ FIGURES: Mapping[str, Figure] = {
         ),
         comparisons={
             (panel, f"{agent} (raw)", agent): difference(panel, f"{agent} (raw)", agent)
-            for panel in ("sparse:deep_sea_10", "sparse:deep_sea_20")
+            for panel in _SEAS
             for agent in SPARSE_SPACES
         },
         solved_from=solved_from,

@@ -146,8 +146,8 @@ def _rejax(name: str, total_steps: int) -> Trained:
     )
 
     def score(result: Any) -> jax.Array:
-        act, limit = algorithm.make_act(result[0]), 1000
-        limit = limit if params is None else params.max_steps_in_episode
+        act = algorithm.make_act(result[0])
+        limit = 1000 if params is None else params.max_steps_in_episode
         return evaluate(act, jax.random.PRNGKey(1), env, params, 128, limit)[1].mean()
 
     # It would evaluate at the end; here only training is timed.

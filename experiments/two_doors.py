@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gasil_jax
+from experiments.report import markdown_table
 from experiments.search import SPARSE_BASE, Point
 from experiments.store import RESULTS, ResultsFolder
 from gasil_envs import wrappers
@@ -248,12 +249,12 @@ def table(rows: list[dict[str, Any]]) -> str:
     A seed solves the maze if nine in ten of its episodes reach the goal, and keeps both
     ways if one in ten takes each.
     """
-    lines = [
-        "| agent | Gaussians | seeds | solve, drawn | solve, most probable | episodes "
-        "at the goal, drawn | at the goal, most probable | keep both ways, drawn | "
-        "buffer has both ways |",
-        "| --- " * 9 + "|",
+    head = [
+        *("agent", "Gaussians", "seeds", "solve, drawn", "solve, most probable"),
+        *("episodes at the goal, drawn", "at the goal, most probable"),
+        *("keep both ways, drawn", "buffer has both ways"),
     ]
+    table_rows = []
     every = dict.fromkeys((row["agent"], row["policy_components"]) for row in rows)
     for key in every:
         own = [x for x in rows if (x["agent"], x["policy_components"]) == key]
@@ -267,11 +268,11 @@ def table(rows: list[dict[str, Any]]) -> str:
         solved = [np.mean(x >= _SOLVED) for x in reached]
         both = [np.mean((ways[x] >= _KEPT).all(axis=1)) for x in ("drawn", "buffer")]
         numbers = [*solved, *(x.mean() for x in reached), *both]
-        cells = [*key, len(own), *(f"{x:.2f}" for x in numbers)]
+        cells = [*map(str, (*key, len(own))), *(f"{x:.2f}" for x in numbers)]
         if np.isnan(ways["buffer"]).any():
             cells[-1] = "-"
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines)
+        table_rows.append(cells)
+    return markdown_table(head, table_rows)
 
 
 def run(options: Options) -> None:
@@ -293,7 +294,8 @@ def run(options: Options) -> None:
             writer.writeheader()
             writer.writerows(rows)
     _, _, explained = __doc__.partition("\n\n")
-    text = f"# Two doors\n\n{explained}\n{table(rows)}\n"
+    counted = table(rows)
+    text = f"# Two doors\n\n{explained}\n{counted}\n"
     with output_file.atomic(options.out / "two_doors.md") as partial:
         partial.write_text(text)
-    print(f"{table(rows)}\nin {options.out / 'two_doors.md'}")
+    print(f"{counted}\nin {options.out / 'two_doors.md'}")

@@ -81,11 +81,12 @@ def write(
             if np.isfinite(value)
         }
 
-    speed = outcome.new_steps / (outcome.train_seconds or 1)
     trained = {
         "compile_seconds": outcome.compile_seconds,
         "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": speed or None,
+        "env_steps_per_second": steps_per_second(
+            outcome.new_steps, outcome.train_seconds
+        ),
         "device": members.device_kind,
         "device_count": len(members.devices),
         "versions": metrics_files.versions(),
@@ -114,10 +115,15 @@ def write(
     return summary
 
 
+def steps_per_second(steps: float, seconds: float) -> float | None:
+    """Return the speed of training; None if it took no step."""
+    return steps / (seconds or 1) or None
+
+
 def speed_in_words(summary: Mapping[str, Any]) -> str:
     """Return what a command prints of the devices, and of the speed if it is known."""
-    known = summary["env_steps_per_second"]
-    steps = "" if known is None else f"{known:,.0f} steps/s "
+    speed = summary["env_steps_per_second"]
+    steps = "" if speed is None else f"{speed:,.0f} steps/s "
     return f"{steps}on {summary['device']}"
 
 

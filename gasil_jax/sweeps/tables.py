@@ -248,12 +248,13 @@ def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         return sum(training[name] for training in trainings)
 
     devices = _joined([{"device": training["device"]} for training in trainings])
-    per_second = total("env_steps") / (total("train_seconds") or 1)
     evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
     return {
         "compile_seconds": total("compile_seconds"),
         "train_seconds": total("train_seconds"),
-        "env_steps_per_second": per_second or None,
+        "env_steps_per_second": run_results.steps_per_second(
+            total("env_steps"), total("train_seconds")
+        ),
         **({"evaluation_seconds": total("evaluation_seconds")} if evaluated else {}),
         **devices,
         "device_count": max(training["device_count"] for training in trainings),
