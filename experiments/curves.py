@@ -6,7 +6,7 @@ import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from experiments.search import DELAY, NEW_TASKS, PAPERS, Point, Search
+from experiments.search import DELAY, PAPERS, Point, Search
 from experiments.store import Store
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
@@ -88,11 +88,7 @@ class Curve:
             algorithm = self.search.algorithm({})
         elif isinstance(self.base, str):
             algorithm = presets.preset(
-                self.env,
-                self.agent,
-                self.base,
-                reward_delay=self.reward_delay,
-                action_size=NEW_TASKS.get(self.env),
+                self.env, self.agent, self.base, reward_delay=self.reward_delay
             )
         algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
         settings = Settings(

@@ -514,7 +514,7 @@ FIGURES: Mapping[str, Figure] = {
                     for arms, base in (([_SCALED], "scaled"), (_RIVALS, Search))
                 ),
                 *(
-                    grid([*NEW_TASKS], arms, (DELAY, 100), base=base)
+                    grid(NEW_TASKS, arms, (DELAY, 100), base=base)
                     for arms, base in (([_SCALED], "scaled"), (_RIVALS, _best_rank))
                 ),
             ]
@@ -536,11 +536,14 @@ FIGURES: Mapping[str, Figure] = {
                 *(
                     grid(
                         (env,),
-                        [Arm(x, "ppo", of(size)) for x, of in _BY_DIMENSION.items()],
+                        [
+                            Arm(x, "ppo", of(presets.ACTION_SIZES[env]))
+                            for x, of in _BY_DIMENSION.items()
+                        ],
                         (DELAY,),
                         base="scaled",
                     )
-                    for env, size in presets.ACTION_SIZES.items()
+                    for env in TASKS
                 ),
                 grid(TASKS, ["ppo"], (DELAY,), base=Search),
             ]

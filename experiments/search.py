@@ -29,13 +29,8 @@ Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
 
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
-#: Tasks on which nothing was ever chosen, each with the dimension of its actions.
-NEW_TASKS: Mapping[str, int] = {
-    "brax:inverted_double_pendulum": 1,
-    "brax:reacher": 2,
-    "brax:pusher": 7,
-    "brax:humanoidstandup": 17,
-}
+#: Tasks on which nothing was ever chosen.
+NEW_TASKS = ("inverted_double_pendulum", "reacher", "pusher", "humanoidstandup")
 #: The steps between two rewards where they are delayed (paper, section 5.4).
 DELAY = 20
 #: The two agents that most figures compare, the paper's, and the adaptive one.

@@ -52,7 +52,7 @@ Rows = Mapping[tuple[str, str], Overrides]
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
-#: The locomotion tasks, each with the dimension of its actions.
+#: The tasks of MuJoCo, each with the dimension of its actions.
 ACTION_SIZES = {
     "hopper": 3,
     "walker2d": 6,
@@ -60,6 +60,11 @@ ACTION_SIZES = {
     "swimmer": 2,
     "ant": 8,
     "humanoid": 17,
+    "humanoidstandup": 17,
+    "inverted_pendulum": 1,
+    "inverted_double_pendulum": 1,
+    "reacher": 2,
+    "pusher": 7,
 }
 # One setting for every locomotion task, chosen on two seeds a task with rewards delayed
 # by 20 steps (experiments/notes/adaptive_ablation.md).

@@ -61,6 +61,8 @@ class Task:
       position: (model, fields) -> planar position (2,), whose change is the forward
         velocity; None for qpos[0:2].
       observe_more: fields -> the rest of the observation.
+      observe: (state, fields) -> the whole observation; None for positions, velocities
+        and what `observe_more` returns.
       contact_cost: contact forces, ``cfrc_ext`` (nbody, 6) -> cost.
       reward: (state before, state after, fields, action) -> reward (), added to the
         others.
@@ -69,6 +71,7 @@ class Task:
         most states of Gymnasium's tasks, 8 for all of robots with more contacts.
       start: random key -> qpos (nq,), qvel (nv,) of an episode's start; None for the
         model's own, with noise.
+      episode_length: number of steps after which an episode is truncated.
     """
 
     xml: str | pathlib.Path
@@ -88,6 +91,7 @@ class Task:
     fields: tuple[str, ...] = ()
     position: Callable[[mujoco.MjModel, Fields], jax.Array] | None = None
     observe_more: Callable[[Fields], jax.Array] | None = None
+    observe: Callable[[PhysicsState, Fields], jax.Array] | None = None
     contact_cost: Callable[[jax.Array], jax.Array] | None = None
     reward: (
         Callable[[PhysicsState, PhysicsState, Fields, jax.Array], jax.Array] | None
@@ -95,6 +99,7 @@ class Task:
     healthy: Callable[[PhysicsState, Fields], jax.Array] | None = None
     solver_iterations: int = 8
     start: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
+    episode_length: int = 1000
 
 
 #: The folder of Gymnasium's models.
@@ -125,6 +130,75 @@ def _body_observations(fields: Fields) -> jax.Array:
     )
 
 
+def _tip(fields: Fields) -> jax.Array:
+    """The upper end of the second pole, x, y, z: its middle is its centre of mass."""
+    return 2.0 * fields["xipos"][3] - fields["xpos"][3]
+
+
+def _observe_poles(state: PhysicsState, fields: Fields) -> jax.Array:
+    position, angles = state.qpos[:1], state.qpos[1:]
+    seen = [position, jnp.sin(angles), jnp.cos(angles), jnp.clip(state.qvel, -10, 10)]
+    return jnp.concatenate([*seen, jnp.clip(fields["qfrc_constraint"][:1], -10, 10)])
+
+
+def _reward_of_poles(
+    before: PhysicsState, after: PhysicsState, fields: Fields, action: jax.Array
+) -> jax.Array:
+    x, _, z = _tip(fields)
+    _, lower, upper = after.qvel
+    return -(0.01 * x**2 + (z - 2.0) ** 2) - (1e-3 * lower**2 + 5e-3 * upper**2)
+
+
+def _to_target(fields: Fields) -> jax.Array:
+    return fields["xpos"][3] - fields["xpos"][4]
+
+
+def _observe_reacher(state: PhysicsState, fields: Fields) -> jax.Array:
+    angles, target = state.qpos[:2], state.qpos[2:]
+    seen = [jnp.cos(angles), jnp.sin(angles), target, state.qvel[:2]]
+    return jnp.concatenate([*seen, _to_target(fields)[:2]])
+
+
+def _start_of_reacher(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The arm is nearly straight, and the target anywhere within 0.2 m."""
+    angle_key, radius_key, direction_key, velocity_key = jax.random.split(key, 4)
+    angles = jax.random.uniform(angle_key, (2,), minval=-0.1, maxval=0.1)
+    radius = 0.2 * jnp.sqrt(jax.random.uniform(radius_key))
+    direction = jax.random.uniform(direction_key, maxval=2.0 * jnp.pi)
+    target = radius * jnp.stack([jnp.cos(direction), jnp.sin(direction)])
+    speed = jax.random.uniform(velocity_key, (2,), minval=-5e-3, maxval=5e-3)
+    return jnp.concatenate([angles, target]), jnp.append(speed, jnp.zeros(2))
+
+
+#: The bodies of the pusher that its task is about.
+_HAND, _OBJECT, _GOAL = 10, 11, 12
+
+
+def _observe_pusher(state: PhysicsState, fields: Fields) -> jax.Array:
+    bodies = [fields["xpos"][body] for body in (_HAND, _OBJECT, _GOAL)]
+    return jnp.concatenate([state.qpos[:7], state.qvel[:7], *bodies])
+
+
+def _reward_of_pusher(
+    before: PhysicsState, after: PhysicsState, fields: Fields, action: jax.Array
+) -> jax.Array:
+    hand, thing, goal = (fields["xpos"][x] for x in (_HAND, _OBJECT, _GOAL))
+    return -jnp.linalg.norm(thing - goal) - 0.5 * jnp.linalg.norm(thing - hand)
+
+
+def _start_of_pusher(key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """The object is to the left of the goal, more than 0.17 m from it."""
+    position_key, velocity_key = jax.random.split(key)
+    # 0.6 of all places are far enough. Of 32 the first one is taken that is.
+    low, high = jnp.array([-0.3, -0.2]), jnp.array([0.0, 0.2])
+    places = jax.random.uniform(position_key, (32, 2), minval=low, maxval=high)
+    place = places[jnp.argmax(jnp.linalg.norm(places, axis=1) > 0.17)]
+    speed = jax.random.uniform(velocity_key, (7,), minval=-5e-3, maxval=5e-3)
+    qpos = jnp.concatenate([jnp.zeros(7), place, jnp.zeros(2)])
+    return qpos, jnp.append(speed, jnp.zeros(4))
+
+
+#: Gymnasium's tasks by name.
 TASKS: Mapping[str, Task] = types.MappingProxyType(
     {
         "hopper": Task(
@@ -200,6 +274,72 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             observe_more=_body_observations,
             contact_cost=lambda f: jnp.minimum(5e-7 * jnp.sum(f**2), 10.0),
         ),
+        "humanoidstandup": Task(
+            gymnasium_id="HumanoidStandup-v5",
+            xml=ASSETS / "humanoidstandup.xml",
+            frame_skip=5,
+            forward_reward=0.0,
+            control_cost=0.1,
+            healthy_reward=1.0,
+            reset_noise=1e-2,
+            hidden_positions=2,
+            fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
+            observe_more=_body_observations,
+            contact_cost=lambda f: jnp.minimum(5e-7 * jnp.sum(f**2), 10.0),
+            # The height over the duration of a time step.
+            reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
+        ),
+        "inverted_pendulum": Task(
+            gymnasium_id="InvertedPendulum-v5",
+            xml=ASSETS / "inverted_pendulum.xml",
+            frame_skip=2,
+            forward_reward=0.0,
+            control_cost=0.0,
+            healthy_reward=1.0,
+            reset_noise=1e-2,
+            hidden_positions=0,
+            healthy=lambda state, fields: jnp.abs(state.qpos[1]) <= 0.2,
+        ),
+        "inverted_double_pendulum": Task(
+            gymnasium_id="InvertedDoublePendulum-v5",
+            xml=ASSETS / "inverted_double_pendulum.xml",
+            frame_skip=5,
+            forward_reward=0.0,
+            control_cost=0.0,
+            healthy_reward=10.0,
+            reset_noise=0.1,
+            normal_velocity_noise=True,
+            fields=("xpos", "xipos", "qfrc_constraint"),
+            observe=_observe_poles,
+            reward=_reward_of_poles,
+            healthy=lambda state, fields: _tip(fields)[2] > 1.0,
+        ),
+        "reacher": Task(
+            gymnasium_id="Reacher-v5",
+            xml=ASSETS / "reacher.xml",
+            frame_skip=2,
+            forward_reward=0.0,
+            control_cost=1.0,
+            fields=("xpos",),
+            observe=_observe_reacher,
+            reward=lambda before, after, fields, action: (
+                -jnp.linalg.norm(_to_target(fields))
+            ),
+            start=_start_of_reacher,
+            episode_length=50,
+        ),
+        "pusher": Task(
+            gymnasium_id="Pusher-v5",
+            xml=ASSETS / "pusher_v5.xml",
+            frame_skip=5,
+            forward_reward=0.0,
+            control_cost=0.1,
+            fields=("xpos",),
+            observe=_observe_pusher,
+            reward=_reward_of_pusher,
+            start=_start_of_pusher,
+            episode_length=100,
+        ),
     }
 )
 
@@ -249,8 +389,10 @@ def _check(task: Task, model: mujoco.MjModel) -> None:
     indexed = f"an index of qpos, which has {model.nq} entries"
     skip = task.frame_skip
     low, high = model.actuator_ctrlrange.T
+    length = task.episode_length
     for field, allowed, holds in (
         ("frame_skip", "1 or more", isinstance(skip, int) and skip > 0),
+        ("episode_length", "1 or more", isinstance(length, int) and length > 0),
         ("solver_iterations", "1 or more", task.solver_iterations > 0),
         ("hidden_positions", indexed, task.hidden_positions in entries),
         ("z_index", indexed, task.z_index in entries or task.healthy_z == _EVERYTHING),
@@ -298,8 +440,6 @@ class Locomotion(Env):
         lacks a part of it, or if a name is unknown.
     """
 
-    episode_length = 1000
-
     def __init__(
         self,
         task: str | Task,
@@ -332,6 +472,11 @@ class Locomotion(Env):
         # A NumPy array becomes a constant of the traced functions.
         self._start = np.asarray(self.model.qpos0, np.float32)
         self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
+
+    @property
+    def episode_length(self) -> int:
+        """Number of steps after which an episode is truncated."""
+        return self.task.episode_length
 
     @property
     def ends_early(self) -> bool:
@@ -440,6 +585,8 @@ class Locomotion(Env):
 
     def _observe(self, physics: PhysicsState, fields: Fields) -> jax.Array:
         task = self.task
+        if task.observe is not None:
+            return task.observe(physics, fields)
         parts = [
             physics.qpos[task.hidden_positions :],
             jnp.clip(physics.qvel, -task.max_velocity, task.max_velocity),

@@ -49,9 +49,10 @@ class Options:
     """Train an agent on an environment, many seeds at once.
 
     Attributes:
-      env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant or
-        humanoid; one of another package as brax:NAME, gymnax:NAME, navix:NAME or
-        playground:NAME, for example gymnax:CartPole-v1; or your own as MODULE:NAME.
+      env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
+        humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
+        brax:NAME, gymnax:NAME, navix:NAME or playground:NAME, for example
+        gymnax:CartPole-v1; or your own as MODULE:NAME.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+bonus, gail, or your own as MODULE:CLASS. Each has its own settings: this
         help shows those of the one that is named beside it.

@@ -74,6 +74,8 @@ def gymnasium_transitions(name):
 @pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME[1:])
 def test_one_step_equals_gymnasiums(name, physics):
+    if (name, physics) == ("humanoidstandup", "mjx"):
+        pytest.skip("it is humanoid's model, which takes half a minute to compile")
     env, reset, step = env_and_functions(name, physics)
     # Here, and not in a test of its own, so that a step is compiled once. A reset is
     # the same for all tasks, so MJX's, slow to compile, is compiled for one.
@@ -82,7 +84,7 @@ def test_one_step_equals_gymnasiums(name, physics):
     transitions = gymnasium_transitions(name)
     *before, action = (jnp.asarray(x, jnp.float32) for x in transitions[:5])
     observation, reward, terminated = transitions[5:]
-    assert terminated.any() or name in ("halfcheetah", "swimmer", "ant")
+    assert terminated.any() or not env.ends_early or name == "ant"
 
     # Of a state a step looks at these alone, so that nothing is compiled for the rest.
     qpos, qvel, warmstart, position = before
@@ -142,7 +144,8 @@ def test_episodes_start_where_gymnasiums_do(name):
             ("highest", np.max, 2.5 if normal else 0.2),
         ):
             error = np.abs(quantity(our, axis=0) - quantity(their, axis=0))
-            error = error / their.std(axis=0)
+            # Some entries are the same in all episodes: there no error is allowed.
+            error = error / np.maximum(their.std(axis=0), 1e-9)
             print(f"{name}, {field}: {of} differs by {error.max():.2f} deviations")
             assert error.max() < most, (field, of, error.argmax())
 

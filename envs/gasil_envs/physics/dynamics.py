@@ -25,7 +25,10 @@ _JOINT_TRANSMISSION = [
     int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
 ]
 #: The arrays of ``mjData`` that `step` can return.
-FIELDS = ("xpos", "xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext")
+FIELDS = (
+    *("xpos", "xipos", "cinert", "cvel"),
+    *("qfrc_actuator", "qfrc_constraint", "cfrc_ext"),
+)
 
 
 class Dynamics(NamedTuple):
@@ -120,6 +123,7 @@ def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
         "cinert": at.cinert,
         "cvel": tree.velocity(model, at.cdof, state.qvel),
         "qfrc_actuator": jnp.zeros((model.nv, size), jnp.float32),
+        "qfrc_constraint": jnp.zeros((model.nv, size), jnp.float32),
         "cfrc_ext": jnp.zeros((model.nbody, 6, size), jnp.float32),
     }
     return {name: fields[name] for name in dynamics.fields}
@@ -171,6 +175,7 @@ def forward(
         "cinert": at.cinert,
         "cvel": smooth.cvel,
         "qfrc_actuator": actuation,
+        "qfrc_constraint": constraint_force,
         "cfrc_ext": of_bodies,
     }
     return _Evaluation(

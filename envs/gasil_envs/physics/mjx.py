@@ -27,6 +27,7 @@ _FIELDS: dict[str, Callable[[mjx.Data], jax.Array]] = {
     "cinert": lambda data: data._impl.cinert,
     "cvel": lambda data: data.cvel,
     "qfrc_actuator": lambda data: data.qfrc_actuator,
+    "qfrc_constraint": lambda data: data.qfrc_constraint,
     "cfrc_ext": lambda data: data._impl.cfrc_ext,
 }
 
