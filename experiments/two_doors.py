@@ -144,6 +144,16 @@ AGENTS_OF: Mapping[str, tuple[str, Point]] = {
         {**_LEARNING, "alpha": 0.1, "bonus": "centered"},
     ),
 }
+# The same with a buffer in which episodes of one way share their return. The distance
+# was not tuned: it is the first one tried.
+AGENTS_OF = {
+    **AGENTS_OF,
+    **{
+        f"{title}, shared": (name, {**point, "sharing_distance": 0.5})
+        for title, (name, point) in AGENTS_OF.items()
+        if point.keys() & _LEARNING.keys() == _LEARNING.keys()
+    },
+}
 
 
 def side(across: Any, xp: Any = np) -> Any:

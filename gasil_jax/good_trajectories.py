@@ -9,6 +9,8 @@ a tie the older episode stays. All functions are pure and work under jit, vmap a
 shard_map; an empty buffer is a normal state.
 """
 
+from typing import Any
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -223,6 +225,83 @@ def ended_episodes(
     )
 
 
+def _kept_lengths(good_trajectories: GoodTrajectories) -> jax.Array:
+    """Return the lengths of the buffer's episodes, int32 (C,), each at its first step.
+
+    All other entries are 0. An episode ends where the next one starts.
+    """
+    slot = jnp.arange(good_trajectories.capacity, dtype=jnp.int32)
+    starts = good_trajectories.filled & (good_trajectories.time == 0)
+    next_start = jax.lax.cummin(
+        jnp.where(starts, slot, good_trajectories.size), reverse=True
+    )
+    following = jnp.append(next_start[1:], good_trajectories.size)
+    return jnp.where(starts, following - slot, 0)
+
+
+# Number of the best episodes among which returns are shared. It bounds the table of
+# their distances; a batch and a buffer together seldom have more.
+_MOST_SHARING = 256
+
+
+def shared_returns(
+    good_trajectories: GoodTrajectories,
+    history: History,
+    episodes: Episodes,
+    *,
+    scale: jax.Array,
+    distance: float,
+) -> jax.Array:
+    """Return what `insert` ranks episodes by if similar ones share their return.
+
+    An episode's return, above the lowest of all, is divided by 1 + n, where n is the
+    number of episodes before it by return that are within a distance of it (fitness
+    sharing, Goldberg and Richardson 1987). So episodes that succeed in another way come
+    before ever more of the same way. Two episodes are as far apart as the means of
+    their observations: the root mean square of the scaled differences.
+
+    Args:
+      good_trajectories: the buffer before the insertion.
+      history: the history that holds the steps of the offered episodes.
+      episodes: the offered episodes.
+      scale: float32 (obs,), the unit of each entry of an observation.
+      distance: the distance below which two episodes are similar.
+
+    Returns:
+      float32 (C + E,), of the entries of the buffer and the offered ones. Beyond the
+      best 256 episodes it is their return above the lowest, divided by 257.
+    """
+
+    def means(rows: jax.Array, env: Any, *, end: jax.Array, length: Any) -> jax.Array:
+        """Return the means of `length` scaled rows (env, row, obs) before `end`."""
+        sums = jnp.cumsum(rows / scale[None, None], axis=1)
+        sums = jnp.pad(sums, ((0, 0), (1, 0), (0, 0)))
+        total = sums[env, end] - sums[env, end - length]
+        return total / jnp.maximum(length, 1)[:, None]
+
+    kept_length = _kept_lengths(good_trajectories)
+    end = jnp.arange(kept_length.shape[0]) + kept_length
+    rows = good_trajectories.observation[None]
+    kept = means(rows, 0, end=end, length=kept_length)
+    # An episode may begin at the end of the ring, so its end is in a second copy.
+    rows = jnp.concatenate([history.observation] * 2, axis=1)
+    end = history.observation.shape[1] + episodes.last + 1
+    offered = means(rows, episodes.env, end=end, length=episodes.length)
+
+    length = jnp.concatenate([kept_length, episodes.length])
+    return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
+    valid = (length > 0) & jnp.isfinite(return_)
+    order = jnp.argsort(jnp.where(valid, -return_, jnp.inf), stable=True)
+    best = order[:_MOST_SHARING]
+    mean = jnp.concatenate([kept, offered])[best]
+    apart = jnp.sqrt(jnp.mean((mean[:, None] - mean[None]) ** 2, axis=-1))
+    similar = (apart < distance) & valid[best][None]
+    before = jnp.sum(jnp.tril(similar, k=-1), axis=1)
+    sharing = jnp.full(return_.shape, _MOST_SHARING).at[best].set(before)
+    lowest = jnp.min(jnp.where(valid, return_, jnp.inf))
+    return jnp.where(valid, (return_ - lowest) / (1 + sharing), 0.0)
+
+
 def insert(
     good_trajectories: GoodTrajectories,
     history: History,
@@ -230,6 +309,7 @@ def insert(
     *,
     max_episodes: int | None = None,
     newest: bool = False,
+    ranked_by: jax.Array | None = None,
 ) -> GoodTrajectories:
     """Return the buffer with the best of its own and the offered episodes.
 
@@ -240,26 +320,21 @@ def insert(
         an episode in which any number is not finite must have such a return.
       max_episodes: number of episodes to keep at most; None for any number.
       newest: whether the newer of two episodes with the same return comes first.
+      ranked_by: float32 (C + E,), numbers to rank the buffer's own and the offered
+        episodes by; default their returns.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
     """
     capacity = good_trajectories.capacity
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    filled = good_trajectories.filled
-    # The buffer's own content as episodes: one at each first step, and elsewhere
-    # entries of length 0. An episode ends where the next one starts.
-    starts = filled & (good_trajectories.time == 0)
-    next_start = jax.lax.cummin(
-        jnp.where(starts, slot, good_trajectories.size), reverse=True
-    )
-    following = jnp.append(next_start[1:], good_trajectories.size)
-    kept_length = jnp.where(starts, following - slot, 0)
+    kept_length = _kept_lengths(good_trajectories)
     offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
     length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
     return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
-    key = jnp.where(length > 0, -return_, jnp.inf)
+    ranked_by = return_ if ranked_by is None else ranked_by
+    key = jnp.where(length > 0, -ranked_by, jnp.inf)
     if newest:
         by_age = jnp.concatenate(
             [jnp.arange(key.shape[0] - 1, capacity - 1, -1), jnp.arange(capacity)]

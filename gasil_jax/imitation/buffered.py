@@ -5,8 +5,8 @@ from typing import Any, ClassVar
 import jax
 import jax.numpy as jnp
 
-from gasil_jax import good_trajectories
-from gasil_jax.config import choice, count, switch
+from gasil_jax import good_trajectories, normalization
+from gasil_jax.config import choice, count, number, switch
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.imitation.interface import Agent
@@ -32,6 +32,9 @@ class BufferedAgent(Agent):
         the same batch.
       ties: which of two episodes with the same return the buffer keeps: the oldest, as
         in the paper, or the newest.
+      sharing_distance: episodes whose mean normalized observations are nearer than this
+        share their return, so that the good-trajectory buffer holds several ways to
+        succeed; 0 ranks each by its own return, as the paper does.
     """
 
     history_episodes: ClassVar[int] = 1
@@ -42,6 +45,7 @@ class BufferedAgent(Agent):
     sample_by_return: bool = switch(False)
     admission: str = choice("all", ("all", "better"))
     ties: str = choice("oldest", ("oldest", "newest"))
+    sharing_distance: float = number(0.0, 0.0, traced=False)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
         """Return an empty buffer as the state."""
@@ -102,12 +106,19 @@ class BufferedAgent(Agent):
             length=batch.episode_length,
             terminated=batch.terminated if self.keeps_terminated else None,
         )
+        ranked_by = None
+        if self.sharing_distance > 0:
+            _, scale = normalization.moments(context.normalizer)
+            ranked_by = good_trajectories.shared_returns(
+                buffer, history, episodes, scale=scale, distance=self.sharing_distance
+            )
         return good_trajectories.insert(
             buffer,
             history,
             episodes,
             max_episodes=self.buffer_episodes,
             newest=self.ties == "newest",
+            ranked_by=ranked_by,
         )
 
     def sample(

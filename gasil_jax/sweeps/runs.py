@@ -29,6 +29,7 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "decomposition_inputs": "transition",
     "policy_components": 1,
+    "sharing_distance": 0.0,
 }
 
 

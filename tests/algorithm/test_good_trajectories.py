@@ -213,3 +213,84 @@ def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
     assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
     history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
     assert record(history, observation).next_observation is None
+
+
+SHARING_CAPACITY = 12
+
+
+def shared_by_hand(episodes, distance, scale):
+    """What episodes, (return, observations), are ranked by; a plain double loop."""
+    order = sorted(range(len(episodes)), key=lambda i: -episodes[i][0])
+    means = [np.mean(np.array(x), axis=0) / scale for _, x in episodes]
+    lowest = min((return_ for return_, _ in episodes), default=0.0)
+    ranked = {}
+    for place, i in enumerate(order):
+        apart = [np.sqrt(np.mean((means[i] - means[j]) ** 2)) for j in order[:place]]
+        similar = sum(x < distance for x in apart)
+        ranked[i] = (episodes[i][0] - lowest) / (1 + similar)
+    return ranked
+
+
+@given(st.integers(0, 2**31 - 1), st.sampled_from([0.1, 0.5, 2.0]))
+@settings(max_examples=30, deadline=None)
+def test_similar_episodes_share_their_return_as_by_hand(seed, distance):
+    rng = np.random.default_rng(seed)
+    scale = np.float32([0.5, 2.0])
+    buffer = good_trajectories.init(SHARING_CAPACITY, 2, 1)
+    history = good_trajectories.init_history(
+        NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=2, action_size=1
+    )
+    running, ranked = [[] for _ in range(NUM_ENVS)], 0
+    for _ in range(6):
+        shape = (NUM_STEPS, NUM_ENVS)
+        observation = rng.normal(size=(*shape, 2)).astype(np.float32)
+        ended = rng.random(shape) < 0.4
+        # Distinct returns, so that no tie has to be decided.
+        return_ = rng.permutation(np.arange(6)).reshape(shape) + rng.random()
+        length, offers = np.zeros(shape, int), {}
+        for time in range(NUM_STEPS):
+            for env in range(NUM_ENVS):
+                running[env].append(observation[time, env])
+                length[time, env] = len(running[env])
+                ended[time, env] |= len(running[env]) == MAX_EPISODE
+                if ended[time, env]:
+                    offers[time, env] = return_[time, env], running[env]
+                    running[env] = []
+        history = good_trajectories.record(
+            history,
+            jnp.array(observation),
+            jnp.zeros((*shape, 1)),
+            reward=jnp.zeros(shape),
+            ended=jnp.array(ended),
+        )
+        episodes = good_trajectories.ended_episodes(
+            history,
+            jnp.array(ended),
+            jnp.float32(return_),
+            length=jnp.int32(length),
+        )
+        starts = [i for i in range(int(buffer.size)) if buffer.time[i] == 0]
+        stops = [*starts[1:], int(buffer.size)]
+        mine = [
+            (float(buffer.return_[i]), buffer.observation[i:j])
+            for i, j in zip(starts, stops)
+        ]
+        entries = starts + [
+            SHARING_CAPACITY + time * NUM_ENVS + env for time, env in offers
+        ]
+        expected = shared_by_hand(mine + list(offers.values()), distance, scale)
+        ranked_by = shared(buffer, history, episodes, scale, distance)
+        for i, entry in enumerate(entries):
+            np.testing.assert_allclose(ranked_by[entry], expected[i], rtol=1e-4)
+        buffer = good_trajectories.insert(
+            buffer, history, episodes, ranked_by=ranked_by
+        )
+        ranked += len(entries)
+    assert ranked > 6
+
+
+shared = jax.jit(
+    lambda buffer, history, episodes, scale, distance: good_trajectories.shared_returns(
+        buffer, history, episodes, scale=scale, distance=distance
+    )
+)

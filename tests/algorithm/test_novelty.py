@@ -77,6 +77,26 @@ def test_ties_and_admission_of_the_buffer():
     assert kept(admission="better") is None
 
 
+def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
+    def kept(**settings):
+        agent = gasil_jax.PPOBC(buffer_steps=16, **settings)
+        context = context_of(agent)
+        batch, history = context.rollout, context.history
+        # Episodes of environment 1 are the best, and like no other's.
+        returns = jnp.zeros_like(batch.discounted_return)
+        returns = returns.at[:, 1].set(1.0).at[:, 2].set(0.9)
+        history = history.replace(observation=history.observation.at[1].add(100.0))
+        context = context.replace(
+            rollout=batch.replace(discounted_return=returns), history=history
+        )
+        sizes = gasil_jax.context.sizes_of(ENV, 4, 40)
+        buffer = agent.remember(agent.init(KEY, sizes), context)
+        return buffer.return_[:: int(buffer.size) // 2]
+
+    np.testing.assert_allclose(kept(), [1.0, 1.0])
+    np.testing.assert_allclose(kept(sharing_distance=1.0), [1.0, 0.9])
+
+
 def test_only_better_episodes_are_admitted():
     agent = gasil_jax.PPOBC(admission="better")
     context = context_of(agent)
