@@ -86,7 +86,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
     """Return the small version of a figure, of the named panels or the first one.
 
     Instead of what searches choose, which may not be known yet, it uses the presets
-    "tuned", "decomposed" and "paper".
+    "tuned", "scaled" and "paper".
 
     Raises:
       InputError: if a name is no panel or search of the figure, or if only searches are
@@ -102,7 +102,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
     def small(curve: Curve) -> Curve:
         base = curve.base
         if search := curve.search:
-            base = "decomposed" if search.decompose_rewards else "tuned"
+            base = "scaled" if search.decompose_rewards else "tuned"
             base = "paper" if isinstance(search, PaperSearch) else base
         return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
 

@@ -108,16 +108,23 @@ _SCHEDULED = Arm(
     "ppo+gasil",
     {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
 )
+
+
+def _adaptive(name: str, **changes: Any) -> Arm:
+    """Return adaptive imitation with its one setting for all delayed tasks, changed."""
+    return Arm(name, ADAPTIVE, {**presets.ADAPTIVE_DELAYED, **changes})
+
+
 #: Adaptive imitation as a whole, and with one part at a time removed.
 _PARTS = [
-    Arm("whole", ADAPTIVE),
-    Arm("rewards not decomposed", ADAPTIVE, {"decompose_rewards": False}),
-    Arm("no imitation", ADAPTIVE, {"imitation_weight": 0.0}),
+    _adaptive("whole"),
+    _adaptive("rewards not decomposed", decompose_rewards=False),
+    _adaptive("no imitation", imitation_weight=0.0),
     *(
-        Arm(f"rule {rule}", ADAPTIVE, {"imitation_rule": rule})
+        _adaptive(f"rule {rule}", imitation_rule=rule)
         for rule in ("agreement", "gap", "fixed")
     ),
-    Arm("deviation 1", ADAPTIVE, {"initial_deviation": 1.0}),
+    _adaptive("deviation 1", initial_deviation=1.0),
 ]
 #: PPO+GASIL with forms of the bonus that don't favour long episodes.
 _LOGIT, _CENTERED = (
@@ -210,8 +217,8 @@ _NOT_CLIPPED = [
     Arm(f"{agent} (rewards not clipped)", agent, {"reward_clip": 1e9}) for agent in PAIR
 ]
 _ADAPTIVE_WITH_AND_WITHOUT = (
-    Arm(ADAPTIVE, ADAPTIVE),
-    Arm(f"{ADAPTIVE} without imitation", ADAPTIVE, {"imitation_weight": 0.0}),
+    _adaptive(ADAPTIVE),
+    _adaptive(f"{ADAPTIVE} without imitation", imitation_weight=0.0),
 )
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
@@ -488,7 +495,7 @@ FIGURES: Mapping[str, Figure] = {
                     (DELAY,),
                     base=functools.partial(SingleSetting, decompose_rewards=True),
                 ),
-                grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,)),
+                grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,), base=None),
                 _delayed(PAPERS, Search),
             ]
         ),
@@ -631,7 +638,7 @@ FIGURES: Mapping[str, Figure] = {
         "Adaptive imitation, with each of its parts taken away",
         "",
         joined(
-            grid(tasks, arms, (DELAY,))
+            grid(tasks, arms, (DELAY,), base=None)
             for tasks, arms in (
                 (TASKS[:4], _PARTS),
                 (("ant",), [_PARTS[i] for i in (0, 2, 6)]),

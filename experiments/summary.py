@@ -323,26 +323,24 @@ class Summary:
         return report.fill((report.NOTES / "README.md").read_text(), self.value)
 
     def tuned(self) -> str:
-        """Return the tuned presets as JSON, updated by what complete searches chose.
-
-        For decomposed rewards there are no rows of earlier searches, so an incomplete
-        search gives its best point so far.
-        """
+        """Return the tuned presets as JSON, updated by what complete searches chose."""
         rows = json.loads(presets.TUNED.read_text())
         for page in self.pages.values():
             for search in page.figure.searches.values():
-                choose = search.leading if search.decompose_rewards else search.chosen
-                point = choose(page.searched)
-                # Adaptive imitation has one setting for all tasks, and the preset
-                # "paper" has normalized rewards.
-                raw = not getattr(search, "normalize_rewards", True)
-                # So has each agent on the sparse tasks.
-                single = search.agent == ADAPTIVE or isinstance(search, SparseSearch)
-                if point is None or single or raw:
+                # The preset "paper" has normalized rewards, "scaled" decomposed ones.
+                other = search.decompose_rewards or not getattr(
+                    search, "normalize_rewards", True
+                )
+                # On the sparse tasks each agent has one setting for all, and so has
+                # adaptive imitation where that returns about as much as its searches.
+                kind = "delayed" if search.reward_delay > 1 else "dense"
+                is_own = kind == "delayed" and search.env in ("ant", "humanoid")
+                single = search.agent == ADAPTIVE and not is_own
+                single |= isinstance(search, SparseSearch)
+                point = search.chosen(page.searched)
+                if point is None or single or other:
                     continue
                 settings = report.changed(search.algorithm(point))
-                kind = "delayed" if search.reward_delay > 1 else "dense"
-                kind = "decomposed" if search.decompose_rewards else kind
                 kind = f"paper {kind}" if isinstance(search, PaperSearch) else kind
                 of_task = rows.setdefault(kind, {}).setdefault(search.env, {})
                 of_task[search.agent] = dict(sorted(settings.items()))

@@ -37,17 +37,12 @@ def test_the_tuned_rows_are_what_the_searches_chose(env, reward_delay):
     store = Store(RESULTS / "runs")
     for agent in AGENTS:
         search = Search(env, agent, reward_delay)
-        if agent != ADAPTIVE and (point := search.chosen(store)) is not None:
+        # Adaptive imitation has one setting for all other tasks.
+        if agent == ADAPTIVE and not (reward_delay > 1 and env in ("ant", "humanoid")):
+            continue
+        if (point := search.chosen(store)) is not None:
             tuned = gasil_jax.preset(env, agent, reward_delay=reward_delay)
             assert tuned == search.algorithm(point)
-
-
-@pytest.mark.parametrize("env", TASKS)
-def test_the_rows_on_decomposed_rewards_are_the_best_of_their_searches(env):
-    search = Search(env, "ppo", DELAY, decompose_rewards=True)
-    point = search.leading(Store(RESULTS / "runs"))
-    row = gasil_jax.preset(env, "ppo", "decomposed", reward_delay=DELAY)
-    assert row == search.algorithm(point) and row.settings["decompose_rewards"]
 
 
 @pytest.mark.parametrize("env", TASKS)
@@ -122,8 +117,6 @@ def test_a_preset_that_has_nothing_for_the_run_is_refused(capsys):
         "preset 'scaled' has nothing for agent 'gasil' on point_mass with dense "
         "rewards: it has ppo on hopper, walker2d, halfcheetah, swimmer, ant, humanoid"
     ) in capsys.readouterr().err
-    with pytest.raises(ValueError, match="with dense rewards: it has rows for delayed"):
-        gasil_jax.preset("walker2d", "ppo", "decomposed")
 
 
 def test_an_unknown_preset_is_refused(capsys):

@@ -380,7 +380,7 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
         ("brax:ant", "nothing for agent 'ppo+gasil' on brax:ant with dense rewards"),
         ("walker2d --agent ppo+bonus --preset paper", None),
         ("walker2d --agent ppo --reward-delay 20", None),
-        ("walker2d --agent ppo --preset decomposed --reward-delay 20", None),
+        ("walker2d --agent ppo --preset scaled --reward-delay 20", None),
     ],
 )
 def test_a_task_without_a_tuned_preset_is_told(arguments, message, capsys):
