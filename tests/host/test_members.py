@@ -26,7 +26,7 @@ def compiled(agent):
     sizes |= {"sil_buffer_steps": 200, "sil_minibatch_size": 32}
     algorithm = algorithm.replace(
         total_steps=4 * 128,
-        decompose_rewards=agent == "ppo+bc+novelty",
+        decompose_rewards=agent == "ppo+sil",
         **{name: x for name, x in sizes.items() if name in algorithm.settings},
     )
     members = make_members(env, algorithm, [3, 4, 5], devices=jax.devices()[:2])
