@@ -382,7 +382,7 @@ def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
     with pytest.raises(output_file.WriteError) as told:
         gasil_jax.fit(
             env,
-            PPO.replace(total_steps=100 * 128),
+            PPO,
             folder=out,
             evaluate_every=128,
             evaluate_episodes=1,
