@@ -17,20 +17,6 @@ from gasil_jax.host import checkpoint
 pytestmark = pytest.mark.xdist_group("trained_point_mass")
 
 
-def test_a_saved_state_is_loaded_bit_by_bit(trained_point_mass, tmp_path):
-    _, _, states = trained_point_mass
-    checkpoint.save(tmp_path / "state", states)
-    like = jax.eval_shape(lambda: states)
-    loaded = checkpoint.restore(tmp_path / "state", like)
-    assert jax.tree.structure(loaded) == jax.tree.structure(states)
-    plain = lambda x: (
-        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
-    )
-    jax.tree.map(
-        lambda a, b: np.testing.assert_array_equal(plain(a), plain(b)), loaded, states
-    )
-
-
 def test_gymnasiums_episodes_have_the_runs_limit():
     rest = lambda observation: np.zeros(2)
     for limit, length in ((7, 7), (None, 1000)):
