@@ -1,5 +1,6 @@
 """The networks, in Flax linen."""
 
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -30,15 +31,25 @@ def orthogonal(scale: float) -> nn.initializers.Initializer:
     Several batched QR factorizations in one program can deadlock jaxlib 0.10.1 on a
     CPU. A loop over single ones can't.
     """
-    initializer = nn.initializers.orthogonal(scale)
 
     def init(key: jax.Array, shape: Sequence[int], dtype: Any = jnp.float32) -> Any:
-        one = jax.custom_batching.sequential_vmap(
-            lambda data: initializer(jax.random.wrap_key_data(data), shape, dtype)
-        )
-        return one(jax.random.key_data(key))
+        return _orthogonal(jax.random.key_data(key), scale, tuple(shape), dtype)
 
     return init
+
+
+# Flax traces the initializer wherever a network is applied; jitted, it is traced once.
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _orthogonal(
+    data: jax.Array, scale: float, shape: tuple[int, ...], dtype: Any
+) -> jax.Array:
+    initializer = nn.initializers.orthogonal(scale)
+
+    @jax.custom_batching.sequential_vmap
+    def one(data: jax.Array) -> jax.Array:
+        return initializer(jax.random.wrap_key_data(data), shape, dtype)
+
+    return one(data)
 
 
 class MLP(nn.Module):

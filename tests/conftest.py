@@ -1,6 +1,7 @@
 """Settings that all tests share: two devices, a cache, how programs are compiled."""
 
 import atexit
+import gc
 import importlib.metadata
 import os
 import shutil
@@ -30,6 +31,9 @@ from gasil_jax.host.members import Members
 
 native.reserve_threads(2)
 
+# What JAX traces and compiles stays alive: to look through all of it as often as Python
+# does by default takes a twentieth of the time.
+gc.set_threshold(100_000, 20, 20)
 
 # Compiling takes most of the time, so most of XLA's optimizations are turned off. Tests
 # with this mark check XLA's numbers or its memory, and are compiled as for users.
@@ -69,7 +73,7 @@ def pytest_runtest_setup(item):
         _programs.clear()
 
 
-# The compiled training of members, by all that it depends on.
+# The compiled first states and training of members, by all that they depend on.
 _programs = {}
 
 
@@ -77,9 +81,9 @@ _programs = {}
 def equal_members_share_a_program():
     """Trace and compile the training of equal members once in a session.
 
-    Members are equal if they are trained by the same algorithm, with equal numbers, in
-    an environment that was made by the same name with the same settings. Yields the
-    programs, for a test that needs one to be compiled.
+    Members are equal if they are trained by the same algorithm, whatever its numbers,
+    in the same environment, or in one that was made by the same name with the same
+    settings. Yields the programs, for a test that needs one to be compiled.
     """
     import jax
 
@@ -87,19 +91,22 @@ def equal_members_share_a_program():
     compile_ = Members.compile
 
     def compiled(self, states=None):
-        made = registry.made_with(self.env)
-        named = made is not None and ":" not in made[0]
-        if not named or jax.tree.leaves(self.data):
+        if jax.tree.leaves(self.data):
             return compile_(self, states)
+        # A class of the same name may be another one.
+        kind = type(getattr(self.env, "unwrapped", None))
+        made = registry.made_with(self.env) or id(self.env)
+        numbers = dict.fromkeys(self.algorithm.hyperparameters, 0.0)
         padded = self.num_members + self._padding
-        key = (made, self.algorithm, padded, *self.devices)
-        if key not in _programs:
-            states, _programs[key] = compile_(self, states)
-        elif states is None:
-            states = self.init()
+        key = (kind, made, self.algorithm.replace(**numbers), padded, *self.devices)
+        if key in _programs:
+            vars(self)["first_states"], advance, _ = _programs[key]
+            states = self.init() if states is None else self.to_devices(states)
         else:
-            states = self.to_devices(states)
-        return states, _programs[key]
+            states, advance = compile_(self, states)
+            # The environment stays alive, so that no other one gets its id.
+            _programs[key] = self.first_states, advance, self.env
+        return states, advance
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Members, "compile", compiled)
@@ -137,9 +144,8 @@ def figures(monkeypatch):
     return kept
 
 
-@pytest.fixture(scope="session")
-def untrained_hopper(tmp_path_factory):
-    """The folder of a run on hopper with a first checkpoint: no training compiles."""
+def _untrained(out, env, **settings):
+    """Write a run's folder with a first checkpoint: no training compiles."""
     import jax
     import numpy as np
 
@@ -147,22 +153,38 @@ def untrained_hopper(tmp_path_factory):
     from gasil_jax.host import checkpoint
     from gasil_jax.host.environments import Settings
 
-    out = tmp_path_factory.mktemp("hopper") / "run"
     algorithm = gasil_jax.algorithm(
-        num_envs=1, batch_steps=64, hidden_sizes=(8,), discriminator_hidden_sizes=(8,)
+        num_envs=1,
+        batch_steps=64,
+        hidden_sizes=(8,),
+        discriminator_hidden_sizes=(8,),
+        buffer_steps=200,
     )
     options = run_options.Options(
-        env="hopper",
-        settings=Settings(physics="mujoco"),
+        env=env,
+        settings=Settings(**settings),
         **run_options.algorithm_options(algorithm),
     )
     out.mkdir()
     run_options.write_config(options, out)
-    env = run_options.make_env(options)
-    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
+    made = run_options.make_env(options)
+    init = jax.vmap(lambda seed: gasil_jax.init(made, algorithm, jax.random.key(seed)))
     states = jax.jit(init)(np.arange(1, dtype=np.uint32))
     checkpoint.write(out / "checkpoints", 0, states, {"score": None})
     return out
+
+
+@pytest.fixture(scope="session")
+def untrained_hopper(tmp_path_factory):
+    """The folder of a run on hopper, with C MuJoCo."""
+    out = tmp_path_factory.mktemp("hopper") / "run"
+    return _untrained(out, "hopper", physics="mujoco")
+
+
+@pytest.fixture(scope="session")
+def untrained_point_mass(tmp_path_factory):
+    """The folder of a run on the point mass."""
+    return _untrained(tmp_path_factory.mktemp("point_mass") / "run", "point_mass")
 
 
 @pytest.fixture(scope="session")

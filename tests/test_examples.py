@@ -1,5 +1,6 @@
 """The examples of the documentation run, made small."""
 
+import functools
 import json
 import pathlib
 import re
@@ -14,6 +15,7 @@ import gasil_jax
 from gasil_jax.host import policy_file
 from gasil_jax.sweeps import saved_states
 
+SMALL = {"num_epochs": 1, "hidden_sizes": (8,)}
 EXAMPLES = pathlib.Path(__file__).parent.parent / "docs" / "examples"
 
 
@@ -31,6 +33,23 @@ def run_script(monkeypatch, capsys):
     plt.close("all")
 
 
+@pytest.fixture
+def small(monkeypatch):
+    """Let examples train with less; PPO+BONUS, with an alpha too, compiles sooner."""
+
+    def smaller(original):
+        def make(*names, **settings):
+            names = ["ppo+bonus" if x == "ppo+gasil" else x for x in names]
+            return original(*names, **settings).replace(**SMALL)
+
+        return make
+
+    for name in ("preset", "algorithm"):
+        monkeypatch.setattr(gasil_jax, name, smaller(getattr(gasil_jax, name)))
+    config = functools.partial(gasil_jax.Config, **SMALL)
+    monkeypatch.setattr(gasil_jax, "Config", config)
+
+
 def numbers(text):
     return [float(number) for number in re.findall(r"-?\d+\.\d+", text)]
 
@@ -44,7 +63,7 @@ def test_all_are_listed():
             assert f"]({path.name})" in text, path
 
 
-def test_alpha_is_swept_and_plotted(run_script, tmp_path):
+def test_alpha_is_swept_and_plotted(run_script, small, tmp_path):
     out = tmp_path / "alpha.png"
     options = ("--steps", 2048, "--seeds", 2, "--out", out)
     printed = run_script("sweep_alpha.py", *options)
@@ -53,7 +72,7 @@ def test_alpha_is_swept_and_plotted(run_script, tmp_path):
     assert plt.imread(out).std() > 0.01
 
 
-def test_an_environment_of_ones_own_trains(run_script, monkeypatch):
+def test_an_environment_of_ones_own_trains(run_script, small, monkeypatch):
     printed = run_script("own_environment.py", "--steps", 4096)
     assert re.findall(r"^(\S+): return", printed, re.MULTILINE) == ["ppo", "ppo+gasil"]
     # A step's reward is between 0 and 1, and nearly 0 while the pendulum hangs.
@@ -62,7 +81,7 @@ def test_an_environment_of_ones_own_trains(run_script, monkeypatch):
     assert gasil_jax.make_env("own_environment:Pendulum").observation_size == 3
 
 
-def test_an_agent_of_ones_own_trains(run_script, monkeypatch):
+def test_an_agent_of_ones_own_trains(run_script, small, monkeypatch):
     monkeypatch.syspath_prepend(EXAMPLES)  # as a script's own folder is
     printed = run_script("own_agent.py", "--steps", 4096)
     agents = re.findall(r"^(\S+): return", printed, re.MULTILINE)
@@ -81,6 +100,10 @@ def test_a_policy_plays_in_gymnasium(run_script, untrained_hopper, tmp_path):
 
 def test_the_notebook_tells_its_story(monkeypatch, capsys):
     monkeypatch.setenv("EXAMPLE_SIZE", "0.01")
+    preset = gasil_jax.preset
+    monkeypatch.setattr(
+        gasil_jax, "preset", lambda *names: preset(*names).replace(**SMALL)
+    )
     plt.switch_backend("Agg")
     notebook = json.loads((EXAMPLES / "point_mass.ipynb").read_text())
     assert (notebook["nbformat"], notebook["nbformat_minor"]) == (4, 5)

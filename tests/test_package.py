@@ -10,6 +10,7 @@ import sys
 import zipfile
 
 import pytest
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import __main__ as package
@@ -78,10 +79,8 @@ def test_the_wheel_alone_trains(tmp_path):
     assert gasil_jax.__version__ in wheel.name
     zipfile.ZipFile(wheel).extractall(site)
 
-    arguments = (
-        "--env point_mass --agent ppo --total-steps 64 --batch-steps 64 --num-envs 4 "
-        "--num-epochs 1 --hidden-sizes 4 --out run"
-    ).split()
+    # Other tests compile the same.
+    arguments = [*FLAGS, "--agent", "ppo", "--out", "run"]
     program = _RUN.format(extras=EXTRAS, site=str(site), arguments=arguments)
     environment = os.environ | {
         "PYTHONPATH": str(site),

@@ -36,6 +36,7 @@ TOY = {
     "--env": "point_mass",
     # Others may have nothing for it.
     "--preset": "tuned",
+    "--reward-delay": "1",
     "--seeds": "2",
     "--episodes": "2",
     "--evaluate-every": "128",
@@ -209,6 +210,9 @@ def as_toy(line, finished, locomotion, folder):
             arguments[i] = str(locomotion if needs_locomotion else finished)
     if program in ("gasil_jax.run", "gasil_jax.sweep"):
         arguments += [*SMALL, "--out", str(folder)]
+    if program == "gasil_jax.run":
+        # As many members as a sweep of two seeds has, whose program it shares.
+        arguments += ["--seeds", "8"]
     return PROGRAMS[program], arguments
 
 
@@ -317,6 +321,8 @@ def run_python(path):
         "1_000_000": "1024",
         r"key\(0\), \d+\)": "key(0), 2)",
         r"n_trials=\d+": "n_trials=2",
+        # Together as many members as in the other call, which share a program.
+        r"seeds=10,\n    points": "seeds=5, points",
     }
     for block in blocks:
         for pattern, value in changes.items():
@@ -338,7 +344,7 @@ def test_the_python_of_the_documentation_runs(finished_hopper):
     assert names["state"].iteration.shape == (2,)
     assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
-    assert names["tried"].metrics["episode_return"].shape == (2, 10, 2)
+    assert names["tried"].metrics["episode_return"].shape == (2, 5, 2)
     result = names["result"]
     assert result.metrics["episode_return"].shape == (10, 2)
     # The untrained policy and the last one.
@@ -407,8 +413,8 @@ def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
     pytest.importorskip("gymnax")
     run_of_it = ["--env", "gymnax:Breakout-MinAtar", "--agent", "my_tasks:Planes"]
     out = tmp_path / "run"
-    arguments = [*run_of_it, *SMALL[:-2], "--seeds", "2", "--out", str(out)]
-    assert run.main(arguments) == 0
+    arguments = [*run_of_it, "--preset", "gymnax", *SMALL[:-2], "--seeds", "2"]
+    assert run.main([*arguments, "--out", str(out)]) == 0
     assert "policy.npz is not written: the policy's network is a F" in (
         capsys.readouterr().err
     )

@@ -172,19 +172,24 @@ class Members:
             check_vma=False,
         )
 
+    @functools.cached_property
+    def first_states(self) -> Any:
+        """The jitted function of seeds and hyperparameters, (padded,), for `init`."""
+
+        def init_one(seed: Any, hyperparameters: Any) -> Any:
+            return init_member(self.env, self.algorithm, seed, hyperparameters)
+
+        return jax.jit(
+            self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
+        )
+
     def init(self) -> Any:
         """Return the first states of all members, (padded, ...) each leaf."""
 
         def pad(values: Any) -> Any:
             return [*values, *[values[-1]] * self._padding]
 
-        def init_one(seed: Any, hyperparameters: Any) -> Any:
-            return init_member(self.env, self.algorithm, seed, hyperparameters)
-
-        init = jax.jit(
-            self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
-        )
-        return init(
+        return self.first_states(
             np.array(pad(self.seeds), np.uint32),
             jax.tree.map(
                 lambda *x: np.array(x, np.float32), *pad(self.hyperparameters)

@@ -4,7 +4,6 @@ All checks of an agent share one compiled iteration of two members. Their random
 hyperparameters and reward units are data.
 """
 
-import dataclasses
 import functools
 
 import jax
@@ -28,7 +27,7 @@ DISCRIMINATOR = {
     "discriminator_updates": 20,
     "discriminator_learning_rate": 3e-4,
 }
-# GAIL needs an expert: test_gail.py.
+# GAIL needs an expert: test_discrete.py.
 SELF_TAUGHT = (
     gasil_jax.PPO(),
     # A constant bonus as large as the normalized reward drowns it.
@@ -96,6 +95,10 @@ def train(agent, iterations, *, changes=({}, {}), units=(1, 1), seeds=(0, 0)):
     return state, jax.tree.map(lambda *x: np.stack(x, axis=1), *rows)
 
 
+def close(**tolerance):
+    return functools.partial(np.testing.assert_allclose, **tolerance)
+
+
 def test_every_agent_but_the_taught_one_is_tested():
     assert [*ALGORITHMS, "gail"] == list(gasil_jax.agents())
 
@@ -126,67 +129,39 @@ def test_an_agent_looks_at_each_of_its_numbers(agent):
 def test_the_unit_of_the_reward_does_not_matter(agent):
     # Without normalization it does: to a bonus beside it, and to the value's loss.
     _, metrics = train(agent, 3, units=(1, 1024))
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5)
     assert np.all(np.isfinite(metrics["reward_scale"]))
     for name in ("policy_loss", "value_loss", "entropy", "bonus", "sil_fraction"):
         if name in metrics:
-            close(metrics[name][1], metrics[name][0], err_msg=name)
+            usual, scaled = metrics[name]
+            close(rtol=1e-3, atol=1e-5)(scaled, usual, err_msg=name)
     # The buffer holds the environment's own returns.
     for name in metrics.keys() & {"reward_scale", "good_return"}:
         usual, scaled = metrics[name]
         np.testing.assert_allclose(scaled, 1024.0 * usual, rtol=1e-4, err_msg=name)
 
 
-@pytest.mark.xdist_group("agent ppo+gasil")
-def test_vmap_over_every_hyperparameter_equals_single_runs():
-    algorithm = ALGORITHMS["ppo+gasil"]
-    half = halved("ppo+gasil", algorithm.hyperparameters)
-    _, together = train("ppo+gasil", 2, changes=({}, half))
-    init = jax.jit(functools.partial(gasil_jax.init, ENV, algorithm))
-    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, algorithm))
-    for i, hyperparameters in enumerate((algorithm.hyperparameters, half)):
-        state = init(jax.random.key(0), hyperparameters)
-        for iteration in range(2):
-            state, metrics = iterate(state)
-            for name in ("bonus", "policy_loss", "value_loss", "good_steps"):
-                np.testing.assert_allclose(
-                    together[name][i, iteration],
-                    metrics[name],
-                    rtol=1e-3,
-                    atol=1e-5,
-                    err_msg=name,
-                )
-    assert np.all(together["bonus"][0] > together["bonus"][1])
+@pytest.mark.xdist_group("agent ppo+gasil-adaptive")
+def test_each_stream_has_its_own_value_and_without_weight_it_is_ppo():
+    without = {"imitation_weight": 0.0}
+    states, _ = train("ppo+gasil-adaptive", 1, changes=(without, {}))
+    plain = train("ppo", 1)[0].actor_critic
+    member = lambda tree: jax.tree.map(lambda x: x[0], tree.params)
+    own, expected = states.actor_critic, member(plain.policy)
+    jax.tree.map(close(rtol=1e-3, atol=1e-4), member(own.policy), expected)
+    first, second = map(member, own.values)
+    jax.tree.map(close(rtol=1e-3, atol=1e-4), first, member(plain.values[0]))
+    assert not np.allclose(jax.tree.leaves(first)[0], jax.tree.leaves(second)[0])
+    # With weight it is another one.
+    (kernel, *_) = jax.tree.leaves(own.policy.params)
+    assert not np.allclose(kernel[0], kernel[1], atol=1e-3)
 
 
-class TwoStreams(gasil_jax.Agent):
-    """PPO on the first of two streams."""
-
-    num_streams = 2
-
-    def update_and_reward(self, state, context, key):
-        reward = context.rollout.reward
-        return state, jnp.stack([reward, -3.0 * reward], axis=-1), {}
-
-    def mix(self, state, advantages, context):
-        return advantages[..., 0], {}
-
-
-@pytest.mark.xdist_group("agent ppo")
-def test_two_streams_of_the_same_reward_are_that_reward():
-    """Each stream has its own value; with one of them at weight 0 it is plain PPO."""
-    algorithm = dataclasses.replace(ALGORITHMS["ppo"], agent=TwoStreams())
-    init = jax.jit(functools.partial(gasil_jax.init, ENV, algorithm))
-    iterate = jax.jit(functools.partial(gasil_jax.iterate, ENV, algorithm))
-    state, _ = iterate(init(jax.random.key(0)))
-    plain = gasil_jax.member(train("ppo", 1)[0], 0).actor_critic
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-4)
-    jax.tree.map(close, state.actor_critic.policy.params, plain.policy.params)
-    first, second = state.actor_critic.values
-    jax.tree.map(close, first.params, plain.values[0].params)
-    (kernel, *_) = jax.tree.leaves(second.params)
-    (other, *_) = jax.tree.leaves(first.params)
-    assert not np.allclose(kernel, other)
+@pytest.mark.xdist_group("agent ppo+bonus")
+def test_a_constant_bonus_of_nothing_is_ppo():
+    nothing = {"alpha": 0.0}
+    states, _ = train("ppo+bonus", 1, changes=(nothing, nothing))
+    plain, _ = train("ppo", 1)
+    jax.tree.map(close(rtol=1e-3, atol=1e-5), states.actor_critic, plain.actor_critic)
 
 
 @pytest.mark.xdist_group("agent ppo+bc")
@@ -214,7 +189,7 @@ def test_cloning_makes_the_good_steps_likelier():
     # the value, which cloning leaves alone, is equal.
     plain, _ = train("ppo", 1, changes=(fast, fast))
     jax.tree.map(
-        functools.partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-6),
+        close(rtol=1e-5, atol=1e-6),
         gasil_jax.member(states.actor_critic.params["values"], 1),
         gasil_jax.member(plain.actor_critic.params["values"], 1),
     )

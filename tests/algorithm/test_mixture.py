@@ -1,6 +1,6 @@
 """Policies that are mixtures of Gaussians: their formulas, files, and refusals."""
 
-import csv
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from flax import linen as nn
-from small_training import DISCRIMINATOR, DISCRIMINATOR_FLAGS, FLAGS, SETTINGS
+from small_training import DISCRIMINATOR_FLAGS, FLAGS, SETTINGS
 
 import gasil_jax
 from gasil_jax import evaluate, normalization, numpy_policy, policy, run, sweep
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
-from gasil_jax.host import policy_file
+from gasil_jax.host import metrics_files, policy_file
 from gasil_jax.networks import MixturePolicy
 
 
@@ -164,13 +164,10 @@ def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
     assert between(drawn) < 0.02 and np.mean(drawn > 0) == pytest.approx(0.5, abs=0.05)
 
 
-# The others use nothing of a policy that one of these does not.
-@pytest.mark.parametrize("agent", ["ppo+sil", "ppo+gasil-adaptive"])
-def test_agents_train_it(agent):
-    env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm(agent)
-    more = DISCRIMINATOR if "gasil" in agent else {}
-    algorithm = algorithm.replace(**SETTINGS, **more, policy_components=3)
-    algorithm = algorithm.replace(entropy_coefficient=0.01)
+# The other agents use nothing of a policy that one of these two does not.
+def test_replays_train_it():
+    env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm("ppo+sil")
+    algorithm = algorithm.replace(**SETTINGS, policy_components=3)
     state, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
     assert np.isfinite(metrics["entropy"]).all()
     assert (metrics["skipped_updates"] == 0).all()
@@ -178,16 +175,34 @@ def test_agents_train_it(agent):
     assert layers["Dense_1"]["bias"].shape == (3 * (2 + 1),)
 
 
-def save(path):
-    """Save two policies with random layers, and return what they are of."""
+def test_adaptive_imitation_trains_it_and_it_is_evaluated(tmp_path):
+    flags = [*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "ppo+gasil-adaptive"]
+    flags += ["--policy-components", "3", "--entropy-coefficient", "0.01"]
+    assert run.main([*flags, "--out", str(tmp_path)]) == 0
+    metrics = metrics_files.read_metrics(tmp_path / "metrics.csv", ("seed",), 1)
+    assert np.isfinite(metrics["entropy"]).all()
+    assert (metrics["skipped_updates"] == 0).all()
+    assert evaluate.main([str(tmp_path), "--episodes", "2", "--stochastic"]) == 0
+
+
+@functools.cache
+def random_policies():
+    """Return the environment and the states of two policies with random layers."""
     env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.algorithm("ppo", **SETTINGS, policy_components=3)
     init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states, rng = init(jnp.arange(2, dtype=jnp.uint32)), np.random.default_rng(0)
+    states = jax.jit(init)(jnp.arange(2, dtype=jnp.uint32))
+    rng = np.random.default_rng(0)
     other = lambda x: x + jnp.asarray(0.3 * rng.normal(size=x.shape), x.dtype)
     learner = states.actor_critic.policy
     learner = learner.replace(params=jax.tree.map(other, learner.params))
     states = states.replace(actor_critic=states.actor_critic.replace(policy=learner))
+    return env, states
+
+
+def save(path):
+    """Save these policies, and return what they are of."""
+    env, states = random_policies()
     policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
     return env, states
 
@@ -243,18 +258,6 @@ def test_a_file_with_another_number_of_components_is_refused(tmp_path, changes, 
     np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
     with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
         gasil_jax.load_policy(path)
-
-
-def test_a_run_continues_and_is_evaluated(tmp_path):
-    flags = [*FLAGS, *DISCRIMINATOR_FLAGS, "--policy-components", "3"]
-    flags += ["--learning-rate-decay", "0"]
-    whole, parts = str(tmp_path / "whole"), str(tmp_path / "parts")
-    assert run.main([*flags, "--total-steps", "512", "--out", whole]) == 0
-    assert run.main([*flags, "--out", parts]) == 0
-    assert run.main(["--resume", "--out", parts, "--total-steps", "512"]) == 0
-    read = lambda out: list(csv.DictReader(open(f"{out}/metrics.csv")))
-    assert read(parts) == read(whole) and len(read(whole)) == 4
-    assert evaluate.main([parts, "--episodes", "2", "--stochastic"]) == 0
 
 
 class Own(gasil_jax.PPO):

@@ -41,9 +41,25 @@ class Own(gasil_jax.PPOGASIL):
         return Head()
 
 
-@pytest.mark.parametrize("make", [lambda: gasil_jax.make_env("point_mass"), Corridor])
-def test_networks_of_ones_own_are_trained_and_act(make):
-    env = make()
+def assert_it_acts(env, state):
+    """The saved policy of a state is its network, which needs JAX."""
+    observation = np.ones((3, env.observation_size), np.float32)
+    act = policy.from_state(state, env)
+    learned = state.actor_critic.policy
+    with jax.numpy_rank_promotion("allow"):
+        inputs = numpy_policy.inputs(policy.weights(state, env), observation)
+        parameters = learned.network.apply(learned.params, inputs)
+    if hasattr(env, "num_actions"):
+        np.testing.assert_array_equal(act(observation), parameters.argmax(axis=-1))
+    else:
+        expected = np.clip(parameters[0], *wrappers.action_range(env))
+        np.testing.assert_allclose(act(observation), expected, rtol=1e-5)
+    with pytest.raises(ValueError, match="a Flax module of your own, which needs JAX"):
+        numpy_policy.make(policy.weights(state, env))(observation)
+
+
+def test_networks_of_ones_own_are_trained_and_act():
+    env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.Algorithm(Own()).replace(buffer_steps=64, **SMALL)
     train = gasil_jax.make_train(env, algorithm)
     keys = jax.random.split(jax.random.key(0), 2)  # of two runs
@@ -60,20 +76,13 @@ def test_networks_of_ones_own_are_trained_and_act(make):
         old = network(before).params
         changed = jax.tree.map(lambda x, y: bool((x != y).any()), params, old)
         assert all(jax.tree.leaves(changed))
+    assert_it_acts(env, state)
 
-    observation = np.ones((3, env.observation_size), np.float32)
-    act = policy.from_state(state, env)
-    learned = state.actor_critic.policy
-    with jax.numpy_rank_promotion("allow"):
-        inputs = numpy_policy.inputs(policy.weights(state, env), observation)
-        parameters = learned.network.apply(learned.params, inputs)
-    if hasattr(env, "num_actions"):
-        np.testing.assert_array_equal(act(observation), parameters.argmax(axis=-1))
-    else:
-        expected = np.clip(parameters[0], *wrappers.action_range(env))
-        np.testing.assert_allclose(act(observation), expected, rtol=1e-5)
-    with pytest.raises(ValueError, match="a Flax module of your own, which needs JAX"):
-        numpy_policy.make(policy.weights(state, env))(observation)
+
+def test_a_network_of_ones_own_acts_in_discrete_actions():
+    algorithm = gasil_jax.Algorithm(Own()).replace(**SMALL)
+    init = jax.jit(lambda key: gasil_jax.init(Corridor(), algorithm, key))
+    assert_it_acts(Corridor(), init(jax.random.key(0)))
 
 
 class WithState(nn.Module):

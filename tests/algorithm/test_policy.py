@@ -150,15 +150,16 @@ LAYERS = {
 }
 
 
-@pytest.mark.parametrize("layer_norm", [False, True])
-@pytest.mark.parametrize("activation", LAYERS)
+@pytest.mark.parametrize(
+    ("activation", "layer_norm"), [("tanh", False), ("relu", True), ("swish", False)]
+)
 def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.algorithm(
         "ppo", activation=activation, layer_norm=layer_norm, hidden_sizes=(8, 5)
     )
     init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states = init(jnp.arange(2, dtype=jnp.uint32))
+    states = jax.jit(init)(jnp.arange(2, dtype=jnp.uint32))
     rng = np.random.default_rng(0)
     draw = lambda x: x + jnp.asarray(rng.normal(size=x.shape), x.dtype)
     params = jax.tree.map(draw, states.actor_critic.policy.params)
@@ -184,17 +185,9 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     normalizer = gasil_jax.member(states, 1).normalizer
     mean, _ = network.apply(own, normalization.normalize(normalizer, observation))
     np.testing.assert_allclose(mean, x, rtol=1e-3)
-
-
-def test_a_layer_without_its_norm_is_refused(tmp_path):
-    env = gasil_jax.make_env("point_mass")
-    algorithm = gasil_jax.algorithm("ppo", layer_norm=True, hidden_sizes=(8, 5))
-    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states = init(jnp.arange(1, dtype=jnp.uint32))
-    path = tmp_path / "policy.npz"
-    policy_file.save(path, states, env, [0], np.zeros(1))
-    arrays = dict(np.load(path))
-    del arrays["norm_bias_1"]
-    np.savez(path, **arrays)
-    with pytest.raises(ValueError, match="norm_bias_1 is missing"):
-        gasil_jax.load_policy(path)
+    if layer_norm:
+        arrays = dict(np.load(tmp_path / "policy.npz"))
+        del arrays["norm_bias_1"]
+        np.savez(tmp_path / "policy.npz", **arrays)
+        with pytest.raises(ValueError, match="norm_bias_1 is missing"):
+            gasil_jax.load_policy(tmp_path)

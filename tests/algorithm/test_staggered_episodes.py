@@ -112,7 +112,7 @@ def test_an_episode_that_ends_by_itself_before_it_is_cut_is_whole():
 @pytest.mark.parametrize(
     "agent",
     [
-        gasil_jax.PPOGASIL(buffer_steps=30, discriminator_hidden_sizes=(4,)),
+        gasil_jax.PPOBC(buffer_steps=30),
         gasil_jax.PPOSIL(sil_buffer_steps=300, sil_minibatch_size=8),
     ],
     ids=lambda agent: agent.name,
@@ -144,9 +144,9 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
     ended = np.asarray(metrics["episodes"]) > 0
     assert (np.asarray(metrics["episode_length"])[ended] == LIMIT).all()
     assert (np.asarray(metrics["episode_return"])[ended] == -LIMIT).all()
-    if agent.name == "ppo+gasil":
-        assert int(state.agent.buffer.size) == 30
-        np.testing.assert_array_equal(state.agent.buffer.return_, -LIMIT)
+    if agent.name == "ppo+bc":
+        assert int(state.agent.size) == 30
+        np.testing.assert_array_equal(state.agent.return_, -LIMIT)
     else:
         # A whole episode's steps have the returns -1 to -LIMIT, each as often.
         replay = state.agent

@@ -214,7 +214,13 @@ def test_every_command_takes_it(tmp_path, capsys):
     described = json.loads((out / "config.json").read_text())["algorithm"]
     assert described["agent"] == "my_agents:Own" and described["my_weight"] == 0.25
     again = ["--env", "point_mass", "--out", str(out), "--resume"]
+    # The total of steps may grow.
+    before = (out / "metrics.csv").read_text()
     assert run.main([*again, "--total-steps", "384"]) == 0
+    after = (out / "metrics.csv").read_text()
+    assert after.startswith(before) and after.count("\n") == 1 + 3
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["env_steps_per_seed"] == 384
     assert column(out / "metrics.csv", "my_weight") == {0.25}
     assert run.main([*again, "--my-weight", "0.3"]) == 2
     assert "my_weight was 0.25, is 0.3" in capsys.readouterr().err

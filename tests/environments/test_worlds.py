@@ -11,7 +11,7 @@ from environment_contract import check_reset_and_step
 
 import gasil_envs
 from gasil_envs import pictures, worlds, wrappers
-from gasil_jax import render, run
+from gasil_jax import render
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
@@ -233,9 +233,3 @@ def test_control_tasks_are_built_and_robots_that_are_downloaded_refused():
     assert (env.observation_size, env.action_size, env.episode_length) == (5, 1, 1000)
     with pytest.raises(ValueError, match="downloads a robot's model"):
         gasil_envs.make("playground:Go1Getup")
-
-
-def test_a_run_by_name(tmp_path):
-    command = ["--env", "gymnax:Catch-bsuite", "--preset", "gymnax", "--agent", "ppo"]
-    small = ["--total-steps", "512", "--batch-steps", "256", "--hidden-sizes", "8"]
-    assert run.main([*command, *small, "--out", str(tmp_path / "run")]) == 0

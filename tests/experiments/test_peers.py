@@ -21,10 +21,9 @@ def test_a_peer_that_is_not_installed_is_told_in_a_line(missing, monkeypatch, ca
 
 
 # Brax's hopper takes a quarter of a minute to trace.
-@pytest.mark.parametrize("name", peers.ENVS[:2])
-def test_ours_has_the_sizes_of_the_others(name):
+def test_ours_has_the_sizes_of_the_others():
     pytest.importorskip("gymnax")
-    train, _ = peers._ours(name, 3 * 32 * 64)
+    train, _ = peers._ours(peers.ENVS[0], 3 * 32 * 64)
     state, metrics = jax.eval_shape(train, jax.random.key(0))
     assert metrics["env_steps"].shape == (3,)
     assert state.environments.episode_length.shape == (32,)

@@ -146,11 +146,12 @@ def test_a_type_of_the_same_size_is_not_taken_for_another(tmp_path):
 
 
 def test_an_environment_with_arrays_of_every_kind_continues_bit_for_bit(tmp_path):
-    whole = gasil_jax.fit(Static(), PPO, seeds=2).states
+    env = Static()
+    whole = gasil_jax.fit(env, PPO, seeds=2).states
     once = lambda progress: True
     for callback in (once, None):
         states = gasil_jax.fit(
-            Static(),
+            env,
             PPO,
             seeds=2,
             folder=tmp_path,
@@ -381,7 +382,7 @@ def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
     with pytest.raises(output_file.WriteError) as told:
         gasil_jax.fit(
             env,
-            PPO.replace(total_steps=100 * 128),
+            PPO,
             folder=out,
             evaluate_every=128,
             evaluate_episodes=1,

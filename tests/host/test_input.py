@@ -300,9 +300,9 @@ def test_traced_values_pass_unlooked_at():
 @given(algorithm=small_algorithms().filter(accepted))
 def test_an_accepted_algorithm_completes_an_iteration(algorithm):
     env = gasil_jax.make_env("point_mass", reward_delay=2)
-    step = jax.jit(lambda state: gasil_jax.iterate(env, algorithm, state))
-    init = jax.jit(lambda key: gasil_jax.init(env, algorithm, key))
-    state, _ = step(init(jax.random.key(0)))
+    init = lambda key: gasil_jax.init(env, algorithm, key)
+    first = jax.jit(lambda key: gasil_jax.iterate(env, algorithm, init(key)))
+    state, _ = first(jax.random.key(0))
     assert int(state.iteration) == 1
     for leaf in jax.tree.leaves((state.actor_critic, state.agent)):
         assert np.isfinite(leaf).all()

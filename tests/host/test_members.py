@@ -26,7 +26,7 @@ def compiled(agent):
     sizes |= {"sil_buffer_steps": 200, "sil_minibatch_size": 32}
     algorithm = algorithm.replace(
         total_steps=4 * 128,
-        decompose_rewards=agent == "ppo+bc+novelty",
+        decompose_rewards=agent == "ppo+sil",
         **{name: x for name, x in sizes.items() if name in algorithm.settings},
     )
     members = make_members(env, algorithm, [3, 4, 5], devices=jax.devices()[:2])
@@ -62,29 +62,39 @@ def trained(members, advance, states):
 
 
 @pytest.mark.xdist_group("members ppo+gasil")
-def test_a_seeds_result_is_its_own():
-    """It does not depend on the seeds beside it or on the number of devices."""
+def test_a_members_result_is_its_own():
+    """With a seed and numbers of its own it is trained as `make_train` trains it."""
     members, states, advance = compiled("ppo+gasil")
-    metrics, params = trained(members, advance, members.to_devices(states))
-    alone = make_members(members.env, members.algorithm, [4], devices=jax.devices()[:1])
-    states, advance = alone.compile()
-    own = trained(alone, advance, states)
+    half = {x: 0.5 * y for x, y in members.algorithm.hyperparameters.items()}
+    del half["initial_deviation"]  # The first states are already drawn.
+    numbers = {x: states.hyperparameters[x].at[1].set(half[x]) for x in half}
+    numbers = {**states.hyperparameters, **numbers}
+    states = members.to_devices(states.replace(hyperparameters=numbers))
+    metrics, params = trained(members, advance, states)
+    train = jax.jit(gasil_jax.make_train(members.env, members.algorithm))
+    state, own = train(jax.random.key(members.seeds[1]), half)
     # A batch of another size is summed in another order, and learning lets that grow.
-    close = lambda a, b: np.testing.assert_allclose(a[1], b[0], rtol=2e-3, atol=2e-4)
-    jax.tree.map(close, (metrics, params), own)
+    close = lambda a, b: np.testing.assert_allclose(a[1], b, rtol=2e-3, atol=2e-4)
+    jax.tree.map(close, (metrics, params), (own, state.actor_critic.params))
     returns = metrics["episode_return"]
     assert np.nanmax(np.abs(returns[0] - returns[1])) > 0.1
 
 
 def test_it_is_its_own_where_the_environment_calls_the_host():
     env = gasil_jax.make_env("halfcheetah", physics="mujoco")
-    algorithm = gasil_jax.algorithm("ppo", **SETTINGS)
-    results = []
+
+    def last_observation(seed):
+        state = env.reset(jax.random.key(seed))
+        for action in (0.5, -0.5):
+            state = env.step(state, jnp.full(env.action_size, action))
+        return state.obs
+
     # Three members on two devices: one is padding.
-    for devices, seeds in ((1, [6]), (2, [5, 6, 7])):
-        members = make_members(env, algorithm, seeds, devices=jax.devices()[:devices])
-        states, advance = members.compile()
-        results.append(trained(members, advance, states)[1])
-    alone, two = results
-    close = lambda a, b: np.testing.assert_allclose(a[1], b[0], rtol=1e-4, atol=1e-5)
-    jax.tree.map(close, two, alone)
+    algorithm, seeds = gasil_jax.algorithm("ppo"), [5, 6, 7]
+    members = make_members(env, algorithm, seeds, devices=jax.devices()[:2])
+    padded = members.to_devices(np.array(seeds, np.uint32))
+    together = members.trim(members.vmap(last_observation)(padded))
+    assert len(np.unique(together, axis=0)) == 3
+    for seed, observation in zip(seeds, together, strict=True):
+        alone = jax.jit(last_observation)(np.uint32(seed))
+        np.testing.assert_allclose(observation, alone, rtol=1e-4, atol=1e-5)

@@ -17,7 +17,7 @@ from gasil_jax.host.members import make_members
     ("agent", "changes"),
     [
         pytest.param(
-            *("ppo+gasil", {"num_envs": 64, "batch_steps": 8192}),
+            *("ppo+bc", {"num_envs": 64, "batch_steps": 8192}),
             marks=pytest.mark.compiled_as_for_users,
         ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
