@@ -183,7 +183,7 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
         ("--grid alpha=1 --shard 1/1", "shard needs --out"),
         ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
-        ("--grid alpha=1 --launcher rya", "'rya': it must be one of None, ray"),
+        ("--grid alpha=1 --launcher rya", "launcher is 'rya': it must be one of"),
         ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
         ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
         ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
