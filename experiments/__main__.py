@@ -155,7 +155,7 @@ def _train(name: str, options: Options) -> None:
             engine.train_missing(missing, stored, setup)
     if options.list:
         for each in engine.unfinished(missing, setup):
-            print(f"  {engine.title(each.program)}")
+            print(f"  {engine.title(each)}")
         return
     if published and not options.quick:
         # Other pages may have some of the same runs.

@@ -9,13 +9,13 @@ import dataclasses
 import functools
 import json
 import math
-import multiprocessing
 import multiprocessing.connection
 import os
 import pathlib
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from multiprocessing.context import SpawnProcess
 from typing import Any
 
 import jax
@@ -26,9 +26,10 @@ from experiments.store import Record, Store
 from gasil_jax.errors import InputError
 from gasil_jax.host import metrics_files, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.sweeps import assembly, programs, shards
-from gasil_jax.sweeps.programs import Program, ProgramFolder
+from gasil_jax.sweeps import assembly, programs
+from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps.shards import Shard
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -120,7 +121,7 @@ def _scratch(setup: Setup) -> pathlib.Path:
     return setup.runs / f"{setup.physics}-{setup.evaluate_episodes}"
 
 
-def unfinished(missing: Sequence[Run], setup: Setup) -> list[ProgramFolder]:
+def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     """Return the programs to train: those that have begun, then the most important.
 
     Args:
@@ -130,24 +131,23 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[ProgramFolder]:
     Raises:
       InputError: if a program.json in the scratch folder is damaged.
     """
-    rank = {run: rank for rank, run in enumerate(missing)}
+    rank, scratch = {run: rank for rank, run in enumerate(missing)}, _scratch(setup)
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
-    every = programs.unfinished(
-        ordered,
-        _scratch(setup),
-        labels=_labels,
-        most=setup.members,
-        apart=_is_of_search,  # Those are not evaluated.
-    )
+    begun, others = programs.unfinished(ordered, programs.read(scratch))
 
-    def order(x: Any) -> Any:
-        return (not x.path.exists(), min(rank.get(r, 0) for r in x.program.runs))
+    def importance(x: Program) -> int:
+        return min(rank.get(run, 0) for run in x.runs)
 
-    return sorted(every, key=order)
+    # Runs of a search are not evaluated.
+    new = [
+        x.below(scratch, {"member": range(len(x.runs)), "seed": x.seeds})
+        for x in programs.group(others, setup.members, _is_of_search)
+    ]
+    return sorted(begun, key=importance) + sorted(new, key=importance)
 
 
-def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
+def select_by_key(runs: Iterable[Run], shard: Shard) -> list[Run]:
     """Return the runs of a shard, the same on each machine.
 
     A run's shard depends on its key alone, not on which other runs are missing.
@@ -155,7 +155,7 @@ def select_by_key(runs: Iterable[Run], shard: shards.Shard) -> list[Run]:
     return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
 
 
-def train(stored: ProgramFolder, setup: Setup) -> dict[Run, Record]:
+def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     """Train a program, or continue its training.
 
     Raises:
@@ -163,8 +163,7 @@ def train(stored: ProgramFolder, setup: Setup) -> dict[Run, Record]:
         trains it.
       Interrupted: if a signal was received; a checkpoint was written first.
     """
-    program = stored.program
-    run = program.runs[0]
+    run = stored.runs[0]
     episodes = None if _is_of_search(run) else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
     options = run_options.Options(
@@ -177,38 +176,32 @@ def train(stored: ProgramFolder, setup: Setup) -> dict[Run, Record]:
         settings=dataclasses.replace(run.settings, physics=setup.physics),
         **run_options.algorithm_options(run.algorithm),
     )
-    env = assembly.prepare(options, [program], [stored.path])
-    job = assembly.Job(stored, stored.path.name)
+    env = assembly.prepare(options, [stored])
     _add_session(stored, setup)
     try:
-        assembly.train_in_folders(options, env, [job], title=title(program))
+        assembly.train(options, env, [stored], title=title(stored))
     except Interrupted as interrupted:
         interrupted.add_note("continue with: the same command and --resume")
         raise
     return records(stored)
 
 
-def records(stored: ProgramFolder) -> dict[Run, Record]:
+def records(stored: Program) -> dict[Run, Record]:
     """Return the records of a program that is trained to its end."""
     metrics, evaluations = stored.tables()
     provenance = _provenance(stored)
     return {
         run: record(own, scores, provenance)
         for run, own, scores in zip(
-            stored.program.runs, metrics, evaluations or [{}] * len(metrics)
+            stored.runs, metrics, evaluations or [{}] * len(metrics)
         )
     }
 
 
-def _labels(program: Program) -> dict[str, Sequence[int]]:
-    """Return the columns of metrics.csv that identify a program's members."""
-    return {"member": range(len(program.runs)), "seed": program.seeds}
-
-
-def _add_session(stored: ProgramFolder, setup: Setup) -> None:
+def _add_session(stored: Program, setup: Setup) -> None:
     """Add to a program's provenance.json how it is trained in this process."""
     path = run_folder.create(stored.path) / _SESSIONS
-    devices = jax.devices()[: len(stored.program.runs)]
+    devices = jax.devices()[: len(stored.runs)]
     now = {
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
@@ -220,19 +213,19 @@ def _add_session(stored: ProgramFolder, setup: Setup) -> None:
         metrics_files.write_json(path, {"sessions": [*sessions, now]})
 
 
-def _provenance(stored: ProgramFolder) -> dict[str, Any]:
+def _provenance(stored: Program) -> dict[str, Any]:
     """Return how a program was trained, over all sessions of interrupted training."""
     sessions = json.loads((stored.path / _SESSIONS).read_text())["sessions"]
 
-    def every(name: str) -> str:
-        return ", then ".join(
-            dict.fromkeys(str(session[name]) for session in sessions if session[name])
+    def every(name: str) -> str | None:
+        return (
+            ", then ".join(dict.fromkeys(x[name] for x in sessions if x[name])) or None
         )
 
     # False if any session had a changed checkout; otherwise None if any is unknown.
     clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
-    commit = every("commit") or None
-    return {**sessions[-1], "device": every("device"), "commit": commit, "clean": clean}
+    joined = {name: every(name) for name in ("device", "commit")}
+    return {**sessions[-1], **joined, "clean": clean}
 
 
 def record(
@@ -268,9 +261,7 @@ def record(
     )
 
 
-def _requested(
-    missing: Sequence[Run], store: Store, setup: Setup
-) -> list[ProgramFolder]:
+def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Program]:
     """Return the programs that train the missing runs; store those that are trained.
 
     Raises:
@@ -279,7 +270,7 @@ def _requested(
     """
     asked = set(missing)
     begun = programs.read(_scratch(setup))
-    used = [x for x in begun if not asked.isdisjoint(x.program.runs)]
+    used = [x for x in begun if x.trains_any(asked)]
     if used and not setup.resume:
         raise InputError(
             f"runs is {setup.runs}, which holds training of these runs in "
@@ -293,15 +284,27 @@ def _requested(
     return unfinished(missing, setup)
 
 
-def _train_on_core(
-    program: ProgramFolder, setup: Setup, store: pathlib.Path, *, core: int
-) -> None:
+def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
+    """Train runs and add them to the store, each program as soon as it has ended.
+
+    Raises:
+      InputError: if the scratch folder holds training of these runs and `Setup.resume`
+        is not set.
+      Interrupted: if a signal was received; a checkpoint was written first.
+    """
+    for stored in _requested(missing, store, setup):
+        # Another process may have added them since.
+        if Store(store.folder).missing(stored.runs):
+            store.add(train(stored, setup))
+
+
+def _train_on_core(stored: Program, setup: Setup, store: Store, *, core: int) -> None:
     """Train a program on one core; what this process prints goes to a log file."""
     os.sched_setaffinity(0, {core})
-    with open(f"{program.path}.log", "a") as log:
+    with open(f"{stored.path}.log", "a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
-        Store(store).add(train(program, setup))
+        store.add(train(stored, setup))
 
 
 def train_in_processes(
@@ -327,46 +330,27 @@ def train_in_processes(
             f"{len(cores)}"
         )
     _scratch(setup).mkdir(parents=True, exist_ok=True)
-    spawn = multiprocessing.get_context("spawn")
-    free = cores[: setup.processes]
-    failed: list[Program] = []
-    running: dict[Any, tuple[Any, Program, int]] = {}
+    free, failed = cores[: setup.processes], list[Program]()
+    running: dict[Any, tuple[SpawnProcess, Program, int]] = {}
     while True:
-        begun_here = [*failed, *(program for _, program, _ in running.values())]
-        not_waiting = {run for program in begun_here for run in program.runs}
-        waiting = [run for run in missing() if run not in not_waiting]
+        begun = [*failed, *(stored for _, stored, _ in running.values())]
+        begun_here = {run for each in begun for run in each.runs}
+        waiting = [run for run in missing() if run not in begun_here]
         for stored in _requested(waiting, store, setup)[: len(free)]:
-            core = free.pop()
-            process = spawn.Process(
-                target=_train_on_core,
-                args=(stored, setup, store.folder),
-                kwargs={"core": core},
-            )
+            given = {"core": free.pop()}
+            new = (stored, setup, Store(store.folder))
+            process = SpawnProcess(target=_train_on_core, args=new, kwargs=given)
             process.start()
-            running[process.sentinel] = process, stored.program, core
+            running[process.sentinel] = process, stored, given["core"]
         if not running:
             break
         for sentinel in multiprocessing.connection.wait(list(running)):
-            process, program, core = running.pop(sentinel)
+            process, stored, core = running.pop(sentinel)
             process.join()
             free.append(core)
-            failed += [program] if process.exitcode else []
+            failed += [stored] if process.exitcode else []
             outcome = "failed" if process.exitcode else "done"
-            print(f"{outcome}: {title(program)}", flush=True)
+            print(f"{outcome}: {title(stored)}", flush=True)
     if failed:
-        logs = ", ".join(f"{_scratch(setup) / x.name}.log" for x in failed)
+        logs = ", ".join(f"{stored.path}.log" for stored in failed)
         raise InputError(f"the training of {len(failed)} programs failed: see {logs}")
-
-
-def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
-    """Train runs and add them to the store, each program as soon as it has ended.
-
-    Raises:
-      InputError: if the scratch folder holds training of these runs and `Setup.resume`
-        is not set.
-      Interrupted: if a signal was received; a checkpoint was written first.
-    """
-    for stored in _requested(missing, store, setup):
-        # Another process may have added them since.
-        if Store(store.folder).missing(stored.program.runs):
-            store.add(train(stored, setup))

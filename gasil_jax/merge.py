@@ -7,15 +7,19 @@ can be continued. The folders are only read.
 
 import dataclasses
 import pathlib
+import shutil
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from typing import Annotated, Any
 
 import tyro
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line
-from gasil_jax.sweeps import merging, tables
+from gasil_jax.host import command_line, run_folder
+from gasil_jax.sweeps import tables
+from gasil_jax.sweeps.plan import programs_of, stored_plan
+
+_ADDED = ("points", "seeds", "first_seed")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,9 +47,63 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if len(options.folders) > 1:
             raise InputError("out is missing: several folders need --out")
         out = options.folders[0]
-    plan, summary = merging.merge(options.folders, out)
-    print(*tables.report(plan.points, summary), f"in {out}", sep="\n")
+    every = list(dict.fromkeys(options.folders))
+    if run_folder.has_run(out):
+        every = list(dict.fromkeys([out, *every]))
+    united = _united(every)
+    plan = stored_plan(every[0], united)
+    trained = [each for folder in every for each in plan.trained(folder)]
+    # Nothing has been written if a run is missing or has two different results.
+    results = tables.read(plan, trained)
+    run_folder.create(out)
+    with run_folder.lock(out):
+        if not run_folder.has_run(out):
+            run_folder.refuse_used(out)
+        for each in trained:
+            _copy(each.path, programs_of(out))
+        run_folder.write_description(out, {**united, "out": str(out)})
+    tables.finish(out, results)
     return 0
+
+
+def _united(folders: Sequence[pathlib.Path]) -> dict[str, Any]:
+    """Return the description of a sweep with the points and seeds of all.
+
+    Raises:
+      InputError: if they differ in something else, or if one is a run.
+    """
+    every = [run_folder.read(folder) for folder in folders]
+    first, settings = folders[0], _settings(every[0])
+    for folder, description in zip(folders, every, strict=True):
+        if "points" not in description:
+            raise InputError(f"folder is {folder}, a run: it must be of a sweep")
+        own = _settings(description)
+        changed = run_folder.differences(settings, own, grows=())
+        changed = changed or run_folder.differences(own, settings, grows=())
+        if changed:
+            raise InputError(
+                f"{folder} is of another sweep than {first}: {'; '.join(changed)}"
+            )
+        run_folder.refuse_other_expert(every[0], run_folder.flat(description), first)
+    points = [point for description in every for point in description["points"]]
+    seeds = [run_folder.seeds_of(description) for description in every]
+    low, high = min(x.start for x in seeds), max(x.stop for x in seeds)
+    distinct = [x for i, x in enumerate(points) if x not in points[:i]]
+    united = {"points": distinct, "first_seed": low, "seeds": high - low}
+    return {**every[0], **united}
+
+
+def _settings(description: dict[str, Any]) -> dict[str, Any]:
+    return {name: x for name, x in description.items() if name not in _ADDED}
+
+
+def _copy(program: pathlib.Path, parent: pathlib.Path) -> None:
+    """Copy a program's folder, whole or not at all, unless it is there."""
+    target, partial = parent / program.name, parent / f".{program.name}"
+    if not target.exists():
+        shutil.rmtree(partial, ignore_errors=True)
+        shutil.copytree(program, partial, ignore=shutil.ignore_patterns(".lock"))
+        partial.rename(target)
 
 
 if __name__ == "__main__":

@@ -103,8 +103,8 @@ def _saved(
         return fit["env"], fit["agent"], [(folder, count, range(count))]
     run = run_folder.read(folder)
     saved = [
-        (x.root.parent, len(x.program.runs), x.indices)
-        for x in saved_states.find(folder, run, point)
+        (stored.path, len(stored.runs), indices)
+        for stored, indices in saved_states.find(folder, run, point)
     ]
     return run["env"], run["algorithm"].agent.name, saved
 

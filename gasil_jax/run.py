@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import statistics
-from gasil_jax.host import command_line, driver, environments, run_folder
-from gasil_jax.host.members import Members
+from gasil_jax.host import command_line, environments, run_folder
 from gasil_jax.host.progress import announced
 from gasil_jax.host.run_options import (
     Options,
@@ -23,13 +22,11 @@ from gasil_jax.host.run_options import (
     write_config,
 )
 from gasil_jax.sweeps import assembly, run_results
-from gasil_jax.sweeps.programs import Program, ProgramFolder
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps.plan import Plan
+from gasil_jax.sweeps.programs import NOWHERE, Program
 
 
-def train(
-    options: Options, env: Any, program: Program, folder: pathlib.Path
-) -> dict[str, Any]:
+def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
     """Train, log and save a run; return the summary.
 
     Raises:
@@ -37,6 +34,7 @@ def train(
       OSError: if the folder can no longer be written.
       ValueError: if the run to continue does not fit the options.
     """
+    folder = job.path
 
     def write() -> None:
         write_config(options, folder)
@@ -45,21 +43,11 @@ def train(
     if not run_folder.has_run(folder):
         write()
     title = f"{options.env} {options.agent}"
-    labels = {"seed": seeds_of(options)}
-    stored = ProgramFolder(program, folder, labels)
-    job = assembly.Job(stored, folder.absolute().name)
-    finished: list[tuple[Members, driver.Outcome]] = []
-    assembly.train(
-        options,
-        env,
-        [job],
-        title=title,
-        on_finished=lambda job, members, outcome: finished.append((members, outcome)),
-        on_restored=write,
+    members, outcome = assembly.train(
+        options, env, [job], title=title, own_folder=True, on_restored=write
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
-        members, outcome = finished[0]
         tables = run_results.read(folder, options.seeds)
         summary = run_results.write(
             folder, options.env, members=members, outcome=outcome, tables=tables
@@ -84,16 +72,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
-    # A run of many seeds is one program.
-    program = Program(
-        tuple(
-            Run(options.env, options.algorithm, seed, options.settings)
-            for seed in seeds_of(options)
-        )
+    seeds = seeds_of(options)
+    plan = Plan(
+        options.env, options.settings, options.algorithm, [{}], seeds, is_run=True
     )
-    env = assembly.prepare(options, [program], [options.out] if options.out else [])
+    env = assembly.prepare(options, plan.stored(options.out or NOWHERE))
     with open_folder(options, "gasil_jax.run") as folder:
-        summary = train(options, env, program, folder)
+        (job,) = plan.stored(folder)
+        summary = train(options, env, job)
     scores = {
         name.replace("_", " "): np.array(list(summary[name].values()), float)
         for name in ("final_return", "final_evaluation")

@@ -21,18 +21,16 @@ import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from collections.abc import Sequence
+from typing import Literal
 
-from gasil_jax import algorithms
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.run_folder import StoredRun
-from gasil_jax.sweeps import assembly, launch, programs, run_results, shards, tables
-from gasil_jax.sweeps.plan import Plan
-from gasil_jax.sweeps.points import Point, check_saved, make_points
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps import assembly, launch, points, run_results, shards, tables
+from gasil_jax.sweeps.plan import Plan, stored_plan
+from gasil_jax.sweeps.programs import NOWHERE
 from gasil_jax.sweeps.shards import Shard
 
 _PROGRAM = "gasil_jax.sweep"
@@ -73,19 +71,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run_options.check(options)
     shard = None if options.shard is None else shards.parse(options.shard)
     if options.launcher is not None:
-        _launch(options, arguments, stored=stored)
+        _launch(options, make_plan(options, stored), arguments)
         return 0
     if options.shards is not None:
         raise InputError(
             f"shards is {options.shards}: it needs --launcher (one part is --shard)"
         )
     if shard is None:
-        _train_whole(options, make_plan(options, stored))
+        run_options.check_out(options)
+    elif options.out is None:
+        raise InputError("shard needs --out and the folder of the whole sweep")
     else:
-        if options.out is None:
-            raise InputError("shard needs --out and the folder of the whole sweep")
-        stored = stored or _joined(options, options.out)
-        _train_shard(options, make_plan(options, stored), shard, folder=options.out)
+        stored = stored or run_options.begun(options, options.out)
+    _train(options, make_plan(options, stored), shard)
     return 0
 
 
@@ -99,200 +97,102 @@ def make_plan(options: Options, stored: StoredRun | None = None) -> Plan:
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
     """
-    algorithm, points = options.algorithm, _points(options, stored)
-    without_effect = run_options.without_effect(algorithm)
-    with command_line.input_checked():
-        for point in points:
-            for name in without_effect.keys() & point.keys():
-                raise InputError(f"{name} can't vary: {without_effect[name]}")
-            algorithms.check(algorithm.replace(**point))
+    algorithm, file = options.algorithm, options.points_file
+    every = [] if stored is None else [*stored_plan(*stored).points]
+    # A sweep that has begun has its points in config.json; their file may be gone.
+    own_file = stored is not None and file == stored.description.get("points_file")
+    if file is None or not own_file or pathlib.Path(file).exists():
+        named = points.make_points(
+            options.grid,
+            options.random,
+            file,
+            seed=options.first_seed,
+            algorithm=algorithm,
+        )
+        every += [point for point in named if point not in every]
+    points.check(every, algorithm)
     seeds = run_options.seeds_of(options)
-    return Plan(options.env, options.settings, algorithm, points, seeds)
+    return Plan(options.env, options.settings, algorithm, every, seeds)
 
 
-def _points(options: Options, stored: StoredRun | None) -> list[Point]:
-    """Return the points of a stored sweep, then those that the options add."""
-    earlier: list[Point] = []
-    file = options.points_file
-    if stored is not None:
-        folder, description = stored
-        earlier += description["points"]
-        check_saved(earlier, description["algorithm"], folder / run_folder.CONFIG)
-        if file is not None and not pathlib.Path(file).exists():
-            if description["points_file"] == file:
-                return earlier
-    named = make_points(
-        options.grid,
-        options.random,
-        file,
-        seed=options.first_seed,
-        algorithm=options.algorithm,
-    )
-    return [*earlier, *(point for point in named if point not in earlier)]
+def _train(options: Options, plan: Plan, shard: Shard | None) -> None:
+    """Train what is missing of a sweep, or of a shard if one is given.
 
-
-def _joined(options: Options, folder: pathlib.Path) -> StoredRun | None:
-    """Return the sweep that a new shard belongs to, if another one has begun it.
+    The tables are written if no run is missing at the end.
 
     Raises:
-      InputError: if the folder holds another run or sweep.
-    """
-    if not run_folder.has_run(folder):
-        return None
-    stored = StoredRun(folder, run_folder.read(folder))
-    run_options.refuse_changes(options, stored)
-    return stored
-
-
-def _prepare(options: Options, plan: Plan, requested: Sequence[Run]) -> Any:
-    """Return the environment, once it is checked that what is missing can be trained.
-
-    The environment is None if no run is missing.
-    """
-    if options.out is None:
-        return assembly.prepare(options, programs.group(requested))
-    unfinished = plan.unfinished(options.out, requested)
-    for each in unfinished:
-        run_folder.refuse_without_checkpoints(each.path)
-    if not unfinished:
-        return None
-    folders = [x.path for x in unfinished]
-    return assembly.prepare(options, [x.program for x in unfinished], folders)
-
-
-def _train(
-    options: Options,
-    plan: Plan,
-    requested: Sequence[Run],
-    *,
-    env: Any,
-    folder: pathlib.Path,
-    on_restored: Callable[[], None] = lambda: None,
-) -> None:
-    """Train, log and save what is missing of the requested runs.
-
-    Raises:
+      InputError: if it can't be trained, or if a shard is to be continued without
+        `options.resume`.
       Interrupted: if a signal was received.
       OSError: if the folder can no longer be written.
-      ValueError: if the sweep to continue does not fit the options.
     """
-    name = folder.absolute().name
-    jobs = [
-        assembly.Job(each, f"{name}-{each.program.name}")
-        for each in plan.unfinished(folder, requested)
-    ]
-    if jobs:
-        title = f"{options.env} {options.agent} sweep"
-        assembly.train_in_folders(
-            options, env, jobs, title=title, on_restored=on_restored
-        )
-
-
-def _write_config(options: Options, plan: Plan, folder: pathlib.Path) -> None:
-    """Write config.json, which does not say how the sweep is divided."""
-    whole = dataclasses.replace(options, shard=None, launcher=None, shards=None)
-    run_options.write_config(whole, folder, points=plan.points)
-
-
-def _train_whole(options: Options, plan: Plan) -> None:
-    """Train what is missing of a sweep, and write its tables."""
-    run_options.check_out(options)
-    requested = list(plan.runs.values())
-    env = _prepare(options, plan, requested)
-    with run_options.open_folder(options, _PROGRAM) as folder:
-
-        def write() -> None:
-            _write_config(options, plan, folder)
-
-        # A sweep keeps its config.json until a checkpoint is restored.
-        if env is None or not run_folder.has_run(folder):
-            write()
-        _train(options, plan, requested, env=env, folder=folder, on_restored=write)
-        summary = tables.write(folder, tables.read(plan, plan.trained(folder)))
-    print(*tables.report(plan.points, summary), f"in {folder}", sep="\n")
-
-
-def _train_shard(
-    options: Options, plan: Plan, shard: Shard, *, folder: pathlib.Path
-) -> None:
-    """Train what is missing of a shard, and write the tables if no run is missing."""
-
-    def part(plan: Plan) -> list[Run]:
-        return shards.cut_evenly(list(plan.runs.values()), shard)
-
-    begun = [x for x in plan.unfinished(folder, part(plan)) if x.path.exists()]
-    if begun and not options.resume:
-        raise InputError(
-            f"shard is {shard}, whose training has begun in {begun[0].path}: continue "
-            "it with --resume"
-        )
-    env = _prepare(options, plan, part(plan))
-    with run_folder.wait_for_lock(run_folder.create(folder)):
-        if stored := _joined(options, folder):
+    jobs = plan.unfinished(options.out or NOWHERE, plan.part(shard))
+    for job in jobs:
+        if job.path.exists() and not options.resume:
+            raise InputError(
+                f"shard is {shard}, whose training has begun in {job.path}: continue "
+                "it with --resume"
+            )
+        run_folder.refuse_without_checkpoints(job.path)
+    env = assembly.prepare(options, jobs) if jobs else None
+    folder = run_options.make_folder(options)
+    with run_folder.wait_for_lock(folder):
+        if (options.resume or shard) and (stored := run_options.begun(options, folder)):
             # Another shard may have begun, or added points, since.
             plan = make_plan(options, stored)
         else:
             run_folder.refuse_used(folder)
-        _write_config(options, plan, folder)
-    command = f"{_PROGRAM} --shard {shard}"
+        # It does not say how the sweep is divided.
+        whole = dataclasses.replace(options, shard=None)
+        run_options.write_config(whole, folder, points=plan.points)
+    command = _PROGRAM if shard is None else f"{_PROGRAM} --shard {shard}"
     with run_options.told_how_to_continue(folder, command):
-        _train(options, plan, part(plan), env=env, folder=folder)
-    trained, own = plan.trained(folder), set(part(plan))
-    speed = tables.speed(
-        [x.training for x in trained if not own.isdisjoint(x.program.runs)]
-    )
-    print(f"shard {shard} is done, {run_results.speed_in_words(speed)}, in {folder}")
-    if missing := plan.missing(trained):
-        print(f"{len(missing)} of {len(plan.runs)} runs of the sweep are missing")
-        return
-    with run_folder.wait_for_lock(folder):
-        summary = tables.write(folder, tables.read(plan, trained))
-    print(*tables.report(plan.points, summary), sep="\n")
+        requested = plan.part(shard)
+        if jobs := plan.unfinished(folder, requested):
+            title = f"{options.env} {options.agent} sweep"
+            env = env or assembly.prepare(options, jobs)
+            assembly.train(options, env, jobs, title=title)
+        trained = plan.trained(folder)
+        if shard is not None:
+            own = [x for x in trained if x.trains_any(set(requested))]
+            speed = run_results.speed([x.training for x in own])
+            told = run_results.speed_in_words(speed)
+            print(f"shard {shard} is done, {told}, in {folder}")
+            if missing := plan.missing(trained):
+                print(
+                    f"{len(missing)} of {len(plan.runs)} runs of the sweep are missing"
+                )
+                return
+        tables.finish(folder, tables.read(plan, trained))
 
 
-def _launch(
-    options: Options,
-    arguments: Sequence[str] | None,
-    *,
-    stored: StoredRun | None,
-) -> None:
+def _launch(options: Options, plan: Plan, arguments: Sequence[str] | None) -> None:
     """Train all shards with a launcher, one command for each."""
+    count = options.shards
     if options.shard is not None:
         raise InputError(f"shard is {options.shard}: --launcher trains all of them")
-    if options.shards is None or options.shards < 1:
-        given = f"shards is {options.shards}: "
-        raise InputError(f"{given}--launcher needs --shards, 1 or more")
+    if count is None or count < 1:
+        raise InputError(f"shards is {count}: --launcher needs --shards, 1 or more")
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
-    plan = make_plan(options, stored)
-    runs, last = list(plan.runs.values()), Shard(options.shards, options.shards)
-    shards.cut_evenly(runs, last)  # Refuses more shards than runs.
+    plan.part(Shard(count, count))  # Refuses more shards than runs.
     run_options.check_out(options)
-    # With --resume a job that is run again continues from its checkpoint.
-    resumed = ["--resume", "--out", str(options.out.absolute())]
-    every = [Shard(number, last.count) for number in range(1, last.count + 1)]
-    others = _without_process_options(arguments)
-    jobs = {
-        f"shard {shard}": [*others, *resumed, "--shard", str(shard)] for shard in every
-    }
+    # The rest of the command line is that of each shard. With --resume a job that is
+    # run again continues from its checkpoint.
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--resume", action="store_true")
+    for name in ("--shard", "--launcher", "--shards", "--out"):
+        parser.add_argument(name, nargs="?")
+    others = parser.parse_known_args(arguments)[1]
+    others += ["--resume", "--out", str(options.out.absolute()), "--shard"]
+    every = [f"{number}/{count}" for number in range(1, count + 1)]
+    jobs = {f"shard {shard}": [*others, shard] for shard in every}
     try:
         launch.run_on_ray(_PROGRAM, jobs, options.devices)
     except Interrupted as interrupted:
         interrupted.add_note("continue with the same command and --resume")
         raise
-    results = tables.read(plan, plan.trained(options.out))
-    with run_folder.wait_for_lock(options.out):
-        summary = tables.write(options.out, results)
-    print(*tables.report(plan.points, summary), f"in {options.out}", sep="\n")
-
-
-def _without_process_options(arguments: Sequence[str] | None) -> list[str]:
-    """Return a command line without the options that decide who trains what."""
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--resume", action="store_true")
-    for name in ("--shard", "--launcher", "--shards", "--out"):
-        parser.add_argument(name, nargs="?")
-    return parser.parse_known_args(arguments)[1]
+    tables.finish(options.out, tables.read(plan, plan.trained(options.out)))
 
 
 if __name__ == "__main__":

@@ -455,6 +455,32 @@ def check_out(options: Options) -> None:
         run_folder.check(options.out, options.resume)
 
 
+def make_folder(options: Options) -> pathlib.Path:
+    """Create the run's folder if it is missing, and return it.
+
+    Raises:
+      InputError: if it can't be written.
+    """
+    if options.out is not None:
+        return run_folder.create(options.out)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
+    return run_folder.create_new(name)
+
+
+def begun(options: Options, folder: pathlib.Path) -> StoredRun | None:
+    """Return the run or sweep in a folder, None if none has begun.
+
+    Raises:
+      InputError: if it is not that of the options.
+    """
+    if not run_folder.has_run(folder):
+        return None
+    stored = StoredRun(folder, run_folder.read(folder))
+    refuse_changes(options, stored)
+    return stored
+
+
 @contextlib.contextmanager
 def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
     """Create the run's folder if it is missing, and lock it inside the `with` block.
@@ -467,16 +493,10 @@ def open_folder(options: Options, program: str) -> Iterator[pathlib.Path]:
         continued has other settings, or if the folder can't be written.
       output_file.WriteError: if the folder can no longer be written.
     """
-    stamp = time.strftime("%Y%m%d-%H%M%S")
-    name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
-    out = options.out
-    folder = run_folder.create_new(name) if out is None else run_folder.create(out)
+    folder = make_folder(options)
     with run_folder.lock(folder):
-        if options.resume and run_folder.has_run(folder):
-            # Another process may have written to it since the options were parsed.
-            run = StoredRun(folder, run_folder.read(folder))
-            refuse_changes(options, run)
-        else:
+        # Another process may have written to it since the options were parsed.
+        if not (options.resume and begun(options, folder)):
             run_folder.refuse_used(folder)
         with told_how_to_continue(folder, program):
             yield folder

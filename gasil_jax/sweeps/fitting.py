@@ -1,10 +1,11 @@
 """Train from Python as the command line does: `gasil_jax.fit`."""
 
 import contextlib
+import dataclasses
 import json
 import pathlib
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -107,15 +108,6 @@ def fit(
     """
     checks.check_environment(env)
     numbers = _numbers(seeds)
-    if points is not None:
-        _check_points(points, folder)
-    every = [{}] if points is None else points
-    members = make_members(
-        env,
-        algorithm,
-        [seed for _ in every for seed in numbers],
-        [point for point in every for _ in numbers],
-    )
     for name, value in (
         ("checkpoint_every", checkpoint_every),
         ("evaluate_every", evaluate_every),
@@ -132,7 +124,22 @@ def fit(
     if folder is None and (resume or checkpoint_every is not None):
         name = "resume" if resume else "checkpoint_every"
         raise ValueError(f"{name} is {resume or checkpoint_every}: it needs a folder")
-    schedule = CheckpointSchedule(checkpoint_every, keep=0 if folder is None else 2)
+    if points is not None and folder is not None:
+        raise ValueError(
+            f"folder is {folder}: a folder holds one point, leave out points or folder "
+            "(python -m gasil_jax.sweep keeps several points)"
+        )
+    every = [{}] if points is None else points
+    listed = isinstance(every, list | tuple) and len(every) > 0
+    if not listed or not all(isinstance(point, Mapping) for point in every):
+        allowed = "a list of at least one dict of numbers by name"
+        raise refusal("points", points, allowed)
+    members = make_members(
+        env,
+        algorithm,
+        [seed for _ in every for seed in numbers],
+        [point for point in every for _ in numbers],
+    )
     evaluation_schedule = None
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
@@ -151,23 +158,27 @@ def fit(
                 evaluate_every=evaluate_every,
                 evaluate_episodes=evaluate_episodes if evaluate_every else None,
             )
-            stack.enter_context(_opened(path, record, resume))
+            stack.enter_context(_opened(record, resume))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
             path,
             {"seed": members.seeds},
-            schedule=schedule,
+            schedule=CheckpointSchedule(checkpoint_every, keep=2 if record else 0),
             progress=Progress("fit", algorithm.config.total_steps, shown=False),
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,
-            on_restored=(lambda: None) if record is None else record.write,
+            on_restored=record.write if record else lambda: None,
         )
         tables = run_results.read(path, members.num_members)
         if record is not None:
             run_results.write(
-                path, record.env_name, members=members, outcome=outcome, tables=tables
+                path,
+                record.fields["env"],
+                members=members,
+                outcome=outcome,
+                tables=tables,
             )
         if outcome.unsaved is not None:
             raise outcome.unsaved
@@ -176,20 +187,6 @@ def fit(
             return result
         shape = (len(points), len(numbers))
         return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), result)
-
-
-def _check_points(points: Any, folder: Any) -> None:
-    """Raise `ValueError` if points are not mappings, or are to be kept in a folder."""
-    if folder is not None:
-        raise ValueError(
-            f"folder is {folder}: a folder holds one point, leave out points or folder "
-            "(python -m gasil_jax.sweep keeps several points)"
-        )
-    is_sequence = isinstance(points, list | tuple) and len(points) > 0
-    if not is_sequence or not all(isinstance(x, Mapping) for x in points):
-        raise refusal(
-            "points", points, "a list of at least one dict of numbers by name"
-        )
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:
@@ -212,22 +209,39 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     raise refusal("seeds", seeds, f"a number of seeds, or {each}")
 
 
-class _Record(NamedTuple):
-    """How a folder says what is trained in it.
+@dataclasses.dataclass(frozen=True)
+class _Record:
+    """What a folder says of the training in it.
 
     Attributes:
-      env_name: name of the environment.
-      path: config.json, or fit.json if no command can train the same.
-      now: every field by its own name.
-      read: returns the fields that the file has.
-      write: writes the file.
+      folder: the folder.
+      options: the options with which a command trains the same; None if none can.
+      fields: every field of config.json, or of fit.json without options.
     """
 
-    env_name: str
-    path: pathlib.Path
-    now: Mapping[str, Any]
-    read: Callable[[], Mapping[str, Any]]
-    write: Callable[[], None]
+    folder: pathlib.Path
+    options: run_options.Options | None
+    fields: Mapping[str, Any]
+
+    def write(self) -> None:
+        """Write config.json or fit.json."""
+        if self.options is not None:
+            run_options.write_config(self.options, self.folder)
+        else:
+            metrics_files.write_json(self.folder / run_folder.FIT, self.fields)
+
+    def read(self) -> Mapping[str, Any] | None:
+        """Return the fields that the file has; None if there is none.
+
+        Raises:
+          InputError: if it is damaged.
+        """
+        if self.options is not None:
+            begun = run_folder.has_run(self.folder)
+            return run_folder.read(self.folder) if begun else None
+        with contextlib.suppress(FileNotFoundError):
+            return json_reader.read(self.folder / run_folder.FIT, dict[str, Any])
+        return None
 
 
 def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record:
@@ -241,58 +255,32 @@ def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record
     Raises:
       ValueError: if the expert's data can't be read.
     """
-    env, algorithm = members.env, members.algorithm
+    env, algorithm, seeds = members.env, members.algorithm, list(members.seeds)
     try:
-        options = _options(members, **arguments)
+        made_with = environments.made_with(env)
+        if made_with is None:
+            raise ValueError(
+                "the environment is not one that gasil_jax.make_env returned"
+            )
+        if seeds != list(range(seeds[0], seeds[0] + len(seeds))):
+            raise ValueError("the seeds do not follow one another")
+        stored = metrics_files.to_json(descriptions.describe(algorithm))
+        if descriptions.read(json.loads(stored)) != algorithm:
+            raise ValueError("options can't name the agent or the models of rewards")
+    # A function has no JSON form.
     except (ValueError, TypeError) as error:
-        path = folder / run_folder.FIT
-        env_name = type(getattr(env, "unwrapped", env)).__name__
         described = {
             "why_no_run": str(error),
-            "env": env_name,
-            "seeds": tuple(members.seeds),
+            "env": type(getattr(env, "unwrapped", env)).__name__,
+            "seeds": tuple(seeds),
             **arguments,
             **descriptions.describe(algorithm),
             **run_folder.expert_hash(algorithm),
         }
-        # JSON has no functions.
-        now = {x: "a function" if callable(y) else y for x, y in described.items()}
-        return _Record(
-            env_name,
-            path,
-            now,
-            read=lambda: json_reader.read(path, dict[str, Any]),
-            write=lambda: metrics_files.write_json(path, now),
-        )
-    return _Record(
-        options.env,
-        folder / run_folder.CONFIG,
-        run_folder.flat(run_options.description(options)),
-        read=lambda: run_folder.read(folder),
-        write=lambda: run_options.write_config(options, folder),
-    )
-
-
-def _options(members: Members, **arguments: Any) -> run_options.Options:
-    """Return the options with which a command trains the same.
-
-    Raises:
-      TypeError: if a setting has no JSON form.
-      ValueError: if options can't name the environment, the seeds or a part of the
-        algorithm.
-    """
-    made_with = environments.made_with(members.env)
-    if made_with is None:
-        raise ValueError("the environment is not one that gasil_jax.make_env returned")
-    seeds = list(members.seeds)
-    if seeds != list(range(seeds[0], seeds[0] + len(seeds))):
-        raise ValueError("the seeds do not follow one another")
-    algorithm = members.algorithm
-    stored = metrics_files.to_json(descriptions.describe(algorithm))
-    if descriptions.read(json.loads(stored)) != algorithm:
-        raise ValueError("options can't name the agent or the models of rewards")
+        fields = {x: "a function" if callable(y) else y for x, y in described.items()}
+        return _Record(folder, None, fields)
     name, settings = made_with
-    return run_options.Options(
+    options = run_options.Options(
         env=name,
         settings=settings,
         seeds=len(seeds),
@@ -300,19 +288,20 @@ def _options(members: Members, **arguments: Any) -> run_options.Options:
         **arguments,
         **run_options.algorithm_options(algorithm),
     )
+    return _Record(folder, options, run_folder.flat(run_options.description(options)))
 
 
 @contextlib.contextmanager
-def _opened(folder: pathlib.Path, record: _Record, resume: bool) -> Iterator[None]:
+def _opened(record: _Record, resume: bool) -> Iterator[None]:
     """Create and lock a folder of `fit`, and write its record if training begins.
 
     Raises:
       ValueError: if the folder can't be written, is in use, or holds other files.
     """
-    with contextlib.ExitStack() as stack:
-        run_folder.create(folder, option="folder")
-        stack.enter_context(run_folder.lock(folder, option="folder"))
-        if not record.path.is_file():
+    folder = run_folder.create(record.folder, option="folder")
+    with run_folder.lock(folder, option="folder"):
+        before = record.read()
+        if before is None:
             run_folder.refuse_used(folder, option="folder")
             record.write()
         elif not resume:
@@ -321,13 +310,12 @@ def _opened(folder: pathlib.Path, record: _Record, resume: bool) -> Iterator[Non
                 "another folder"
             )
         else:
-            before = record.read()
-            if changes := run_folder.differences(before, record.now):
+            if changes := run_folder.differences(before, record.fields):
                 raise ValueError(
                     f"resume continues with {folder}, where {'; '.join(changes)}: "
                     "only total_steps may differ, and grow"
                 )
-            run_folder.refuse_other_expert(before, record.now, folder)
+            run_folder.refuse_other_expert(before, record.fields, folder)
         try:
             yield
         except Interrupted as interrupted:

@@ -4,9 +4,8 @@ Each job is a process of its own. If that dies it is run again, and continues fr
 checkpoint.
 """
 
-import contextlib
 import importlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from gasil_jax.errors import InputError
@@ -16,29 +15,6 @@ from gasil_jax.host.interruption import Interrupted, Interruption
 RETRIES = 3
 _SECONDS_BETWEEN_POLLS = 1.0
 _BAD_INPUT = 2
-
-Jobs = Mapping[str, Sequence[str]]
-
-
-def _raise_failures(failed: Mapping[str, str], num_jobs: int) -> None:
-    """Raise an error if jobs have failed.
-
-    Args:
-      failed: why jobs have failed, by the job's name.
-      num_jobs: number of all jobs.
-
-    Raises:
-      ChildProcessError: if jobs have failed.
-      InputError: if all jobs have failed because of bad input.
-    """
-    if failed:
-        jobs = ", ".join(f"{name} ({why})" for name, why in failed.items())
-        if list(failed.values()) == [f"status {_BAD_INPUT}"] * num_jobs:
-            raise InputError(f"{jobs}: bad input, see above")
-        raise ChildProcessError(
-            f"{jobs} failed; the others are done. Continue with the same command and "
-            "--resume"
-        )
 
 
 class _Unfinished(Exception):
@@ -57,34 +33,13 @@ def _run_module(program: str, arguments: Sequence[str]) -> int:
     return status
 
 
-def _ray_package() -> Any:
-    try:
-        import ray
-    except ImportError:
-        raise InputError(
-            "launcher is 'ray': it needs the package ray "
-            '(pip install "gasil_jax[ray]")'
-        ) from None
-    return ray
-
-
-@contextlib.contextmanager
-def _connected(ray: Any) -> Iterator[None]:
-    """Connect to a Ray cluster: RAY_ADDRESS's, else a running one, else a new one."""
-    if ray.is_initialized():
-        yield
-        return
-    ray.init()
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
+def run_on_ray(
+    program: str, jobs: Mapping[str, Sequence[str]], devices: int | None
+) -> None:
     """Run jobs as tasks of a Ray cluster, with a GPU each if it has GPUs, else on CPUs.
 
-    If a task's worker or node dies, the task is run again elsewhere.
+    The cluster is RAY_ADDRESS's, else a running one, else a new one. If a task's worker
+    or node dies, the task is run again elsewhere.
 
     Args:
       program: name of the module to start, which workers must have installed.
@@ -99,47 +54,60 @@ def run_on_ray(program: str, jobs: Jobs, devices: int | None) -> None:
         have failed because of bad input.
       Interrupted: if a signal was received; it was passed on to the running jobs.
     """
-    ray = _ray_package()
-    with _connected(ray):
-        if ray.cluster_resources().get("GPU", 0) >= 1:
-            needs = {"num_cpus": 1, "num_gpus": 1}
-        else:
-            needs = {"num_cpus": devices or 1, "num_gpus": 0}
-            # By default a job would use every core of its node.
-            more = [] if devices else ["--devices", "1"]
-            jobs = {name: [*arguments, *more] for name, arguments in jobs.items()}
-        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-        if not any(node.get("CPU", 0) >= needs["num_cpus"] for node in nodes):
-            raise InputError(
-                f"launcher is 'ray': no node of the cluster has {needs['num_cpus']} "
-                "CPUs, which each job reserves"
-            )
-        # JAX sets up its devices once per process, so each job needs its own. The
-        # process ends with the job, so that the folder is free when the job runs again.
-        task = ray.remote(
-            max_calls=1, max_retries=RETRIES, retry_exceptions=[_Unfinished], **needs
-        )(_run_module)
-        names = {
-            task.options(name=name).remote(program, list(arguments)): name
-            for name, arguments in jobs.items()
-        }
-        _wait(ray, list(names))
-        failed = {}
-        for reference, name in names.items():
-            try:
-                status = ray.get(reference)
-            except ray.exceptions.RayError as error:
-                failed[name] = str(error).strip().splitlines()[-1]
-            else:
-                if status:
-                    failed[name] = f"status {status}"
-    _raise_failures(failed, len(jobs))
+    try:
+        import ray
+    except ImportError:
+        raise InputError(
+            "launcher is 'ray': it needs the package ray "
+            '(pip install "gasil_jax[ray]")'
+        ) from None
+    connected = ray.is_initialized()
+    if not connected:
+        ray.init()
+    try:
+        failed = _failures(ray, program, jobs, devices)
+    finally:
+        if not connected:
+            ray.shutdown()
+    if failed:
+        told = ", ".join(f"{name} ({why})" for name, why in failed.items())
+        if list(failed.values()) == [f"status {_BAD_INPUT}"] * len(jobs):
+            raise InputError(f"{told}: bad input, see above")
+        raise ChildProcessError(
+            f"{told} failed; the others are done. Continue with the same command and "
+            "--resume"
+        )
 
 
-def _wait(ray: Any, references: list[Any]) -> None:
-    """Wait until all tasks are done; pass a signal that is received on to them."""
+def _failures(
+    ray: Any, program: str, jobs: Mapping[str, Sequence[str]], devices: int | None
+) -> dict[str, str]:
+    """Run jobs on a cluster; return why some have failed, by the job's name."""
+    on_gpu = ray.cluster_resources().get("GPU", 0) >= 1
+    cpus = 1 if on_gpu else devices or 1
+    # By default a job would use every core of its node.
+    more = [] if on_gpu or devices else ["--devices", "1"]
+    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+    if not any(node.get("CPU", 0) >= cpus for node in nodes):
+        raise InputError(
+            f"launcher is 'ray': no node of the cluster has {cpus} CPUs, which each "
+            "job reserves"
+        )
+    # JAX sets up its devices once per process, so each job needs its own. The process
+    # ends with the job, so that the folder is free when the job runs again.
+    task = ray.remote(
+        max_calls=1,
+        max_retries=RETRIES,
+        retry_exceptions=[_Unfinished],
+        num_cpus=cpus,
+        num_gpus=int(on_gpu),
+    )(_run_module)
+    names = {
+        task.options(name=name).remote(program, [*arguments, *more]): name
+        for name, arguments in jobs.items()
+    }
     with Interruption() as interruption:
-        pending = references
+        pending = list(names)
         while pending and interruption.signal is None:
             _, pending = ray.wait(
                 pending, num_returns=len(pending), timeout=_SECONDS_BETWEEN_POLLS
@@ -148,5 +116,13 @@ def _wait(ray: Any, references: list[Any]) -> None:
             for reference in pending:
                 # Without force the job receives it as Ctrl-C, and saves.
                 ray.cancel(reference, force=False)
-            ray.wait(references, num_returns=len(references))
+            ray.wait(list(names), num_returns=len(names))
             raise Interrupted(interruption.signal)
+    failed = {}
+    for reference, name in names.items():
+        try:
+            if status := ray.get(reference):
+                failed[name] = f"status {status}"
+        except ray.exceptions.RayError as error:
+            failed[name] = str(error).strip().splitlines()[-1]
+    return failed

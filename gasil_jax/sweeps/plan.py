@@ -1,4 +1,8 @@
-"""The plan of a sweep: every point with every seed is a run."""
+"""The plan of a sweep: every point with every seed is a run.
+
+A run of one setting is a sweep of one point, whose only program has the run's own
+folder.
+"""
 
 import dataclasses
 import functools
@@ -7,12 +11,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError
 from gasil_jax.host import run_folder
 from gasil_jax.host.environments import Settings
-from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.points import Point, check_saved
-from gasil_jax.sweeps.programs import Program, ProgramFolder
+from gasil_jax.sweeps import points, programs
+from gasil_jax.sweeps.points import Point
+from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps.shards import Shard
 
 #: The columns of a sweep's tables that identify its members.
 LABELS = ("point", "seed")
@@ -20,14 +26,16 @@ LABELS = ("point", "seed")
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The points and seeds of a sweep.
+    """The points and seeds of a sweep, or the seeds of a run.
 
     Attributes:
       env: name of the environment.
       settings: settings of the environment.
       algorithm: the algorithm that the points change.
-      points: changed settings, by name. A point that is added later comes last.
+      points: changed settings, by name. A point that is added later comes last. A run
+        has one, without changes.
       seeds: absolute seed numbers.
+      is_run: whether it is a run and no sweep.
     """
 
     env: str
@@ -35,17 +43,38 @@ class Plan:
     algorithm: Algorithm
     points: Sequence[Point]
     seeds: Sequence[int]
+    is_run: bool = False
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
         """The run of each (index of the point, seed)."""
+        every = [self.algorithm.replace(**point) for point in self.points]
         return {
             (index, seed): Run(self.env, changed, seed, self.settings)
-            for index, changed in enumerate(
-                self.algorithm.replace(**point) for point in self.points
-            )
+            for index, changed in enumerate(every)
             for seed in self.seeds
         }
+
+    def part(self, shard: Shard | None) -> list[Run]:
+        """Return the runs of a shard, whatever is trained already; all for None.
+
+        The sizes of shards differ by one run at most, and the runs of a program are
+        divided as little as possible.
+
+        Raises:
+          InputError: if there are more shards than runs.
+        """
+        ordered = [x for each in programs.group(self.runs.values()) for x in each.runs]
+        if shard is None:
+            return ordered
+        total = len(ordered)
+        if shard.count > total:
+            raise InputError(
+                f"shard is {shard}: {total} members (points x seeds) make {total} "
+                "shards at most"
+            )
+        first = (shard.number - 1) * total // shard.count
+        return ordered[first : shard.number * total // shard.count]
 
     @functools.cached_property
     def _members(self) -> Mapping[Run, tuple[int, int]]:
@@ -57,39 +86,35 @@ class Plan:
         members = [self._members[run] for run in program.runs]
         return dict(zip(LABELS, zip(*members, strict=True), strict=True))
 
-    @property
-    def total_steps(self) -> int:
-        """The environment steps of each run."""
-        return self.algorithm.config.total_steps
+    def stored(self, folder: pathlib.Path) -> list[Program]:
+        """Return the programs that have begun in the folder of the sweep or run."""
+        if self.is_run:
+            runs = tuple(self.runs.values())
+            return [Program(runs, folder, {"seed": self.seeds})]
+        return programs.read(programs_of(folder), self.algorithm.config.total_steps)
 
-    def stored(self, folder: pathlib.Path) -> list[ProgramFolder]:
-        """Return the programs that have begun in the sweep's folder."""
-        return programs.read(programs_of(folder), self.total_steps)
-
-    def trained(self, folder: pathlib.Path) -> list[ProgramFolder]:
+    def trained(self, folder: pathlib.Path) -> list[Program]:
         """Return the programs that are trained to their end, of runs of this plan."""
         own = set(self.runs.values())
         return [
             each
             for each in self.stored(folder)
-            if each.training and not own.isdisjoint(each.program.runs)
+            if each.training and each.trains_any(own)
         ]
 
-    def missing(self, trained: Iterable[ProgramFolder]) -> list[tuple[int, int]]:
+    def missing(self, trained: Iterable[Program]) -> list[tuple[int, int]]:
         """Return the (index of the point, seed) of each run that no program has."""
-        done = {run for each in trained for run in each.program.runs}
+        done = {run for each in trained for run in each.runs}
         return [member for member, run in self.runs.items() if run not in done]
 
     def unfinished(
         self, folder: pathlib.Path, requested: Collection[Run]
-    ) -> list[ProgramFolder]:
+    ) -> list[Program]:
         """Return the programs that are still to be trained for the requested runs."""
-        return programs.unfinished(
-            requested,
-            programs_of(folder),
-            labels=self.labels,
-            total_steps=self.total_steps,
-        )
+        begun, others = programs.unfinished(requested, self.stored(folder))
+        parent = programs_of(folder)
+        new = [x.below(parent, self.labels(x)) for x in programs.group(others)]
+        return [*begun, *new]
 
 
 def programs_of(folder: pathlib.Path) -> pathlib.Path:
@@ -98,17 +123,24 @@ def programs_of(folder: pathlib.Path) -> pathlib.Path:
 
 
 def stored_plan(folder: pathlib.Path, description: Mapping[str, Any]) -> Plan:
-    """Return the plan of a stored sweep, from its config.json (`run_folder.read`).
+    """Return the plan of a stored sweep or run.
+
+    Args:
+      folder: its folder.
+      description: its config.json, from `run_folder.read`.
 
     Raises:
       InputError: if its points can't be trained.
     """
-    algorithm, points = description["algorithm"], description["points"]
-    check_saved(points, algorithm, folder / run_folder.CONFIG)
+    algorithm, of_sweep = description["algorithm"], description.get("points", ({},))
+    path = folder / run_folder.CONFIG
+    source = f"{path} is damaged, or another program wrote it: points: "
+    points.check(of_sweep, algorithm, source)
     return Plan(
         description["env"],
         description["settings"],
         algorithm,
-        points,
+        of_sweep,
         run_folder.seeds_of(description),
+        is_run="points" not in description,
     )

@@ -1,11 +1,10 @@
 """Read or draw the points of a sweep. A point holds changed settings, by name."""
 
-import contextlib
 import itertools
 import json
 import math
 import pathlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,8 @@ import numpy as np
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import names, ranges
-from gasil_jax.errors import InputError, did_you_mean
+from gasil_jax.errors import InputError, did_you_mean, refusal
+from gasil_jax.host import run_options
 from gasil_jax.host.command_line import whole_number
 from gasil_jax.imitation import agents_with
 from gasil_jax.rewards import REWARD_MODELS
@@ -31,7 +31,7 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 }
 
 
-def kinds(algorithm: Algorithm) -> Mapping[str, type]:
+def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
     """Return the names that a sweep may vary, with the type of their values."""
     return {
         name: int if allowed.whole else float
@@ -41,106 +41,86 @@ def kinds(algorithm: Algorithm) -> Mapping[str, type]:
     }
 
 
-def parse_grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
-    """Return the values by name from entries NAME=VALUE,VALUE,... for an algorithm.
+def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
+    """Return the values by name from entries NAME=VALUE,VALUE,...
 
     Raises:
-      InputError: if a name is unknown or given twice, or if a value is not a number.
+      InputError: if a name can't vary or is given twice, or if a value is not a number.
     """
-    values, allowed = {}, kinds(algorithm)
+    values: dict[str, tuple[Any, ...]] = {}
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
-        if name not in allowed:
-            raise InputError(f"grid: {_why_not(name, algorithm)}")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
+        kind = _kinds(algorithm).get(name)
+        if kind is None:
+            raise InputError(f"grid: {_why_not(name, algorithm)}")
+        read = float if kind is float else whole_number
         try:
-            read = float if allowed[name] is float else whole_number
-            numbers = [read(value) for value in listed.split(",")]
-            values[name] = tuple(dict.fromkeys(numbers))
+            values[name] = tuple(dict.fromkeys(map(read, listed.split(","))))
         except ValueError:
-            kind, example = (
-                ("numbers", "0.1,0.2")
-                if allowed[name] is float
-                else ("whole numbers", "10,20")
-            )
+            like = "numbers, like {}=0.1,0.2"
+            like = like if kind is float else "whole numbers, like {}=10,20"
             raise InputError(
-                f"grid has {entry!r}: it must be {kind}, like {name}={example}"
+                f"grid has {entry!r}: it must be {like.format(name)}"
             ) from None
     return values
 
 
-def read_points(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
-    """Return the points that a JSON file lists, for an algorithm.
+def _read(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
+    """Return the points that a JSON file lists.
 
     Raises:
       InputError: if the file can't be read or is not a list of points.
     """
+    source = f"points_file is {path}"
     try:
         points = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:
-        raise InputError(
-            f"points_file is {path}, which can't be read: {error}"
-        ) from None
+        raise InputError(f"{source}, which can't be read: {error}") from None
     if not isinstance(points, list) or not points:
-        raise InputError(
-            f"points_file is {path}: it must hold a list of points, one or more"
-        )
+        raise InputError(f"{source}: it must hold a list of points, one or more")
     for point in points:
         if not isinstance(point, dict):
-            raise InputError(f"points_file is {path}: {point!r} is not a point")
-        with _errors_name(f"points_file is {path}"):
-            check_point(point, algorithm)
-    allowed = kinds(algorithm)
-    with _errors_name(f"points_file is {path}"):
-        read = [
-            {name: allowed[name](value) for name, value in point.items()}
-            for point in points
-        ]
-    for index, point in enumerate(read):
-        if point in read[:index]:
-            raise InputError(f"points_file is {path}: it has {point} twice")
-    return read
+            raise InputError(f"{source}: {point!r} is not a point")
+        if points.count(point) > 1:
+            raise InputError(f"{source}: it has {point} twice")
+    check(points, algorithm, f"{source}: ")
+    kinds = _kinds(algorithm)
+    return [{name: kinds[name](x) for name, x in point.items()} for point in points]
 
 
-@contextlib.contextmanager
-def _errors_name(source: str) -> Iterator[None]:
-    """Turn an error in a point into an `InputError` that names the source."""
+def check(points: Sequence[Point], algorithm: Algorithm, source: str = "") -> None:
+    """Check that points change what can vary, to values that are allowed.
+
+    Args:
+      points: the points.
+      algorithm: what they change.
+      source: begins the message.
+
+    Raises:
+      InputError: if one does not; the message names the value and the range.
+    """
+    allowed = _kinds(algorithm)
+    without_effect = run_options.without_effect(algorithm)
     try:
-        yield
-    # A whole number that is too large for a float is an OverflowError.
-    except (ValueError, OverflowError) as error:
-        raise InputError(f"{source}: {error}") from None
-
-
-def check_point(point: Point, algorithm: Algorithm) -> None:
-    """Raise `InputError` if a name can't vary or a value is not of its type."""
-    allowed = kinds(algorithm)
-    for name, value in point.items():
-        if name not in allowed:
-            raise InputError(_why_not(name, algorithm))
-        whole = allowed[name] is int
-        if isinstance(value, bool) or not isinstance(
-            value, int if whole else int | float
-        ):
-            kind = "a whole number" if whole else "a number"
-            raise InputError(f"{name} is {value!r}, not {kind}")
-
-
-def check_saved(
-    points: Sequence[Point], algorithm: Algorithm, path: pathlib.Path
-) -> None:
-    """Raise `InputError` if the points in a config.json do not fit its algorithm."""
-    with _errors_name(f"{path} is damaged, or another program wrote it: points"):
         for point in points:
-            check_point(point, algorithm)
+            for name, value in point.items():
+                if name not in allowed:
+                    raise InputError(_why_not(name, algorithm))
+                if value is None:
+                    raise refusal(name, value, "a number")
+                if name in without_effect:
+                    raise InputError(f"{name} can't vary: {without_effect[name]}")
             algorithms.check(algorithm.replace(**point))
+    except ValueError as error:
+        raise InputError(f"{source}{error}") from None
 
 
 def _why_not(name: str, algorithm: Algorithm) -> str:
     """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
-    allowed = tuple(kinds(algorithm))
+    allowed = tuple(_kinds(algorithm))
     of_models = {x for model in REWARD_MODELS for x in names(model)}
     if name not in algorithm.settings and (name in of_models or agents_with(name)):
         return f"{algorithm.why_not(name)}. What can vary: {', '.join(allowed)}"
@@ -172,36 +152,29 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file can't be combined with grid or random")
-        return read_points(pathlib.Path(points_file), algorithm)
-    values: Mapping[str, tuple[Any, ...]] = parse_grid(grid, algorithm)
+        return _read(pathlib.Path(points_file), algorithm)
+    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
+    if random is None and not values:
+        raise InputError(
+            "grid is empty: it must be NAME=VALUE,..., or use --random or --points-file"
+        )
     if random is None:
-        if not values:
-            raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or "
-                "--points-file"
-            )
-        return [
-            dict(zip(values, point, strict=True))
-            for point in itertools.product(*values.values())
-        ]
-    if random < 1:
-        raise InputError(f"random is {random}: it must be 1 or more")
-    values = values or {
-        name: PAPER_RANGES[name] for name in PAPER_RANGES if name in kinds(algorithm)
-    }
+        points = list(itertools.product(*values.values()))
+        return [dict(zip(values, point, strict=True)) for point in points]
+    kinds = _kinds(algorithm)
+    values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)
     if count >= 2**63:
         raise InputError(f"random is {random}: the grid must have under 2**63 points")
-    if random > count:
+    if not 1 <= random <= count:
         raise InputError(
-            f"random is {random}: it must be at most {count}, the number of points"
+            f"random is {random}: it must be at most {count}, the number of points, "
+            "and at least 1"
         )
     chosen = np.random.default_rng(seed).choice(count, random, replace=False)
+    drawn = zip(*np.unravel_index(chosen, sizes), strict=True)
     return [
-        {
-            name: listed[i]
-            for (name, listed), i in zip(values.items(), indices, strict=True)
-        }
-        for indices in zip(*np.unravel_index(chosen, sizes), strict=True)
+        {name: x[i] for (name, x), i in zip(values.items(), at, strict=True)}
+        for at in drawn
     ]

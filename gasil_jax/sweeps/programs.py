@@ -12,18 +12,27 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import pathlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from typing import Any, NotRequired, TypedDict
+from collections.abc import Set as AbstractSet
+from typing import Any
 
 import numpy as np
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
 from gasil_jax.host import json_reader, metrics_files, run_folder
+from gasil_jax.host.driver import Outcome
+from gasil_jax.host.members import Members
 from gasil_jax.sweeps.runs import Run, read_run
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
+#: Stands for a folder that is not made yet; nothing is stored in it.
+NOWHERE = pathlib.Path(os.devnull)
+
+#: The columns of a table for one run, (rows,) each, by name.
+Columns = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -32,9 +41,14 @@ class Program:
 
     Attributes:
       runs: the runs, its members.
+      path: its folder, which may not exist yet.
+      labels: the columns that identify the runs in its tables, (runs,) each. They are
+        "seed" and others.
     """
 
     runs: tuple[Run, ...]
+    path: pathlib.Path = NOWHERE
+    labels: Mapping[str, Sequence[int]] = dataclasses.field(default_factory=dict)
 
     @property
     def algorithm(self) -> Algorithm:
@@ -51,17 +65,100 @@ class Program:
         """The traced numbers of each run, by name."""
         return tuple(run.algorithm.hyperparameters for run in self.runs)
 
-    @property
-    def env_steps(self) -> int:
-        """The number of environment steps over all runs."""
-        config = self.algorithm.config
-        return config.num_iterations * config.batch_steps * len(self.runs)
-
     @functools.cached_property
     def name(self) -> str:
         """A hash of its runs, the name of its folder."""
         keys = " ".join(run.key for run in self.runs)
         return hashlib.sha256(keys.encode()).hexdigest()[:16]
+
+    def below(
+        self, parent: pathlib.Path, labels: Mapping[str, Sequence[int]]
+    ) -> "Program":
+        """Return the program with its folder below a folder, and with labels."""
+        return dataclasses.replace(self, path=parent / self.name, labels=labels)
+
+    def trains_any(self, runs: AbstractSet[Run]) -> bool:
+        """Return whether some of the runs are its own."""
+        return not runs.isdisjoint(self.runs)
+
+    @contextlib.contextmanager
+    def opened(self) -> Iterator[None]:
+        """Create and lock the folder inside the `with` block, and list its runs.
+
+        Raises:
+          InputError: if another process trains the program, or if the folder can't be
+            written.
+        """
+        with run_folder.lock(run_folder.create(self.path)):
+            if not (self.path / _PROGRAM).exists():
+                runs = self.runs
+                every = list(dict.fromkeys(run.experiment for run in runs))
+                listed = [[every.index(run.experiment), run.seed] for run in runs]
+                content = {
+                    "experiments": list(map(json.loads, every)),
+                    "runs": listed,
+                    "labels": {name: list(x) for name, x in self.labels.items()},
+                }
+                metrics_files.write_json(self.path / _PROGRAM, content)
+            yield
+
+    def finish(self, measured: Mapping[str, Any]) -> None:
+        """Write training.json, which says that the program is trained to its end.
+
+        Args:
+          measured: what `measured` returns.
+        """
+        content = {**self._length, **measured}
+        metrics_files.write_json(self.path / _TRAINING, content)
+
+    @property
+    def _length(self) -> dict[str, int]:
+        iterations = self.algorithm.config.num_iterations
+        return {"iterations": iterations, "members": len(self.runs)}
+
+    @property
+    def training(self) -> dict[str, Any]:
+        """What `finish` wrote; empty if the program is not trained to its end."""
+        try:
+            content = json_reader.read(self.path / _TRAINING, dict[str, Any])
+        except (FileNotFoundError, NotADirectoryError, ValueError):
+            return {}
+        return content if self._length.items() <= content.items() else {}
+
+    def tables(self) -> tuple[list[Columns], list[Columns]]:
+        """Return the metrics and the scores of each run.
+
+        The scores are none without evaluations.
+
+        Raises:
+          InputError: if a table is damaged.
+        """
+        rows = self.algorithm.config.num_iterations
+        metrics = self._table("metrics.csv", metrics_files.SUMMARIZED, rows)
+        if self.training.get("evaluation_seconds") is None:
+            return metrics, []
+        return metrics, self._table("evaluations.csv", ("mean",))
+
+    def _table(
+        self, name: str, required: Sequence[str], rows: int | None = None
+    ) -> list[Columns]:
+        """Return a complete table by run, after checking its columns and `rows`."""
+        path, config = self.path / name, self.algorithm.config
+        count = len(self.runs)
+        try:
+            columns = metrics_files.read_metrics(
+                path, (), count, (*self.labels, *required)
+            )
+        except OSError as error:
+            raise InputError(f"{path} is damaged: {error}") from None
+        for label, values in self.labels.items():
+            if (columns.pop(label) != np.array(values)[:, None]).any():
+                raise InputError(f"{path} is damaged: its rows are not in order")
+        steps = columns["env_steps"][0]
+        whole = steps[-1] == config.num_iterations * config.batch_steps
+        if not whole or rows not in (None, len(steps)):
+            raise InputError(f"{path} is damaged: it lacks iterations")
+        return [{name: x[i] for name, x in columns.items()} for i in range(count)]
 
 
 def group(
@@ -87,131 +184,20 @@ def group(
     return parts
 
 
-class _Training(TypedDict):
-    """The content of training.json."""
-
-    iterations: int
-    members: int
-    env_steps: int
-    compile_seconds: float
-    train_seconds: float
-    evaluation_seconds: NotRequired[float | None]
-    device: str
-    device_count: int
-    versions: dict[str, str | None]
-
-
-class _Listed(TypedDict):
-    """The content of program.json: the runs as (index of the experiment, seed)."""
-
-    experiments: tuple[Any, ...]
-    runs: tuple[tuple[int, int], ...]
-    labels: dict[str, tuple[int, ...]]
+def measured(members: Members, outcome: Outcome) -> dict[str, Any]:
+    """Return what is stored of how this process trained: speed, device, versions."""
+    return {
+        "env_steps": outcome.new_steps,
+        "compile_seconds": outcome.compile_seconds,
+        "train_seconds": outcome.train_seconds,
+        "evaluation_seconds": outcome.evaluation_seconds,
+        "device": members.device_kind,
+        "device_count": len(members.devices),
+        "versions": metrics_files.versions(),
+    }
 
 
-@dataclasses.dataclass(frozen=True)
-class ProgramFolder:
-    """A program and its folder, which may not exist yet.
-
-    Attributes:
-      program: the program.
-      path: the folder.
-      labels: the columns that identify the runs in its tables, (runs,) each. They are
-        "seed" and others.
-    """
-
-    program: Program
-    path: pathlib.Path
-    labels: Mapping[str, Sequence[int]]
-
-    @contextlib.contextmanager
-    def opened(self) -> Iterator[None]:
-        """Create and lock the folder inside the `with` block, and list its runs.
-
-        Raises:
-          InputError: if another process trains the program, or if the folder can't be
-            written.
-        """
-        with run_folder.lock(run_folder.create(self.path)):
-            if not (self.path / _PROGRAM).exists():
-                runs = self.program.runs
-                every = list(dict.fromkeys(run.experiment for run in runs))
-                listed = [[every.index(run.experiment), run.seed] for run in runs]
-                content = {
-                    "experiments": list(map(json.loads, every)),
-                    "runs": listed,
-                    "labels": {name: list(x) for name, x in self.labels.items()},
-                }
-                metrics_files.write_json(self.path / _PROGRAM, content)
-            yield
-
-    def finish(self, **measured: Any) -> None:
-        """Write training.json, which says that the program is trained to its end.
-
-        Args:
-          **measured: "env_steps" (over all members), "compile_seconds", "train_seconds"
-            and "evaluation_seconds" (None without evaluations), all measured in the
-            process that finished the program; "device" and "device_count".
-        """
-        content = {
-            "iterations": self.program.algorithm.config.num_iterations,
-            "members": len(self.program.runs),
-            **measured,
-            "versions": metrics_files.versions(),
-        }
-        metrics_files.write_json(self.path / _TRAINING, content)
-
-    @property
-    def training(self) -> dict[str, Any]:
-        """What `finish` wrote; empty if the program is not trained to its end."""
-        try:
-            content = json_reader.read(self.path / _TRAINING, _Training)
-        except (FileNotFoundError, NotADirectoryError, ValueError):
-            return {}
-        ended = content["iterations"] == self.program.algorithm.config.num_iterations
-        same = content["members"] == len(self.program.runs)
-        return content if ended and same else {}
-
-    def tables(self) -> tuple[list[dict[str, np.ndarray]], list[dict[str, np.ndarray]]]:
-        """Return the metrics and the scores of each run, (rows,) each column.
-
-        The scores are none without evaluations.
-
-        Raises:
-          InputError: if a table is damaged.
-        """
-        config = self.program.algorithm.config
-        required, rows = metrics_files.SUMMARIZED, config.num_iterations
-        metrics = self._table("metrics.csv", required, rows)
-        if self.training.get("evaluation_seconds") is None:
-            return metrics, []
-        return metrics, self._table("evaluations.csv", ("mean",))
-
-    def _table(
-        self, name: str, required: Sequence[str], rows: int | None = None
-    ) -> list[dict[str, np.ndarray]]:
-        """Return a complete table by run, after checking its columns and `rows`."""
-        path, config = self.path / name, self.program.algorithm.config
-        try:
-            columns = metrics_files.read_metrics(
-                path, (), len(self.program.runs), (*self.labels, *required)
-            )
-        except OSError as error:
-            raise InputError(f"{path} is damaged: {error}") from None
-        for label, values in self.labels.items():
-            if (columns.pop(label) != np.array(values)[:, None]).any():
-                raise InputError(f"{path} is damaged: its rows are not in order")
-        steps = columns["env_steps"][0]
-        whole = steps[-1] == config.num_iterations * config.batch_steps
-        if not whole or rows not in (None, len(steps)):
-            raise InputError(f"{path} is damaged: it lacks iterations")
-        return [
-            {column: x[position] for column, x in columns.items()}
-            for position in range(len(self.program.runs))
-        ]
-
-
-def read(parent: pathlib.Path, total_steps: int | None = None) -> list[ProgramFolder]:
+def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
     """Return the programs that have begun in the folders of a folder.
 
     Args:
@@ -226,51 +212,32 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[ProgramFo
     return [_read(path, total_steps) for path in paths]
 
 
-def _read(path: pathlib.Path, total_steps: int | None) -> ProgramFolder:
-    listed = json_reader.read(path, _Listed)
+def _read(path: pathlib.Path, total_steps: int | None) -> Program:
+    listed = json_reader.read(path, dict[str, Any])
     try:
-        experiments = listed["experiments"]
+        experiments, labels = listed["experiments"], dict(listed["labels"])
         every = [read_run(experiments[index], seed) for index, seed in listed["runs"]]
-        if total_steps is not None:
-            every = [run.with_total_steps(total_steps) for run in every]
     except NotImportable:
         raise
     except (ValueError, KeyError, IndexError, TypeError) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-    return ProgramFolder(Program(tuple(every)), path.parent, listed["labels"])
+    if total_steps is not None:
+        every = [run.with_total_steps(total_steps) for run in every]
+    return Program(tuple(every), path.parent, labels)
 
 
 def unfinished(
-    requested: Collection[Run],
-    parent: pathlib.Path,
-    *,
-    labels: Callable[[Program], Mapping[str, Sequence[int]]],
-    total_steps: int | None = None,
-    most: int | None = None,
-    apart: Callable[[Run], Any] = lambda run: None,
-) -> list[ProgramFolder]:
-    """Return the programs that are still to be trained, those that have begun first.
+    requested: Collection[Run], stored: Sequence[Program]
+) -> tuple[list[Program], list[Run]]:
+    """Return the programs to continue for requested runs, and the runs that none has.
 
     A program that has begun trains all of its runs, also those that are not requested.
 
     Args:
       requested: the runs.
-      parent: the folder with the folders of programs.
-      labels: returns the labels of a new program, see `ProgramFolder`.
-      total_steps: see `read`.
-      most: see `group`.
-      apart: see `group`.
-
-    Raises:
-      InputError: if a program.json is damaged.
+      stored: the programs that have begun, which may be trained already.
     """
-    stored = read(parent, total_steps)
-    in_training = [each for each in stored if not each.training]
-    begun_or_trained = {run for each in stored for run in each.program.runs}
-    others = (run for run in requested if run not in begun_or_trained)
-    new = group(others, most, apart)
+    begun_or_trained = {run for each in stored for run in each.runs}
     asked = set(requested)
-    return [
-        *(each for each in in_training if not asked.isdisjoint(each.program.runs)),
-        *(ProgramFolder(x, parent / x.name, labels(x)) for x in new),
-    ]
+    begun = [x for x in stored if not x.training and x.trains_any(asked)]
+    return begun, [run for run in requested if run not in begun_or_trained]

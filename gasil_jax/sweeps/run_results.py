@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, NotRequired, TypedDict
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
+from gasil_jax.sweeps import programs
 
 
 class Tables(NamedTuple):
@@ -71,60 +72,29 @@ def write(
             title=f"{env_name}, {agent}",
             evaluations=evaluations or None,
         )
-    faulty = np.nansum(metrics["faulty_steps"], axis=1)
-    skipped = np.nansum(metrics["skipped_updates"], axis=1)
-
-    def by_seed(values: Any, kind: Any) -> Any:
-        return {
-            str(seed): kind(value)
-            for seed, value in zip(seeds, values, strict=True)
-            if np.isfinite(value)
-        }
-
-    trained = {
-        "compile_seconds": outcome.compile_seconds,
-        "train_seconds": outcome.train_seconds,
-        "env_steps_per_second": steps_per_second(
-            outcome.new_steps, outcome.train_seconds
-        ),
-        "device": members.device_kind,
-        "device_count": len(members.devices),
-        "versions": metrics_files.versions(),
+    finals = {
+        "final_return": final,
+        "final_length": metrics_files.final_returns(metrics["episode_length"]),
     }
-    lengths = metrics_files.final_returns(metrics["episode_length"])
-    finals = {"final_return": final, "final_length": lengths}
     if evaluations:
         finals["final_evaluation"] = evaluations["mean"][:, -1]
-    if outcome.evaluation_seconds is not None:
-        trained["evaluation_seconds"] = outcome.evaluation_seconds
-    if not outcome.new_steps:
-        trained = _recorded(folder / "summary.json", trained)
+    faults = {
+        name: np.nansum(metrics[name], axis=1).astype(int)
+        for name in ("faulty_steps", "skipped_updates")
+    }
     summary = {
         "env": env_name,
         "agent": agent,
         "env_steps_per_seed": int(steps[-1]),
         **_by_seed_and_over_seeds(seeds, finals),
-        "faulty_steps": by_seed(faulty, int),
-        "skipped_updates": by_seed(skipped, int),
+        **{name: dict(zip(map(str, seeds), x.tolist())) for name, x in faults.items()},
         "unhealthy_seeds": [
-            seed for seed, bad in zip(seeds, (faulty > 0) | (skipped > 0)) if bad
+            seed for seed, *bad in zip(seeds, *faults.values(), strict=True) if any(bad)
         ],
-        **trained,
+        **_trained(folder / "summary.json", programs.measured(members, outcome)),
     }
     metrics_files.write_json(folder / "summary.json", summary)
     return summary
-
-
-def steps_per_second(steps: float, seconds: float) -> float | None:
-    """Return the speed of training; None if it took no step."""
-    return steps / (seconds or 1) or None
-
-
-def speed_in_words(summary: Mapping[str, Any]) -> str:
-    """Return what a command prints of the devices, and of the speed if it is known."""
-    speed = summary["env_steps_per_second"]
-    steps = "" if speed is None else f"{speed:,.0f} steps/s "
-    return f"{steps}on {summary['device']}"
 
 
 def _by_seed_and_over_seeds(
@@ -134,10 +104,10 @@ def _by_seed_and_over_seeds(
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
         finite = np.isfinite(values)
-        fields[name] = {
-            str(seed): float(value) if is_finite else None
-            for seed, value, is_finite in zip(seeds, values, finite, strict=True)
-        }
+        known = [
+            x if is_finite else None for x, is_finite in zip(values.tolist(), finite)
+        ]
+        fields[name] = dict(zip(map(str, seeds), known, strict=True))
         mean = float(values[finite].mean()) if finite.any() else None
         estimate = statistics.estimate(values)
         fields[f"{name}_mean"] = mean
@@ -146,22 +116,52 @@ def _by_seed_and_over_seeds(
     return fields
 
 
-class _Trained(TypedDict):
-    """What summary.json says of the training."""
-
-    compile_seconds: float
-    train_seconds: float
-    env_steps_per_second: float | None
-    device: str
-    device_count: int
-    versions: dict[str, str | None]
-    evaluation_seconds: NotRequired[float]
-
-
-def _recorded(path: pathlib.Path, trained: dict[str, Any]) -> dict[str, Any]:
-    """Return the same fields from the existing summary, or else as they are given."""
+def _trained(path: pathlib.Path, measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what summary.json says of the training: as before if it took no step."""
+    trained = {**speed([measured]), "versions": measured["versions"]}
+    if measured["env_steps"]:
+        return trained
     try:
-        before = json_reader.read(path, _Trained)
+        before = json_reader.read(path, dict[str, Any])
         return {name: before[name] for name in trained}
     except (OSError, ValueError, KeyError):
         return trained
+
+
+def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the seconds, steps/s and devices of programs trained one after the other.
+
+    For shards, which run in parallel, "env_steps_per_second" is the average speed of
+    one shard; None if no step was taken. "evaluation_seconds" is included if policies
+    were evaluated.
+
+    Args:
+      trainings: what `programs.measured` says of each program.
+    """
+    seconds = [f"{x}_seconds" for x in ("compile", "train", "evaluation")]
+    if any(x.get("evaluation_seconds") is None for x in trainings):
+        del seconds[-1]
+    total = {name: sum(x[name] for x in trainings) for name in seconds}
+    steps = sum(x["env_steps"] for x in trainings)
+    return {
+        **total,
+        "env_steps_per_second": steps / (total["train_seconds"] or 1) or None,
+        **joined([{"device": x["device"]} for x in trainings]),
+        "device_count": max(x["device_count"] for x in trainings),
+    }
+
+
+def joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the common value of each field, or one string of all different values."""
+    every = {name: {record.get(name) for record in records} for name in records[0]}
+    return {
+        name: values.pop() if len(values) == 1 else ", ".join(sorted(map(str, values)))
+        for name, values in every.items()
+    }
+
+
+def speed_in_words(summary: Mapping[str, Any]) -> str:
+    """Return what a command prints of the devices, and of the speed if it is known."""
+    speed = summary["env_steps_per_second"]
+    steps = "" if speed is None else f"{speed:,.0f} steps/s "
+    return f"{steps}on {summary['device']}"

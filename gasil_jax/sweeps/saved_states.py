@@ -27,9 +27,8 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.members import member
 from gasil_jax.imitation.adversarial import AdversarialAgent
-from gasil_jax.sweeps.plan import Plan, stored_plan
+from gasil_jax.sweeps.plan import stored_plan
 from gasil_jax.sweeps.programs import Program
-from gasil_jax.sweeps.runs import Run
 
 
 class _Summary(TypedDict):
@@ -38,24 +37,10 @@ class _Summary(TypedDict):
     best_by_mean: int | None
 
 
-class Saved(NamedTuple):
-    """Members of a program that are saved in a folder of checkpoints.
-
-    Attributes:
-      root: folder of the checkpoints.
-      program: the program whose members they hold.
-      indices: indices of the requested members in the program.
-    """
-
-    root: pathlib.Path
-    program: Program
-    indices: Sequence[int]
-
-
 def find(
     folder: pathlib.Path, description: Mapping[str, Any], point: int | None
-) -> list[Saved]:
-    """Return where the states of a run, or of a sweep's point, are saved.
+) -> list[tuple[Program, Sequence[int]]]:
+    """Return the programs of a run, or of a sweep's point, with its members in each.
 
     Args:
       folder: folder of the run or sweep.
@@ -65,34 +50,11 @@ def find(
     Raises:
       InputError: if the folder has no such point.
     """
-    if "points" in description:
-        plan = stored_plan(folder, description)
-        point = _checked_point(folder, plan, point)
-        requested = {plan.runs[point, seed] for seed in plan.seeds}
-        saved = [
-            Saved(each.path / "checkpoints", each.program, indices)
-            for each in plan.stored(folder)
-            if (
-                indices := [
-                    i for i, run in enumerate(each.program.runs) if run in requested
-                ]
-            )
-        ]
-        if not saved:
-            raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
-        return saved
-    if point is not None:
-        raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    seeds = run_folder.seeds_of(description)
-    env, settings = description["env"], description["settings"]
-    runs = tuple(Run(env, description["algorithm"], x, settings) for x in seeds)
-    return [Saved(folder / "checkpoints", Program(runs), range(len(runs)))]
-
-
-def _checked_point(folder: pathlib.Path, plan: Plan, point: int | None) -> int:
-    """Return the requested point, or the best by mean for None."""
+    plan = stored_plan(folder, description)
     last = len(plan.points) - 1
-    if point is None:
+    if plan.is_run and point is not None:
+        raise InputError(f"point is {point}: {folder} is a run, which has no points")
+    if point is None and not plan.is_run:
         with contextlib.suppress(FileNotFoundError):
             point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
         if point is None:
@@ -100,9 +62,17 @@ def _checked_point(folder: pathlib.Path, plan: Plan, point: int | None) -> int:
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"
             )
+    point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
-    return point
+    requested = {plan.runs[point, seed] for seed in plan.seeds}
+    saved = [
+        (each, [i for i, run in enumerate(each.runs) if run in requested])
+        for each in plan.stored(folder)
+    ]
+    if not any(indices for _, indices in saved):
+        raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
+    return [(each, indices) for each, indices in saved if indices]
 
 
 def load(
@@ -136,54 +106,47 @@ def load(
     settings = dataclasses.asdict(description["settings"])
     with command_line.input_checked():
         env = environments.make_env(description["env"], **settings)
-    states: dict[int, Any] = {}
-    for saved in every:
-        states |= _load(folder, saved, which, env=env)
+    states: dict[int, train.TrainState] = {}
+    for program, indices in every:
+        count, algorithm = len(program.runs), program.algorithm
+        if which == "best" and len(indices) < count:
+            raise InputError(
+                "checkpoint is 'best': this point was trained with others, and "
+                "checkpoints are scored over all of them: it must be 'last'"
+            )
+        chosen = _checkpoint(folder, program.path / "checkpoints", which)
+
+        # The leaves of all members have the same shapes.
+        def init(seed: Any, algorithm: Algorithm = algorithm) -> Any:
+            return train.first_state(env, algorithm, jax.random.key(seed))
+
+        with command_line.input_checked():
+            like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
+            restored = chosen.restore(like)
+        states |= {program.seeds[i]: member(restored, i) for i in indices}
     seeds = sorted(states)
     if seed is not None:
         if seed not in seeds:
             raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
         seeds = [seed]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(states[x] for x in seeds))
-    first = every[0]
-    algorithm = first.program.runs[first.indices[0]].algorithm
-    return env, algorithm, seeds, stacked
+    first, (index, *_) = every[0]
+    return env, first.runs[index].algorithm, seeds, stacked
 
 
-def _load(
-    folder: pathlib.Path, saved: Saved, which: str, *, env: Any
-) -> dict[int, train.TrainState]:
-    """Return the states that a folder of checkpoints holds of a run, by seed.
-
-    Args:
-      folder: folder of the run or sweep, for messages.
-      saved: the folder of checkpoints, and the members.
-      which: see `load`.
-      env: the environment.
-    """
-    chosen, errors = checkpoint.latest(saved.root)
+def _checkpoint(
+    folder: pathlib.Path, root: pathlib.Path, which: str
+) -> checkpoint.Checkpoint:
+    """Return the last or the best checkpoint in the folder of a run's checkpoints."""
+    chosen, errors = checkpoint.latest(root)
     for error in errors:
         print(f"warning: {error}", file=sys.stderr)
-    algorithm, count = saved.program.algorithm, len(saved.program.runs)
     if which == "best":
-        if len(saved.indices) < count:
-            raise InputError(
-                "checkpoint is 'best': this point was trained with others, and "
-                "checkpoints are scored over all of them: it must be 'last'"
-            )
-        chosen = checkpoint.best(saved.root)
+        chosen = checkpoint.best(root)
     if chosen is None:
         scored = " with a score" if which == "best" else ""
         raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    with command_line.input_checked():
-        # The leaves of all members have the same shapes.
-        def init(seed: Any) -> Any:
-            return train.first_state(env, algorithm, jax.random.key(seed))
-
-        like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-        states = chosen.restore(like)
-    seeds = saved.program.seeds
-    return {seeds[i]: member(states, i) for i in saved.indices}
+    return chosen
 
 
 class Policies(NamedTuple):

@@ -4,22 +4,26 @@ import csv
 import dataclasses
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
-from gasil_jax.host import command_line, metrics_files, output_file, policy_file
+from gasil_jax.host import (
+    command_line,
+    metrics_files,
+    output_file,
+    policy_file,
+    run_folder,
+)
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
 from gasil_jax.sweeps import run_results, saved_states
 from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
-from gasil_jax.sweeps.programs import ProgramFolder
+from gasil_jax.sweeps.programs import Columns, Program
 from gasil_jax.sweeps.runs import Run
-
-_Columns = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,7 +32,7 @@ class Results:
 
     Attributes:
       plan: the points and seeds.
-      trainings: what `ProgramFolder.training` says of each program.
+      trainings: what `Program.training` says of each program.
       curves: every metric and score by its name in curves.npz, (points, seeds,
         iterations or evaluations) each.
       finals: the last columns of results.csv by their names, (points, seeds) each; NaN
@@ -66,7 +70,7 @@ class Results:
         return {name: listed for name, listed in values.items() if len(set(listed)) > 1}
 
 
-def read(plan: Plan, trained: Sequence[ProgramFolder]) -> Results:
+def read(plan: Plan, trained: Sequence[Program]) -> Results:
     """Return the results of a sweep that is trained to its end.
 
     Args:
@@ -84,10 +88,10 @@ def read(plan: Plan, trained: Sequence[ProgramFolder]) -> Results:
             f"{point} and seed {seed}: train them with python -m gasil_jax.sweep "
             "--resume"
         )
-    metrics: dict[Run, _Columns] = {}
-    scores: dict[Run, _Columns] = {}
+    metrics: dict[Run, Columns] = {}
+    scores: dict[Run, Columns] = {}
     for each in trained:
-        runs = each.program.runs
+        runs = each.runs
         own_metrics, own_scores = each.tables()
         for run, columns in zip(runs, own_metrics, strict=True):
             if not _equal(metrics.setdefault(run, columns), columns):
@@ -96,38 +100,66 @@ def read(plan: Plan, trained: Sequence[ProgramFolder]) -> Results:
                     f"{run.seed} of {run.experiment}"
                 )
         scores |= dict(zip(runs, own_scores))
-    curves = _curves(plan, metrics)
 
-    def of_point(name: str, i: int) -> np.ndarray:
-        return np.stack([metrics[plan.runs[i, seed]][name] for seed in plan.seeds])
+    def by_point(value_of: Callable[[Run], float]) -> np.ndarray:
+        values = np.array([value_of(run) for run in plan.runs.values()])
+        return values.reshape(-1, len(plan.seeds))
 
-    def finals_of(name: str) -> np.ndarray:
-        return np.array(
-            [
-                metrics_files.final_returns(of_point(name, i))
-                for i in range(len(plan.points))
-            ]
+    def final(name: str) -> np.ndarray:
+        return by_point(
+            lambda x: metrics_files.final_returns(metrics[x][name][None])[0]
         )
 
+    curves = _curves(plan, metrics)
     finals = {
-        "final_return": finals_of("episode_return"),
-        "final_length": finals_of("episode_length"),
+        "final_return": final("episode_return"),
+        "final_length": final("episode_length"),
     }
     if scores:
         of_scores = _curves(plan, scores)
         curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
-        last = np.array([scores[run]["mean"][-1] for run in plan.runs.values()])
-        finals["final_evaluation"] = last.reshape(finals["final_return"].shape)
+        finals["final_evaluation"] = by_point(lambda run: scores[run]["mean"][-1])
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
-    trainings = {each.program.name: each.training for each in trained}
+    trainings = {each.name: each.training for each in trained}
     return Results(plan, list(trainings.values()), curves, finals, diverged)
 
 
-def _equal(first: _Columns, second: _Columns) -> bool:
+def _equal(first: Columns, second: Columns) -> bool:
     return first.keys() == second.keys() and all(
         np.array_equal(first[name], second[name], equal_nan=True) for name in first
     )
+
+
+def _curves(plan: Plan, tables: Mapping[Run, Columns]) -> Columns:
+    """Return every metric, (points, seeds, iterations); NaN after a run's last.
+
+    Raises:
+      InputError: if runs have other metrics than the first one.
+    """
+    every = {member: tables[run] for member, run in plan.runs.items()}
+    (first, columns), *_ = every.items()
+    for (point, seed), metrics in every.items():
+        if differing := ", ".join(sorted(columns.keys() ^ metrics.keys())):
+            raise InputError(
+                f"point {point}, seed {seed} was trained with other metrics than point "
+                f"{first[0]}, seed {first[1]}: {differing}"
+            )
+    # Points may differ in batch_steps, and so in iterations.
+    length = max(len(metrics["env_steps"]) for metrics in every.values())
+    curves = {name: np.full((len(every), length), np.nan) for name in columns}
+    for index, metrics in enumerate(every.values()):
+        for name, values in metrics.items():
+            curves[name][index, : len(values)] = values
+    shape = (-1, len(plan.seeds), length)
+    return {name: values.reshape(shape) for name, values in curves.items()}
+
+
+def finish(folder: pathlib.Path, results: Results) -> None:
+    """Write the tables of a sweep that is trained, and print what they tell."""
+    with run_folder.wait_for_lock(folder):
+        summary = write(folder, results)
+    print(*report(results.plan.points, summary), f"in {folder}", sep="\n")
 
 
 def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
@@ -135,7 +167,7 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
 
     hyperparameters.png is written only if a hyperparameter varies among the points that
     have a final return, and policy.npz, with the policies of the best point by mean,
-    only if there is one.
+    only if there is one whose checkpoints are there.
 
     Args:
       folder: folder to write to.
@@ -146,27 +178,28 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
         np.savez_compressed(partial, **results.curves)
     summary = _summary(results)
     metrics_files.write_json(folder / "summary.json", summary)
-    best = summary["best_by_mean"]
+    best, points = summary["best_by_mean"], results.plan.points
+    final, ended = results.finals["final_return"], results.ended
     with output_file.atomic(folder / "sweep.png") as partial:
-        final = results.finals["final_return"]
-        plotting.final_returns(partial, _labels(results.plan.points), final, best=best)
+        plotting.final_returns(partial, _labels(points), final, best=best)
     if results.varied:
         with output_file.atomic(folder / "hyperparameters.png") as partial:
-            _draw_hyperparameters(partial, results, summary)
+            plotting.marginals(
+                partial,
+                results.varied,
+                results.mean[ended],
+                importance=summary["importance"],
+                best=None if best is None else ended.index(best),
+                left_out=len(points) - len(ended),
+            )
     if best is not None:
-        _write_policies(folder, results, best)
+        try:
+            env, _, seeds, states = saved_states.load(folder, point=best)
+        except InputError as error:
+            command_line.note(f"policy.npz is not written: {error}")
+        else:
+            policy_file.save(folder / "policy.npz", states, env, seeds, final[best])
     return summary
-
-
-def _write_policies(folder: pathlib.Path, results: Results, point: int) -> None:
-    """Write policy.npz with the policies of a point, if its checkpoints are there."""
-    try:
-        env, _, seeds, states = saved_states.load(folder, point=point)
-    except InputError as error:
-        command_line.note(f"policy.npz is not written: {error}")
-    else:
-        final = results.finals["final_return"][point]
-        policy_file.save(folder / "policy.npz", states, env, seeds, final)
 
 
 def _write_results(path: pathlib.Path, results: Results) -> None:
@@ -193,7 +226,8 @@ def _summary(results: Results) -> dict[str, Any]:
     mean, diverged = results.mean, results.diverged
     others = dict(results.finals)
     final = others.pop("final_return")
-    sound = np.flatnonzero(~diverged.any(axis=1) & np.isfinite(final).all(axis=1))
+    ended = np.isfinite(final).all(axis=1)
+    sound = np.flatnonzero(~diverged.any(axis=1) & ended)
 
     def best(scores: np.ndarray) -> int | None:
         return int(sound[scores[sound].argmax()]) if sound.size else None
@@ -207,7 +241,8 @@ def _summary(results: Results) -> dict[str, Any]:
             {
                 **point,
                 "mean": _finite(mean[i]),
-                **_estimate(final[i])._asdict(),
+                # Nothing is told where a final return is unknown.
+                **estimate(final[i] if ended[i] else final[i][:0])._asdict(),
                 "worst_seed": _finite(final[i].min()),
                 **{name: _finite(values[i].mean()) for name, values in others.items()},
                 "diverged_seeds": int(diverged[i].sum()),
@@ -217,89 +252,9 @@ def _summary(results: Results) -> dict[str, Any]:
         "best_by_mean": best(mean),
         "best_by_worst_seed": best(final.min(axis=1)),
         "importance": shares,
-        **speed(results.trainings),
-        "versions": _joined([x["versions"] for x in results.trainings]),
+        **run_results.speed(results.trainings),
+        "versions": run_results.joined([x["versions"] for x in results.trainings]),
     }
-
-
-def _draw_hyperparameters(
-    path: pathlib.Path, results: Results, summary: Mapping[str, Any]
-) -> None:
-    """Draw the mean final returns over each hyperparameter that varies."""
-    ended, best = results.ended, summary["best_by_mean"]
-    plotting.marginals(
-        path,
-        results.varied,
-        results.mean[ended],
-        importance=summary["importance"],
-        best=None if best is None else ended.index(best),
-        left_out=len(results.plan.points) - len(ended),
-    )
-
-
-def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the seconds, steps/s and devices of programs trained one after the other.
-
-    "evaluation_seconds" is included if policies were evaluated. For shards, which run
-    in parallel, "env_steps_per_second" is the average speed of one shard.
-    """
-
-    def total(name: str) -> float:
-        return sum(training[name] for training in trainings)
-
-    devices = _joined([{"device": training["device"]} for training in trainings])
-    evaluated = all(x.get("evaluation_seconds") is not None for x in trainings)
-    return {
-        "compile_seconds": total("compile_seconds"),
-        "train_seconds": total("train_seconds"),
-        "env_steps_per_second": run_results.steps_per_second(
-            total("env_steps"), total("train_seconds")
-        ),
-        **({"evaluation_seconds": total("evaluation_seconds")} if evaluated else {}),
-        **devices,
-        "device_count": max(training["device_count"] for training in trainings),
-    }
-
-
-def _joined(records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the common value of each field, or one string of all different values."""
-    every = {name: {record.get(name) for record in records} for name in records[0]}
-    return {
-        name: values.pop() if len(values) == 1 else ", ".join(sorted(map(str, values)))
-        for name, values in every.items()
-    }
-
-
-def _curves(plan: Plan, tables: Mapping[Run, _Columns]) -> dict[str, Any]:
-    """Return every metric, (points, seeds, iterations); NaN after a run's last.
-
-    Raises:
-      InputError: if runs have other metrics than the first one.
-    """
-    every = {member: tables[run] for member, run in plan.runs.items()}
-    (first, columns), *_ = every.items()
-    for (point, seed), metrics in every.items():
-        if differing := ", ".join(sorted(columns.keys() ^ metrics.keys())):
-            raise InputError(
-                f"point {point}, seed {seed} was trained with other metrics than point "
-                f"{first[0]}, seed {first[1]}: {differing}"
-            )
-    # Points may differ in batch_steps, and so in iterations.
-    length = max(len(metrics["env_steps"]) for metrics in every.values())
-
-    def pad(x: np.ndarray) -> np.ndarray:
-        return np.concatenate([x, np.full(length - len(x), np.nan)])
-
-    shape = (len(plan.points), len(plan.seeds), length)
-    return {
-        name: np.array([pad(x[name]) for x in every.values()]).reshape(shape)
-        for name in columns
-    }
-
-
-def _estimate(final: np.ndarray) -> Estimate:
-    """Return what a point's final returns tell; nothing if one is unknown."""
-    return estimate(final if np.isfinite(final).all() else final[:0])
 
 
 def _finite(value: float) -> float | None:

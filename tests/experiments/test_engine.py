@@ -61,7 +61,7 @@ def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
         dataclasses.replace(run(), env="hopper"),
     ]
     folders = engine.unfinished([*RUNS, *other], Setup())
-    assert sorted(len(x.program.runs) for x in folders) == [1, 1, 1, 1, 3]
+    assert sorted(len(x.runs) for x in folders) == [1, 1, 1, 1, 3]
     assert len({x.path for x in folders}) == 5
     # The order in which runs are missing does not change a program.
     assert engine.unfinished(RUNS[::-1], Setup(devices=1))[0] in folders
@@ -174,7 +174,7 @@ def test_training_is_continued_when_other_runs_are_missing(
     with pytest.raises(InputError, match=f"in {program.path.name}: continue it"):
         engine.train_missing(missing, Store(tmp_path), setup)
     engine.train_missing(missing, Store(tmp_path), resumed)
-    assert [set(x.program.runs) for x in requested] == [set(RUNS), {another}]
+    assert [set(x.runs) for x in requested] == [set(RUNS), {another}]
     assert requested[0].path.name == program.path.name
     # With other physics it is other training.
     other = dataclasses.replace(setup, physics="mujoco")
@@ -347,7 +347,7 @@ def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
 
 def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
     runs = [run(seed) for seed in range(5)] + [run(seed) for seed in (1000, 1001)]
-    every = [x.program for x in engine.unfinished(runs, Setup(members=2))]
+    every = engine.unfinished(runs, Setup(members=2))
     assert sorted(len(program.runs) for program in every) == [1, 2, 2, 2]
     assert {x for program in every for x in program.runs} == set(runs)
     for program in every:

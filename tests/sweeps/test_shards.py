@@ -18,7 +18,7 @@ from gasil_jax.host.environments import Settings
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.sweeps import assembly, launch, programs, saved_states, shards, tables
 from gasil_jax.sweeps.plan import Plan, programs_of
-from gasil_jax.sweeps.programs import ProgramFolder
+from gasil_jax.sweeps.runs import Run
 
 
 def plan_of(points, seeds, algorithm=None):
@@ -34,13 +34,14 @@ def plan_of(points, seeds, algorithm=None):
 )
 def test_shards_hold_each_run_once(updates, num_seeds, count):
     points = [{"discriminator_updates": 1 + n // 3, "alpha": n / 9} for n in updates]
-    runs = list(plan_of(points, range(num_seeds)).runs.values())
+    plan = plan_of(points, range(num_seeds))
+    runs = list(plan.runs.values())
     every = [shards.Shard(number, count) for number in range(1, count + 1)]
     if count > len(runs):
         with pytest.raises(InputError, match=f"{len(runs)} members"):
-            shards.cut_evenly(runs, every[0])
+            plan.part(every[0])
         return
-    parts = [shards.cut_evenly(runs, shard) for shard in every]
+    parts = [plan.part(shard) for shard in every]
     sizes = [len(part) for part in parts]
     assert max(sizes) - min(sizes) <= 1
     whole = programs.group(runs)
@@ -72,11 +73,37 @@ def test_points_that_differ_in_traced_numbers_alone_share_a_program():
     ]
 
 
+def test_a_program_of_a_version_with_fewer_settings_is_read(tmp_path):
+    """What it lacks has its default, so that its runs are those of this version."""
+    runs = tuple(Run("point_mass", gasil_jax.algorithm("ppo"), seed) for seed in (3, 4))
+    stored = programs.Program(runs, tmp_path / "now", {"seed": (3, 4)})
+    with stored.opened():
+        pass
+    listed = json.loads((stored.path / "program.json").read_text())
+    (experiment,) = listed["experiments"]
+    del experiment["algorithm"]["entropy_coefficient"], listed["sha256"]
+    (stored.path / "program.json").write_text(json.dumps(listed))
+    (read,) = programs.read(tmp_path)
+    assert read.runs == runs
+
+
 GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
 SMALL = (
     *("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100"),
     *("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3", "--gamma", "0.99"),
 )
+
+
+def trained_for(seconds, num_members):
+    """What is stored of how a program was trained, for so many seconds a member."""
+    return {
+        "env_steps": 300 * num_members,
+        "compile_seconds": 1.0,
+        "train_seconds": seconds * num_members,
+        "device": "1 x cpu",
+        "device_count": 1,
+        "versions": {},
+    }
 
 
 def train(folder, shard=None, *arguments, grid=GRID):
@@ -85,23 +112,14 @@ def train(folder, shard=None, *arguments, grid=GRID):
         sweep.Options, [*SMALL, "--grid", *grid, *arguments], "x"
     )
     plan = sweep.make_plan(options)
-    runs = list(plan.runs.values())
-    if shard is not None:
-        runs = shards.cut_evenly(runs, shards.parse(shard))
+    runs = plan.part(None if shard is None else shards.parse(shard))
     folder.mkdir(parents=True, exist_ok=True)
     run_options.write_config(options, folder, points=plan.points)
     for program in programs.group(runs):
-        path = programs_of(folder) / program.name
-        stored = ProgramFolder(program, path, plan.labels(program))
+        stored = program.below(programs_of(folder), plan.labels(program))
         with stored.opened():
             write_metrics(stored)
-            stored.finish(
-                env_steps=300 * len(program.runs),
-                compile_seconds=1.0,
-                train_seconds=0.5 * len(program.runs),
-                device="1 x cpu",
-                device_count=1,
-            )
+            stored.finish(trained_for(0.5, len(program.runs)))
     return plan
 
 
@@ -115,7 +133,7 @@ def write_metrics(stored):
                 + 20 * run.algorithm.agent.discriminator_updates
                 + run.seed
             ]
-            for run in stored.program.runs
+            for run in stored.runs
         ]
     )
     value = value + steps
@@ -161,7 +179,7 @@ def test_tables_of_shards_are_those_of_the_whole_sweep(count, tmp_path, capsys):
         summary = json.loads((out / "summary.json").read_text())
         assert summary["points"] == expected["points"]
         saved = saved_states.find(out, saved_states.run_folder.read(out), 1)
-        seeds = [x.program.seeds[i] for x in saved for i in x.indices]
+        seeds = [x.seeds[i] for x, indices in saved for i in indices]
         assert sorted(seeds) == [0, 1, 2]
 
 
@@ -318,7 +336,7 @@ def test_a_sweep_grows_by_points_and_by_seeds(tmp_path, capsys, jobs_to_train):
     # Only what is missing is trained.
     more = [*again, "--grid", "alpha=0.1,0.5", "--seeds", "4"]
     assert sweep.main(more) == STOPPED
-    members = [(p, s) for j in jobs_to_train for p, s in zip(*j.stored.labels.values())]
+    members = [(p, s) for j in jobs_to_train for p, s in zip(*j.labels.values())]
     points = [*plan.points, {"alpha": 0.1}, {"alpha": 0.5}]
     # {"alpha": 0.1} has the sweep's own discriminator_updates, which is no point yet.
     assert sorted(members) == [
@@ -327,15 +345,9 @@ def test_a_sweep_grows_by_points_and_by_seeds(tmp_path, capsys, jobs_to_train):
     ]
     grown = plan_of(points, range(4), plan.algorithm)
     for job in jobs_to_train:
-        with job.stored.opened():
-            write_metrics(job.stored)
-            job.stored.finish(
-                env_steps=300,
-                compile_seconds=1.0,
-                train_seconds=1.0,
-                device="1 x cpu",
-                device_count=1,
-            )
+        with job.opened():
+            write_metrics(job)
+            job.finish(trained_for(1.0, 1))
     # The folder keeps its own description until training has begun.
     assert len(grown.missing(grown.trained(tmp_path))) == 0
     assert sweep.main(more) == 0
@@ -356,8 +368,8 @@ def test_a_sweep_without_a_name_does_not_look_into_the_folder_it_starts_in(
     monkeypatch.chdir(tmp_path)
     planned = []
 
-    def prepare(options, programs, folders=()):
-        planned.extend(run for program in programs for run in program.runs)
+    def prepare(options, jobs):
+        planned.extend(run for job in jobs for run in job.runs)
         raise InputError("enough")
 
     monkeypatch.setattr(assembly, "prepare", prepare)
@@ -400,7 +412,7 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
     assert f"training has begun in {begun.path}" in capsys.readouterr().err
     assert sweep.main(resumed) == STOPPED
     (job,) = jobs_to_train
-    assert job.stored == begun
+    assert job == begun
     how = f"gasil_jax.sweep --shard 1/2 --resume --out {tmp_path}"
     assert how in capsys.readouterr().err
     jobs_to_train.clear()
@@ -411,7 +423,7 @@ def test_a_shard_is_resumed_only_on_request(tmp_path, capsys, jobs_to_train):
     # A cluster that runs a job again may do so before the job has begun.
     begin += ["--out", str(tmp_path / "other"), "--resume"]
     assert sweep.main(begin) == STOPPED
-    assert sum(len(job.program.runs) for job in jobs_to_train) == 6
+    assert sum(len(job.runs) for job in jobs_to_train) == 6
 
 
 def test_a_shard_keeps_out_of_other_folders(tmp_path, capsys, jobs_to_train):
@@ -443,7 +455,7 @@ def test_shards_need_no_file_of_points_once_one_has_begun(
     path, out = tmp_path / "points.json", tmp_path / "out"
     path.write_text('[{"alpha": 0.1}, {"num_epochs": 3}]')
     more = [*SMALL, "--out", str(out), "--points-file"]
-    members = lambda: jobs_to_train.pop().stored.labels
+    members = lambda: jobs_to_train.pop().labels
     assert sweep.main([*more, str(path), "--shard", "1/2"]) == STOPPED
     assert members() == {"point": (0, 0, 0), "seed": (0, 1, 2)}
     path.unlink()

@@ -93,7 +93,8 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
     plan = Plan("point_mass", Settings(), gasil_jax.algorithm(), points, [5])
     trained = [
         types.SimpleNamespace(
-            program=program,
+            runs=program.runs,
+            name=program.name,
             tables=lambda value=value: ([metrics(value)], []),
             training=training,
         )
@@ -137,12 +138,12 @@ def test_points_from_a_file(tmp_path):
     for text, message in (
         ("[", "can't be read"),
         ("[" * 100_000, "can't be read"),
-        (f'[{{"alpha": 1{"0" * 400}}}]', "too large"),
+        (f'[{{"alpha": 1{"0" * 400}}}]', "it must be 0 or more and finite, at most"),
         ("{}", "a list of points"),
         ("[3]", "3 is not a point"),
         ('[{"alhpa": 1}]', "did you mean 'alpha'"),
-        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5, not a whole number"),
-        ('[{"alpha": 1}, {"alpha": 1.0}]', "it has {'alpha': 1.0} twice"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
+        ('[{"alpha": 1}, {"alpha": 1.0}]', "it has {'alpha': 1} twice"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=message):
@@ -182,7 +183,7 @@ def test_points_from_a_file(tmp_path):
         ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
         ("--grid alpha=1 --shard 1/1", "shard needs --out"),
         ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
-        ("--grid alpha=1 --launcher rya", "'rya': it must be one of None, ray"),
+        ("--grid alpha=1 --launcher rya", "launcher is 'rya': it must be one of"),
         ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
         ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
         ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
@@ -292,8 +293,8 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(
     arguments = [*SMALL, "--out", str(out), "--resume", "--points-file"]
     planned, read = [], []
 
-    def prepare(options, programs, folders):
-        planned.append([program.hyperparameters[0]["alpha"] for program in programs])
+    def prepare(options, jobs):
+        planned.append([job.hyperparameters[0]["alpha"] for job in jobs])
         raise InputError("enough")
 
     original = run_folder.read
