@@ -3,7 +3,9 @@
 import array
 import csv
 import dataclasses
+import hashlib
 import importlib.metadata
+import itertools
 import json
 import math
 import os
@@ -155,8 +157,10 @@ class MetricsWriter:
                 self._writer.writerow([*labels[member], *cells])
         self._file.flush()
 
-    def size(self) -> int:
-        """Write everything to the disk and return the size of the file in bytes.
+    def record(self) -> dict[str, Any]:
+        """Write everything to the disk; return what a checkpoint records of the file.
+
+        That is its size in bytes, its number of lines and their hash.
 
         Raises:
           output_file.WriteError: as `write` does.
@@ -165,7 +169,10 @@ class MetricsWriter:
         with output_file.errors_named(self._path):
             self._file.flush()
             output_file.flush(self._file.fileno())
-            return os.fstat(self._file.fileno()).st_size
+            size, name = os.fstat(self._file.fileno()).st_size, self._path.stem
+            rows, digest = _rows_and_hash(self._path)
+        found = {"size": size, "rows": rows, "sha256": digest}
+        return {f"{name}_{field}": value for field, value in found.items()}
 
     def _check_in_place(self) -> None:
         """Raise `WriteError` if the file at the path is not the one that was opened."""
@@ -182,6 +189,41 @@ class MetricsWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, str]:
+    """Return the number of whole lines, or `most`, and their hash.
+
+    The hash does not see how lines end, because version control may change it.
+    """
+    digest, count = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        for line in itertools.islice(file, most):
+            if line.endswith(b"\n"):
+                digest.update(line.rstrip(b"\r\n") + b"\n")
+                count += 1
+    return count, digest.hexdigest()
+
+
+def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
+    """Return whether a table has all rows that a checkpoint has seen of it.
+
+    Args:
+      path: the table, which may be missing.
+      record: the checkpoint's record. An older version recorded no rows.
+
+    Raises:
+      InputError: if one of these rows has changed.
+    """
+    rows, seen = (record.get(f"{path.stem}_{x}") for x in ("rows", "sha256"))
+    if not rows:
+        return True
+    if not path.is_file():
+        return False
+    count, digest = _rows_and_hash(path, rows)
+    if count == rows and digest != seen:
+        raise InputError(f"{path} is damaged: it has changed since the checkpoint")
+    return count == rows
 
 
 def _cut(path: pathlib.Path, size: int) -> None:
