@@ -1,6 +1,7 @@
 """Write JSON files; write and read tables such as metrics.csv."""
 
 import array
+import contextlib
 import csv
 import dataclasses
 import hashlib
@@ -11,7 +12,7 @@ import math
 import os
 import pathlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -137,7 +138,7 @@ class MetricsWriter:
             path any more.
         """
         self._check_in_place()
-        with output_file.errors_named(self._path):
+        with self._errors_named():
             self._write(metrics)
 
     def _write(self, metrics: Mapping[str, np.ndarray]) -> None:
@@ -166,13 +167,25 @@ class MetricsWriter:
           output_file.WriteError: as `write` does.
         """
         self._check_in_place()
-        with output_file.errors_named(self._path):
+        with self._errors_named():
             self._file.flush()
             output_file.flush(self._file.fileno())
             size, name = os.fstat(self._file.fileno()).st_size, self._path.stem
             rows, digest = _rows_and_hash(self._path)
         found = {"size": size, "rows": rows, "sha256": digest}
         return {f"{name}_{field}": value for field, value in found.items()}
+
+    @contextlib.contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        try:
+            with output_file.errors_named(self._path):
+                yield
+        except output_file.WriteError:
+            # Python would write what is left once there is room, when training may
+            # have continued from a checkpoint.
+            with contextlib.suppress(OSError):
+                self._file.close()
+            raise
 
     def _check_in_place(self) -> None:
         """Raise `WriteError` if the file at the path is not the one that was opened."""
