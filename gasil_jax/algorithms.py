@@ -1,12 +1,14 @@
 """All that decides how a run learns: an agent, reward models, and the config of PPO."""
 
 import dataclasses
+import inspect
 from collections.abc import Mapping
 from typing import Any
 
 from gasil_jax.config import (
     SCHEDULE_SUFFIX,
     Config,
+    Range,
     check_declared,
     names,
     traced_names,
@@ -14,7 +16,7 @@ from gasil_jax.config import (
     validate_config,
     validate_switch,
 )
-from gasil_jax.errors import refusal, unknown
+from gasil_jax.errors import refusal, shown, unknown
 from gasil_jax.imitation import AGENTS, Agent, agents_with
 from gasil_jax.rewards import REWARD_MODELS, RewardModel
 
@@ -140,6 +142,7 @@ def check(algorithm: Algorithm) -> None:
     taken.update(x for model in REWARD_MODELS for x in (model.switch, *names(model)))
     for part in (agent, *(x for x in rewards if type(x) not in REWARD_MODELS)):
         what = f"agent {agent.name!r}" if part is agent else type(part).__name__
+        _check_functions(part, what)
         check_declared(type(part), what)
         for name in names(part):
             if name in taken:
@@ -155,6 +158,26 @@ def check(algorithm: Algorithm) -> None:
         taken.update(names(part))
     for part in (agent, *rewards):
         validate(part, algorithm.config.total_steps)
+
+
+def _check_functions(part: Any, what: str) -> None:
+    """Raise `ValueError` if what takes the place of a function is none."""
+    for base in type(part).__mro__[1:]:
+        for name, function in vars(base).items():
+            if inspect.isfunction(function) and not name.startswith("_"):
+                if not callable(given := getattr(part, name)):
+                    raise ValueError(
+                        f"{what} has {name} {shown(given)}: it must be a function"
+                    )
+    if isinstance(part, Agent):
+        for name, allowed in (
+            ("num_streams", Range(1, 2**31 - 1, whole=True)),
+            ("history_episodes", Range(0, 2**31 - 1, whole=True)),
+        ):
+            if (given := getattr(part, name)) not in allowed:
+                raise ValueError(
+                    f"{what} has {name} {shown(given)}: it must be {allowed}"
+                )
 
 
 #: Columns of a sweep's tables, whose names no setting may have.

@@ -13,7 +13,7 @@ import numpy as np
 import tyro
 
 from gasil_jax import numpy_policy, policy, statistics
-from gasil_jax.errors import InputError
+from gasil_jax.errors import InputError, refusal
 from gasil_jax.evaluation import run_episodes
 from gasil_jax.host import command_line, environments, output_file, resources
 from gasil_jax.host.progress import announced
@@ -42,6 +42,8 @@ def evaluate_in_gymnasium(
     """
     import gymnasium
 
+    if not callable(act):
+        raise refusal("act", act, "a function of an observation")
     env = gymnasium.make(gymnasium_id, max_episode_steps=num_steps)
     returns, lengths = [], []
     for episode in range(num_episodes):

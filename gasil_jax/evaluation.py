@@ -11,7 +11,7 @@ from gasil_envs.precision import full_precision
 from gasil_jax import checks, policy, train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range, validate_switch
-from gasil_jax.errors import refusal
+from gasil_jax.errors import refusal, shown
 
 _COUNT = Range(1, 2**31 - 1, whole=True)
 
@@ -77,19 +77,28 @@ def run_episodes(
       deterministic: whether to act with the policy's mean; else actions are drawn.
 
     Raises:
-      ValueError: as in `evaluate`.
+      ValueError: as in `evaluate`, or if `env` is no environment, or if `act` is no
+        function or returns no actions.
     """
+    checks.check_environment(env)
     checks.check_key(key)
     for name, value in (("num_episodes", num_episodes), ("num_steps", num_steps)):
         if value not in _COUNT:
             raise refusal(name, value, _COUNT)
     validate_switch("deterministic", deterministic)
+    if not callable(act):
+        raise refusal("act", act, "a function of observations and a key")
+    shape = (int(num_episodes), *wrappers.zero_action(env).shape)
     reset_key, act_key = jax.random.split(key)
 
     def step(carry: Any, key: jax.Array) -> Any:
         states, running, return_, length = carry
         observation = states.obs
         action = act(observation, None if deterministic else key)
+        given = getattr(action, "shape", None)
+        if given != shape:
+            returned = shown(action) if given is None else f"an array of shape {given}"
+            raise ValueError(f"act returns {returned}: it must be of shape {shape}")
         states = jax.vmap(env.step)(states, action)
         reward = states.info.get("true_reward", states.reward)
         sound = wrappers.step_is_sound(observation, states)

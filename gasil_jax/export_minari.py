@@ -197,7 +197,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     agent = algorithm.agent
     buffers = jax.device_get(agent.good_trajectories(states.agent))
-    if buffers is None:
+    if not isinstance(buffers, GoodTrajectories):
         raise InputError(
             f"run is {options.run}, of agent {agent.name!r}: it has no buffer of good "
             "trajectories"

@@ -13,7 +13,13 @@ from gasil_jax import statistics
 from gasil_jax.errors import InputError
 from gasil_jax.figures import plotting
 from gasil_jax.figures.plotting import COLORS
-from gasil_jax.host import command_line, metrics_files, output_file, run_folder
+from gasil_jax.host import (
+    checkpoint,
+    command_line,
+    metrics_files,
+    output_file,
+    run_folder,
+)
 from gasil_jax.sweeps import saved_states
 
 _STYLES = ("-", "--", "-.", ":")
@@ -115,7 +121,12 @@ def _read_tables(
     """Return the columns of tables for all members, as far as all of them have come.
 
     They are none if a table is missing or has no rows yet.
+
+    Raises:
+      InputError: if a table is damaged.
     """
+    for folder, *_ in saved:
+        _check_recorded(folder / name)
     if not all((folder / name).is_file() for folder, _, _ in saved):
         return {}
 
@@ -133,6 +144,19 @@ def _read_tables(
         return [columns[x][list(i), :length] for columns, i in every]
 
     return {x: np.concatenate(rows(x)) for x in ("env_steps", column)}
+
+
+def _check_recorded(path: pathlib.Path) -> None:
+    """Check a table against what the newest checkpoint has seen of it.
+
+    Rows that are missing are told; the others can be drawn.
+
+    Raises:
+      InputError: if rows have changed.
+    """
+    record = checkpoint.newest_record(path.parent / "checkpoints")
+    if not metrics_files.has_recorded_rows(path, record):
+        command_line.note(f"{path} lacks rows that its training has written")
 
 
 def draw(runs: Sequence[Curves], path: pathlib.Path) -> None:

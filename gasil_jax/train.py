@@ -26,6 +26,7 @@ from gasil_jax import (
 from gasil_jax.algorithms import Algorithm, check_numbers
 from gasil_jax.context import Context, Metrics, sizes_of
 from gasil_jax.distributions import Distribution
+from gasil_jax.errors import shown
 from gasil_jax.imitation.interface import Checked
 from gasil_jax.networks import Value
 from gasil_jax.ppo import ActorCritic
@@ -588,13 +589,20 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
                 f"{', '.join(sorted(taken))}"
             )
         metrics = {**metrics, **own}
+    numbers: dict[str, jax.Array] = {}
     for name, value in metrics.items():
-        if shape := jnp.shape(value):
+        what = f"metric {shown(name)} of agent {agent!r}"
+        if not isinstance(name, str):
+            raise ValueError(f"{what}: its name must be a string")
+        try:
+            numbers[name] = jnp.asarray(value, jnp.float32)
+        except (TypeError, ValueError):
             raise ValueError(
-                f"metric {name!r} of agent {agent!r} has shape {shape}: it must be one "
-                "number"
-            )
-    return {name: jnp.asarray(x, jnp.float32) for name, x in metrics.items()}
+                f"{what} is {shown(value)}: it must be one number"
+            ) from None
+        if shape := numbers[name].shape:
+            raise ValueError(f"{what} has shape {shape}: it must be one number")
+    return numbers
 
 
 class Train(Protocol):

@@ -5,7 +5,7 @@ Mistakes that would stop training with a long trace are reported in one line bef
 
 import inspect
 import numbers
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -84,6 +84,12 @@ def check(name: str, env: Any, trained: Any) -> None:
         )
     for attribute in ("observation_size", size):
         _check_count(name, attribute, getattr(env, attribute))
+    for function in ("reset", "step"):
+        if not callable(given := getattr(env, function)):
+            raise ValueError(
+                f"env {name!r} has {function} {own_code.shown(given)}: it must be a "
+                "function"
+            )
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
     _check_action_range(name, env)
@@ -118,14 +124,32 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
     Raises:
       ValueError: if it can't be traced, or returns something else than a state.
     """
+
+    def called(*arguments: Any) -> Any:
+        state = getattr(env, function)(*arguments)
+        if not all(hasattr(state, x) for x in ("obs", "reward", "done", "info")):
+            raise ValueError(
+                f"its {function} returns a {type(state).__name__}: it must return a "
+                "brax.envs.State"
+            )
+        for field in ("obs", "reward", "done"):
+            value = getattr(state, field)
+            try:
+                jax.eval_shape(lambda value=value: value)
+            except TypeError:
+                raise ValueError(
+                    f"the {field} of its {function} is {own_code.shown(value)}: it "
+                    "must be an array"
+                ) from None
+        if not isinstance(state.info, Mapping):
+            raise ValueError(
+                f"the info of its {function} is {own_code.shown(state.info)}: it must "
+                "be a dict"
+            )
+        return state
+
     with own_code.refused(f"env {name!r} can't be traced"):
-        state = jax.eval_shape(getattr(env, function), *arguments)
-    if not all(hasattr(state, x) for x in ("obs", "reward", "done", "info")):
-        raise ValueError(
-            f"env {name!r}: its {function} returns a {type(state).__name__}: it must "
-            "return a brax.envs.State"
-        )
-    return state
+        return jax.eval_shape(called, *arguments)
 
 
 def _check_states(name: str, env: Env, trained: Env) -> None:
@@ -134,10 +158,6 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
     size = env.observation_size  # Once: Brax runs a reset for it.
     bare = _traced(name, env, "reset", key)
     stepped = _traced(name, env, "step", bare, action)
-    first, then = bare, stepped
-    if trained is not env:
-        first = _traced(name, trained, "reset", key)
-        then = _traced(name, trained, "step", first, action)
     for state, where in ((bare, "reset"), (stepped, "step")):
         fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
         of_info = {
@@ -165,6 +185,10 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
                     f"env {name!r}: the {field} of its {where} is {value.dtype}: it "
                     "must be float32"
                 )
+    first, then = bare, stepped
+    if trained is not env:
+        first = _traced(name, trained, "reset", key)
+        then = _traced(name, trained, "step", first, action)
     if change := own_code.first_change(first, then):
         path, before, after = change
         raise ValueError(

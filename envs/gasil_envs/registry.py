@@ -11,7 +11,14 @@ import jax
 import numpy as np
 from brax.envs import Env
 
-from gasil_envs import locomotion, own_environment, point_mass, worlds, wrappers
+from gasil_envs import (
+    locomotion,
+    own_code,
+    own_environment,
+    point_mass,
+    worlds,
+    wrappers,
+)
 from gasil_envs.physics import batching, native
 from gasil_envs.physics.mjx import SOLVERS
 
@@ -55,11 +62,7 @@ _EPISODE_LENGTH = 1000
 
 def _refusal(name: str, value: Any, allowed: str) -> ValueError:
     """Return the error for a value that is not allowed, in one short line."""
-    try:
-        shown = " ".join(repr(value).split())[:300]
-    except Exception:  # It may be an object of the user's, or a number of 5,000 digits.
-        shown = f"of type {type(value).__name__}"
-    return ValueError(f"{name} is {shown}: it must be {allowed}")
+    return ValueError(f"{name} is {own_code.shown(value)}: it must be {allowed}")
 
 
 def _refuse_unknown(

@@ -287,11 +287,18 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
     )
 
 
-class _Record(TypedDict, total=False):
-    """The record in manifest.json, as `driver` writes it."""
+class Record(TypedDict, total=False):
+    """The record in manifest.json, as `driver` writes it.
+
+    Older versions recorded sizes and scores alone.
+    """
 
     metrics_size: int
+    metrics_rows: int
+    metrics_sha256: str
     evaluations_size: int
+    evaluations_rows: int
+    evaluations_sha256: str
     score: float | None
 
 
@@ -299,7 +306,7 @@ class _Manifest(TypedDict):
     """The content of manifest.json."""
 
     files: dict[str, str]
-    record: _Record
+    record: Record
 
 
 def read(folder: pathlib.Path) -> Checkpoint:
@@ -332,6 +339,14 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
         except ValueError as error:
             errors.append(str(error))
     return None, errors
+
+
+def newest_record(root: pathlib.Path) -> Record:
+    """Return the record of the newest checkpoint; nothing without one that is read."""
+    for folder in reversed(_folders(root)):
+        with contextlib.suppress(*_DAMAGE_ERRORS):
+            return json_reader.read(folder / _MANIFEST, _Manifest)["record"]
+    return {}
 
 
 def best(root: pathlib.Path) -> Checkpoint | None:

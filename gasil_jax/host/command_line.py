@@ -143,6 +143,9 @@ def parse(
     except SystemExit as exit_:
         if exit_.code in (0, None):
             raise HelpShown(0) from None
+        if (short := [shortened(word) for word in given]) != [*given]:
+            # tyro would break the word into lines, whose beginnings nobody knows.
+            parse(options, short, program, default, why_not=why_not)
         raise InputError(_in_one_line(printed.getvalue())) from None
 
 
@@ -264,6 +267,11 @@ def _in_one_line(printed: str) -> str:
     return f"{name.replace('-', '_')} is {value!r}: it must be {kind}"
 
 
+def shortened(text: str) -> str:
+    """Return a text without the middle of words that are longer than most paths."""
+    return re.sub(r"(\S{40})\S{900,}(\S{20})", r"\1...\2", text)
+
+
 def note(text: str) -> None:
     """Print a line to stderr about something that is allowed but may be a mistake."""
     print(f"note: {text}", file=sys.stderr)
@@ -318,7 +326,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             return 128 + signal.SIGPIPE
         except (InputError, OSError) as error:
             # A name may hold a line break.
-            print(r"\n".join(f"error: {error}".splitlines()), file=sys.stderr)
+            told = r"\n".join(f"error: {shortened(str(error))}".splitlines())
+            print(told, file=sys.stderr)
             too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
             return 2 if too_long or isinstance(error, InputError) else 1
         except HelpShown:

@@ -1,8 +1,9 @@
 """Train members in chunks; log, save and evaluate them between chunks.
 
 `drive` writes metrics.csv, checkpoints/ and, if policies are evaluated during training,
-evaluations.csv. A checkpoint records the sizes of the two tables. Training that
-continues from it cuts the tables to these sizes and writes the same rows again.
+evaluations.csv. A checkpoint records the sizes of the two tables and their hashes.
+Training that continues from it cuts the tables to these sizes and writes the same rows
+again.
 """
 
 import dataclasses
@@ -212,16 +213,16 @@ class _Tables:
     def record(self) -> dict[str, Any]:
         """Write everything to the disk; return a record of it for a checkpoint.
 
-        It has each file's size in bytes and, as "score", the mean score of the current
-        policies or, without evaluations, the mean of all returns since the last record.
+        It has each file's size, rows and hash and, as "score", the mean score of the
+        current policies or, without evaluations, the mean of all returns since the last
+        record.
         """
-        record = {"metrics_size": self._metrics.size()}
+        record = self._metrics.record()
         returns = np.concatenate(self._returns)
         del self._returns[1:]
         if self.evaluation is None:
             return record | {"score": float(returns.mean()) if returns.size else None}
-        size = self.evaluation.size()
-        return record | {"evaluations_size": size, "score": self.score}
+        return record | self.evaluation.record() | {"score": self.score}
 
     def close(self) -> None:
         """Close the files and the trackers."""
@@ -285,8 +286,14 @@ def _restored(
 
 
 def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Return the size in bytes to cut a table to; None if there is no table yet."""
+    """Return the size in bytes to cut a table to; None if there is no table yet.
+
+    Raises:
+      InputError: if rows before that have changed since they were written.
+    """
     if record is not None:
+        # Too few are refused where the table is cut.
+        metrics_files.has_recorded_rows(path, record)
         return record[f"{path.stem}_size"]
     return 0 if path.exists() else None
 

@@ -1,15 +1,18 @@
 """Write JSON files; write and read tables such as metrics.csv."""
 
 import array
+import contextlib
 import csv
 import dataclasses
+import hashlib
 import importlib.metadata
+import itertools
 import json
 import math
 import os
 import pathlib
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -135,7 +138,7 @@ class MetricsWriter:
             path any more.
         """
         self._check_in_place()
-        with output_file.errors_named(self._path):
+        with self._errors_named():
             self._write(metrics)
 
     def _write(self, metrics: Mapping[str, np.ndarray]) -> None:
@@ -155,17 +158,34 @@ class MetricsWriter:
                 self._writer.writerow([*labels[member], *cells])
         self._file.flush()
 
-    def size(self) -> int:
-        """Write everything to the disk and return the size of the file in bytes.
+    def record(self) -> dict[str, Any]:
+        """Write everything to the disk; return what a checkpoint records of the file.
+
+        That is its size in bytes, its number of lines and their hash.
 
         Raises:
           output_file.WriteError: as `write` does.
         """
         self._check_in_place()
-        with output_file.errors_named(self._path):
+        with self._errors_named():
             self._file.flush()
             output_file.flush(self._file.fileno())
-            return os.fstat(self._file.fileno()).st_size
+            size, name = os.fstat(self._file.fileno()).st_size, self._path.stem
+            rows, digest = _rows_and_hash(self._path)
+        found = {"size": size, "rows": rows, "sha256": digest}
+        return {f"{name}_{field}": value for field, value in found.items()}
+
+    @contextlib.contextmanager
+    def _errors_named(self) -> Iterator[None]:
+        try:
+            with output_file.errors_named(self._path):
+                yield
+        except output_file.WriteError:
+            # Python would write what is left once there is room, when training may
+            # have continued from a checkpoint.
+            with contextlib.suppress(OSError):
+                self._file.close()
+            raise
 
     def _check_in_place(self) -> None:
         """Raise `WriteError` if the file at the path is not the one that was opened."""
@@ -182,6 +202,41 @@ class MetricsWriter:
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, str]:
+    """Return the number of whole lines, or `most`, and their hash.
+
+    The hash does not see how lines end, because version control may change it.
+    """
+    digest, count = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        for line in itertools.islice(file, most):
+            if line.endswith(b"\n"):
+                digest.update(line.rstrip(b"\r\n") + b"\n")
+                count += 1
+    return count, digest.hexdigest()
+
+
+def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
+    """Return whether a table has all rows that a checkpoint has seen of it.
+
+    Args:
+      path: the table, which may be missing.
+      record: the checkpoint's record. An older version recorded no rows.
+
+    Raises:
+      InputError: if one of these rows has changed.
+    """
+    rows, seen = (record.get(f"{path.stem}_{x}") for x in ("rows", "sha256"))
+    if not rows:
+        return True
+    if not path.is_file():
+        return False
+    count, digest = _rows_and_hash(path, rows)
+    if count == rows and digest != seen:
+        raise InputError(f"{path} is damaged: it has changed since the checkpoint")
+    return count == rows
 
 
 def _cut(path: pathlib.Path, size: int) -> None:

@@ -132,9 +132,9 @@ class PeriodicEvaluation:
         self.seconds += time.monotonic() - started
         return scores
 
-    def size(self) -> int:
-        """Write everything to the disk; return the size of evaluations.csv in bytes."""
-        return self._writer.size()
+    def record(self) -> dict[str, Any]:
+        """Write everything to the disk; return what a checkpoint records of it."""
+        return self._writer.record()
 
     def close(self) -> None:
         """Close evaluations.csv."""

@@ -22,7 +22,7 @@ import numpy as np
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
-from gasil_jax.host import json_reader, metrics_files, run_folder
+from gasil_jax.host import checkpoint, json_reader, metrics_files, run_folder
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
 from gasil_jax.sweeps.runs import Run, read_run
@@ -145,7 +145,9 @@ class Program:
         """Return a complete table by run, after checking its columns and `rows`."""
         path, config = self.path / name, self.algorithm.config
         count = len(self.runs)
+        record = checkpoint.newest_record(self.path / "checkpoints")
         try:
+            whole = metrics_files.has_recorded_rows(path, record)
             columns = metrics_files.read_metrics(
                 path, (), count, (*self.labels, *required)
             )
@@ -155,7 +157,7 @@ class Program:
             if (columns.pop(label) != np.array(values)[:, None]).any():
                 raise InputError(f"{path} is damaged: its rows are not in order")
         steps = columns["env_steps"][0]
-        whole = steps[-1] == config.num_iterations * config.batch_steps
+        whole &= steps[-1] == config.num_iterations * config.batch_steps
         if not whole or rows not in (None, len(steps)):
             raise InputError(f"{path} is damaged: it lacks iterations")
         return [{name: x[i] for name, x in columns.items()} for i in range(count)]

@@ -1,5 +1,7 @@
 """Command lines in which something is altered, drawn from a seed, end in one line."""
 
+import re
+
 import numpy as np
 
 from gasil_jax import evaluate, export_minari, merge, plot, render, run, sweep
@@ -23,7 +25,7 @@ LINES = [
 ]
 WORDS = [
     *("", "-", "--", "---", "=", "--=", "-1", "1e999", "nan", "é", "\udcff", "\x00"),
-    *("a\nb", "x" * 500, "9" * 500, "0x10", "1_000", "1/0", "0/1", "[", "{}", "None"),
+    *("a\nb", "x" * 500, "9" * 5000, "0x10", "1_000", "1/0", "0/1", "[", "{}", "None"),
     *("--help=", "--out", "--env", "--seeds=", "--grid", "alpha=", "=1", "alpha=a"),
     *("../..", "minari:", "zoo:", "zoo:x", "brax:", ":", "a:", "a:b", "@file", "%s"),
     *("--no-seeds", "--first-seed", "--version=3", "*", "-h1", "True"),
@@ -67,5 +69,15 @@ def test_an_altered_command_line_ends_in_one_line(capsys, monkeypatch):
         printed = capsys.readouterr()
         told = [x for x in printed.err.splitlines() if not x.startswith("note: ")]
         told = [x for x in told if not x.endswith(("environment", "devices"))]
+        assert all(len(line) < 2000 for line in told), words
         assert len(told) == 1 and told[0].startswith("error: "), (words, printed.err)
         assert printed.out == "", words
+
+
+def test_the_middle_of_a_long_word_is_left_out_of_the_message(capsys):
+    word = 5000 * "x"
+    for words in (["--alpha", word], [word], [f"--{word}"], ["--seeds", word]):
+        assert run.main(["--env", "ant", *words, "--out", "/proc/no"]) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert re.search(f"^error: .*{30 * 'x'}[.]{{3}}{15 * 'x'}", line), line
+        assert len(line) < 200

@@ -150,6 +150,28 @@ class Silent(Own):
         return state, actor_critic, None
 
 
+class NoFunction(Own):
+    remember = 3
+
+
+class NoMix(Own):
+    mix = None
+
+
+class NoStreams(Own):
+    num_streams = "two"
+
+
+class WordMetric(Own):
+    def update_policy(self, state, actor_critic, context, key):
+        return state, actor_critic, {"a": "x"}
+
+
+class OddMetric(Own):
+    def update_policy(self, state, actor_critic, context, key):
+        return state, actor_critic, {3: 1.0}
+
+
 class Two(Own):
     def update_and_reward(self, state, context, key):
         return state, {}
@@ -298,6 +320,11 @@ def test_the_help_explains_its_settings(capsys):
         ("my_agents:Turns", r"state\['count'\] is float32\[\]: .* int32\[\], as"),
         ("my_agents:Forgets", r"remember of .* state\['count'\] is missing: .* int32"),
         ("my_agents:LosesNetworks", r"update_policy of .* actor_critic.* missing:"),
+        ("my_agents:NoFunction", "has remember 3: it must be a function"),
+        ("my_agents:NoMix", "has mix None: it must be a function"),
+        ("my_agents:NoStreams", "has num_streams 'two': it must be a whole number, 1"),
+        ("my_agents:WordMetric", "metric 'a' of .* is 'x': it must be one number"),
+        ("my_agents:OddMetric", "metric 3 of .*: its name must be a string"),
         ("my_agents:Silent", "update_policy .* returns metrics None: .* be a dict"),
         ("my_agents:Exits", r"Exits' can't be traced: SystemExit \(.*my_agents"),
         ("my_agents:Refuses", "check of agent .* fails: SystemExit: 7"),

@@ -1,6 +1,7 @@
 """Runs are drawn and compared."""
 
 import csv
+import shutil
 
 import numpy as np
 import pytest
@@ -47,7 +48,10 @@ def test_runs_are_drawn(tmp_path, capsys):
         with pytest.raises(InputError, match="has no curves to draw yet"):
             plot.read(tmp_path / "ppo")
     path.write_bytes(whole)
+    assert "metrics.csv lacks rows that its training has" in capsys.readouterr().err
 
+    # A checkpoint knows what was in the table.
+    shutil.rmtree(tmp_path / "ppo" / "checkpoints")
     # Where none ended in the last tenth, the last that did count, as in the summary.
     with path.open() as file:
         rows = list(csv.DictReader(file))

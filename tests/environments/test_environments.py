@@ -298,7 +298,14 @@ def test_an_environment_of_the_user_is_built(tmp_path, monkeypatch):
         (_OWN.replace("action[0]", "action"), r"reward of its step .*\(1,\): .* \(\)"),
         (_OWN.replace("action[0]", "self.gain"), r"AttributeError: .*gain.*line 10"),
         (_OWN.replace("obs=a", "obs={'x': a}"), r"step is a dict: it .* \(2,\)"),
-        (_OWN.replace("obs=a", "obs=str(a)"), "can't be traced: TypeError"),
+        (_OWN.replace("obs=a", "obs='a'"), "the obs of its step is 'a': it must be an"),
+        (_OWN.replace("obs=a", "obs=len"), "obs of its step is <built-in function len"),
+        (_OWN.replace("obs=a", "obs=None"), r"step is a NoneType: it must .* \(2,\)"),
+        (_OWN.replace("obs=a", "obs=a, done='x'"), "done of its step is 'x': it must"),
+        (_OWN.replace("obs=a", "obs=a, done=None"), "done of its step is a NoneType"),
+        (_OWN.replace("info={}", "info=None"), "the info of its step is None: it must"),
+        (_OWN + "    reset = 3\n", "has reset 3: it must be a function"),
+        (_OWN + "    step = 'x'\n", "has step 'x': it must be a function"),
         (
             _OWN.replace(
                 "return state.", "return a, reward, False, {}\n        state."

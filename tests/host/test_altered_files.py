@@ -11,9 +11,12 @@ from small_training import FLAGS
 
 from gasil_jax import merge, plot, run, sweep
 
-SMALL = [*FLAGS, "--agent", "ppo", "--seeds", "2", "--max-episode-steps", "10"]
+SMALL = [
+    *(*FLAGS, "--agent", "ppo", "--seeds", "2", "--max-episode-steps", "10"),
+    *("--evaluate-every", "128", "--evaluate-episodes", "1"),
+]
 VALUES = [None, True, -1, 0.5, 10**30, math.nan, "", "a", "x" * 300, [], [1], {"a": 1}]
-CELLS = ["inf", "1e999", "a", '"', "é", "0x1"]
+CELLS = ["1.5", "inf", "1e999", "a", '"', "é", "0x1"]
 
 
 @pytest.fixture(scope="module")
@@ -105,3 +108,54 @@ def test_an_altered_file_is_refused_or_changes_nothing(folders, tmp_path, capsys
                 refused += status == 2
                 assert status == 2 or out == expected, (arguments, path)
     assert 10 < refused < 36
+
+
+def edited(path):
+    """Change the last digit of a cell."""
+    header, row, rest = path.read_bytes().split(b"\r\n", 2)
+    other = b"1" if row.endswith(b"2") else b"2"
+    path.write_bytes(b"\r\n".join([header, row[:-1] + other, rest]))
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "evaluations.csv"])
+@pytest.mark.parametrize("kind", ["run", "sweep"])
+def test_a_digit_that_was_changed_is_refused(kind, name, folders, tmp_path, capsys):
+    work = shutil.copytree(folders / kind, tmp_path / "work")
+    (path,) = work.rglob(name)
+    edited(path)
+    commands = [(plot, str(work), "--out", str(tmp_path / "x.png"))]
+    commands.append((run, "--resume", "--out", str(work)))
+    if kind == "sweep":
+        commands[1] = (merge, str(work))
+    for command, *words in commands:
+        capsys.readouterr()
+        assert command.main(words) == 2
+        told = capsys.readouterr().err
+        assert f"{path} is damaged: it has changed since the checkpoint" in told
+
+    # A folder of an older version has no hash of its tables.
+    for manifest in path.parent.rglob("manifest.json"):
+        content = json.loads(manifest.read_text())
+        for field in ("rows", "sha256"):
+            del content["record"][f"{path.stem}_{field}"]
+        del content["sha256"]
+        manifest.write_text(json.dumps(content))
+    for command, *words in commands:
+        assert command.main(words) == 0
+
+
+@pytest.mark.parametrize("name", ["metrics.csv", "evaluations.csv"])
+def test_a_table_that_was_cut_is_told_where_it_is_drawn(
+    name, folders, tmp_path, capsys
+):
+    work = shutil.copytree(folders / "run", tmp_path / "work")
+    # Version control may have changed how lines end.
+    rows = (work / name).read_text().splitlines(keepends=True)
+    for kept, told in (
+        (rows, ""),
+        (rows[:-1], f"note: {work / name} lacks rows that its training has written\n"),
+    ):
+        (work / name).write_text("".join(kept))
+        figure = tmp_path / f"{len(kept)}.png"
+        assert plot.main([str(work), "--out", str(figure)]) == 0
+        assert capsys.readouterr().err == told

@@ -25,6 +25,7 @@ from gasil_jax import merge, run, sweep
 from gasil_jax.host import (
     checkpoint,
     command_line,
+    metrics_files,
     output_file,
     run_folder,
 )
@@ -251,6 +252,17 @@ def test_a_full_disk_has_a_hint(tmp_path):
     with pytest.raises(output_file.WriteError, match="left on device: make room there"):
         with output_file.errors_named(tmp_path):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_rows_that_could_not_be_written_are_not_written_later(tmp_path):
+    path = tmp_path / "metrics.csv"
+    writer = metrics_files.MetricsWriter(path, {"seed": [0]}, columns=("env_steps",))
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    writer._file.flush = mock.Mock(side_effect=full)
+    with pytest.raises(output_file.WriteError, match="left on device: make room"):
+        writer.write({"env_steps": np.ones((1, 1))})
+    # Python would write them once there is room.
+    assert writer._file.closed
 
 
 def test_windows_is_refused_in_a_line():

@@ -262,6 +262,37 @@ def test_a_count_that_is_none_is_refused_by_name(value):
 
 
 @pytest.mark.parametrize(
+    ("act", "why"),
+    [
+        (3, "act is 3: it must be a function of observations and a key"),
+        (None, "act is None: it must be a function"),
+        (lambda observation, key: None, "act returns None: it must be of shape (3, 2)"),
+        (lambda observation, key: "x", "act returns 'x': it must be of shape (3, 2)"),
+        (lambda observation, key: jnp.zeros(2), "returns an array of shape (2,): it"),
+    ],
+)
+def test_a_policy_that_returns_no_actions_is_refused(act, why):
+    env = gasil_jax.make_env("point_mass")
+    with pytest.raises(ValueError, match=re.escape(why)):
+        evaluation.run_episodes(
+            env, act, jax.random.key(0), num_episodes=3, num_steps=1
+        )
+
+
+@pytest.mark.parametrize("act", [3, None, "x"])
+def test_a_policy_that_cannot_be_called_is_refused_in_gymnasium(act):
+    with pytest.raises(ValueError, match=f"act is {act!r}: it must be a function of"):
+        evaluate.evaluate_in_gymnasium("Hopper-v5", act, num_episodes=1)
+
+
+@pytest.mark.parametrize("env", [3, None, "hopper"])
+def test_episodes_are_run_in_an_environment_alone(env):
+    act, key = lambda observation, key: observation, jax.random.key(0)
+    with pytest.raises(ValueError, match=f"env is {env!r}, which has no reset: it mu"):
+        evaluation.run_episodes(env, act, key, num_episodes=1, num_steps=1)
+
+
+@pytest.mark.parametrize(
     ("name", "nearest"), [("num_env", "num_envs"), ("Alpha", "alpha")]
 )
 def test_a_name_that_is_no_setting_is_refused_with_the_nearest(name, nearest):
