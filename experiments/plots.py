@@ -41,7 +41,8 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
     # Four panels are drawn in a square, so that none is alone in its row.
     columns = min({4: 2}.get(count, 4 if count > 6 else 3), count)
     rows = math.ceil(count / columns)
-    size = (3.6 * columns, 2.8 * rows)
+    width = 3.6 + (0.055 * max(map(len, figure.names())))
+    size = ((width if _has_direct_labels(figure) else 3.6) * columns, 2.8 * rows)
     picture = Picture(figsize=size, layout="constrained")
     grid = picture.subplots(rows, columns, squeeze=False)
     for axes in grid.flat[count:]:
@@ -52,16 +53,27 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         else:
             _draw_curves(figure, panel, records, axes=axes)
         axes.set_title(panel)
-    shown = [axes.get_legend_handles_labels() for axes in grid.flat[:count]]
+    if not _has_direct_labels(figure):
+        _draw_legends(figure, picture, list(grid.flat[:count]))
+    for row in grid:
+        is_share = figure.solved_from is not None
+        row[0].set_ylabel("share of seeds" if is_share else "episode return")
+    return picture
+
+
+def _draw_legends(figure: Figure, picture: Picture, panels: Sequence[Any]) -> None:
+    """Draw a legend in each panel, or below all panels if there are many names."""
+    shown = [axes.get_legend_handles_labels() for axes in panels]
     handle_of = {
         name: x
         for handles, names in shown
         for x, name in zip(handles, names, strict=True)
     }
-    if count > 1 and len(handle_of) > 3:
+    if len(panels) > 1 and len(handle_of) > 3:
         # So many names would hide the curves, so the legend is below the panels. At
         # this font size a letter is about 0.07 inches wide.
         width = 0.5 + 0.07 * max(map(len, handle_of))
+        size = picture.get_size_inches()
         fitting = max(1, min(4, int(size[0] / width)))
         if figure.solved_from is not None:
             # Else the legend of many names takes the panels' room.
@@ -70,13 +82,9 @@ def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
         below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
         picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
     else:
-        for axes, (_, names) in zip(grid.flat, shown, strict=False):
+        for axes, (_, names) in zip(panels, shown, strict=True):
             if names:
                 axes.legend(frameon=False, fontsize=7)
-    for row in grid:
-        is_share = figure.solved_from is not None
-        row[0].set_ylabel("share of seeds" if is_share else "episode return")
-    return picture
 
 
 def _colors(figure: Figure) -> dict[str, Any]:
@@ -100,12 +108,26 @@ def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
     return {name: color_of.get(name) or next(free) for name in names}
 
 
-def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
-    """Draw learning curves: interquartile mean and 95% interval over seeds.
+#: Largest number of bands in a panel, and of lines that are labelled at their ends.
+_MOST_BANDS, _MOST_LABELS = 5, 12
 
-    Where tasks are either solved or not, it is the share of seeds that solve the task.
+
+def _has_direct_labels(figure: Figure) -> bool:
+    """Return whether lines are labelled at their ends, and not in a legend."""
+    if figure.over or figure.solved_from is not None:
+        return False
+    return max(map(len, figure.panels.values())) <= _MOST_LABELS
+
+
+def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
+    """Draw learning curves: the interquartile mean over seeds.
+
+    The figure's subject is thick. It and the curves that end highest, at most five in
+    all, have a band, their 95% interval. Where tasks are either solved or not, curves
+    are the share of seeds that solve the task.
     """
     color_of = _colors(figure)
+    drawn = {}
     for label in figure.panels[panel]:
         if (panel, label) not in records:
             continue
@@ -123,11 +145,22 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
             continue
         finite = np.isfinite(returns).all(axis=0)
         if finite.any():
-            color = color_of[label]
-            steps, returns = steps[finite] / 1e6, returns[:, finite]
+            drawn[label] = steps[finite] / 1e6, returns[:, finite]
+    middle_of = {x: interquartile_mean(returns, 0) for x, (_, returns) in drawn.items()}
+    # The subject first, then the highest.
+    ranked = sorted(middle_of, key=lambda x: -middle_of[x][-1])
+    banded = sorted(ranked, key=lambda x: x != figure.favourite)[:_MOST_BANDS]
+    for label, (steps, returns) in drawn.items():
+        color = color_of[label]
+        if label in banded:
             low, high = bootstrap_interval(returns, resamples=500)
             axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-            axes.plot(steps, interquartile_mean(returns, 0), color=color, label=label)
+        width = 2.4 if label == figure.favourite else 1.2
+        line = {"color": color, "label": label, "linewidth": width}
+        axes.plot(steps, middle_of[label], **line)
+    if _has_direct_labels(figure):
+        ends = {label: float(middle_of[label][-1]) for label in ranked}
+        plotting.label_ends(axes, ends, color_of)
     axes.set_xlabel("million steps")
 
 

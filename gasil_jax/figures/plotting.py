@@ -93,6 +93,31 @@ def draw_returns(
     axes.set(xlabel="million steps of a seed", ylabel="episode return")
 
 
+def label_ends(
+    axes: Any, ends: Mapping[str, float], color_of: Mapping[str, Any]
+) -> None:
+    """Write names beside the ends of lines, apart from each other.
+
+    Args:
+      axes: where the lines are, which must all be drawn.
+      ends: where each line ends, in the order of the ends, the highest first.
+      color_of: the color of each name.
+    """
+    low, high = axes.get_ylim()
+    gap = 0.06  # Of the height of the axes, for this font size.
+    places = [(y - low) / (high - low) for y in ends.values()]
+    for i in range(1, len(places)):
+        places[i] = min(places[i], places[i - 1] - gap)
+    # What was moved below the axes is moved up again, and pushes the others.
+    floor = 0.0
+    for i in reversed(range(len(places))):
+        places[i] = max(places[i], floor)
+        floor = places[i] + gap
+    for name, place in zip(ends, places, strict=True):
+        where = {"xycoords": "axes fraction", "va": "center", "fontsize": 7}
+        axes.annotate(name, (1.02, place), color=color_of[name], **where)
+
+
 def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:
     """Write below a figure what its lines and intervals are.
 
