@@ -281,13 +281,19 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
 
 
 @pytest.mark.parametrize("count", [3, 9])
-def test_every_arm_has_a_color(page, tmp_path, count):
+def test_every_arm_has_a_color_and_a_name(page, tmp_path, count):
     arms = [Arm(f"arm {i}", "ppo", {"gamma": 0.5}) for i in range(count)]
     panels = grid(("hopper",), ("ppo", *arms), seeds=6, changes={"gamma": 0.6})
     figure = Figure("Arms", "", panels, favourite="ppo")
     drawn = Page("matrix", page.searched, figure=figure).picture()
-    colors = [str(line.get_color()) for line in drawn.axes[0].get_lines()]
+    (axes,) = drawn.axes
+    colors = [str(line.get_color()) for line in axes.get_lines()]
     assert len(set(colors)) == len(colors) == count + 1
+    # At most five have a band; the subject is thick, and names are at the ends.
+    assert len(axes.collections) == min(count + 1, 5)
+    thick = max(axes.get_lines(), key=lambda line: line.get_linewidth())
+    assert thick.get_label() == "ppo" and axes.get_legend() is None
+    assert len(axes.texts) == count + 1
 
 
 @pytest.fixture(scope="module")

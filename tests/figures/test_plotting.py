@@ -150,3 +150,15 @@ def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     names = [f"alpha={i}" for i in range(1300)]
     plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), best=None)
     assert kept[0] < 2**16
+
+
+def test_names_at_the_ends_of_lines_are_apart_and_in_order():
+    axes = matplotlib.figure.Figure().subplots()
+    axes.set_ylim(0.0, 10.0)
+    ends = {"a": 9.0, "b": 5.0, "c": 5.0, "d": 4.9, "e": 0.0, "f": 0.0}
+    plotting.label_ends(axes, ends, dict.fromkeys(ends, "black"))
+    places = [text.xy[1] for text in axes.texts]
+    assert [text.get_text() for text in axes.texts] == [*ends]
+    assert (-np.diff(places) > 0.0599).all()
+    # Where there is room a name is at the end of its line.
+    assert places[0] == 0.9 and places[1] == 0.5 and min(places) == 0.0
