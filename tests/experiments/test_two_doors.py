@@ -71,13 +71,13 @@ def test_the_table_counts_seeds():
     counted = rows(
         drawn=[(0.5, 0.45), (1.0, 0.0), (0.3, 0.3), (0.0, 0.0)],
         likely=[(1.0, 0.0), (1.0, 0.0), (0.0, 0.0), (0.0, 0.0)],
-        buffer=[(0.5, 0.5), (1.0, 0.0), (0.5, 0.5), (0.5, 0.2)],
+        buffer=[(0.5, 0.5), (1.0, 0.0), (0.5, 0.5), (0.5, 0.05)],
     )
     last = two_doors.table(counted).splitlines()[-1]
-    assert last == "| one | 4 | 4 | 0.50 | 0.50 | 0.64 | 0.50 | 0.50 | 0.75 |"
+    assert last == "| one | 4 | 4 | 0.50 | 0.50 | 0.64 | 0.50 | 0.50 | 0.50 | 0.75 |"
     for row in counted:
         row |= {"buffer left": nan, "buffer right": nan}
-    assert two_doors.table(counted).endswith("| 0.50 | - |")
+    assert two_doors.table(counted).endswith("| 0.50 | - | - |")
 
 
 def test_both_tables_are_written_and_a_second_call_trains_nothing(
