@@ -155,7 +155,7 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
     [
         ("--env walker", "env 'walker' is unknown: did you mean 'walker2d'? (one"),
         ("--env zoo", "env 'zoo' is unknown: it must be one of point_mass, hopper"),
-        ("--env zoo", "humanoid, brax:NAME, gymnax:NAME, navix:NAME, playground:NAME"),
+        ("--env zoo", "pusher, brax:NAME, gymnax:NAME, navix:NAME, playground:NAME"),
         ("--env gymnx:Catch-bsuite", "did you mean 'gymnax:Catch-bsuite'? (one of br"),
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
         (
