@@ -45,10 +45,10 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
     killed, programs = [], []
 
     def kill():
-        begun = "programs/*/checkpoints/[0-9]*"
+        begun = "programs/*/checkpoints/[0-9]*/manifest.json"
         while not (checkpoints := list(out.glob(begun))):
             time.sleep(0.01)
-        programs.append(checkpoints[0].parent.parent)
+        programs.append(checkpoints[0].parents[2])
         killed.append(process_of(programs[0]))
         os.kill(killed[0], signal.SIGKILL)
 
@@ -94,4 +94,4 @@ def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
     (out / "programs").touch()
     arguments += ["--launcher", "ray", "--shards", "1", "--resume"]
     assert sweep.main(arguments) == 2
-    assert "shard 1/1 (status 2) refused" in capsys.readouterr().err
+    assert "shard 1/1 (status 2): bad input" in capsys.readouterr().err
