@@ -151,7 +151,7 @@ AGENTS_OF = {
     **{
         f"{title}, shared": (name, {**point, "sharing_distance": 0.5})
         for title, (name, point) in AGENTS_OF.items()
-        if point.keys() & _LEARNING.keys() == _LEARNING.keys()
+        if _LEARNING.keys() <= point.keys()
     },
 }
 

@@ -130,6 +130,11 @@ def _body_observations(fields: Fields) -> jax.Array:
     )
 
 
+def _impact_cost(forces: jax.Array) -> jax.Array:
+    """The cost of contact forces for both tasks of the humanoid."""
+    return jnp.minimum(5e-7 * jnp.sum(forces**2), 10.0)
+
+
 def _tip(fields: Fields) -> jax.Array:
     """The upper end of the second pole, x, y, z: its middle is its centre of mass."""
     return 2.0 * fields["xipos"][3] - fields["xpos"][3]
@@ -272,7 +277,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             fields=("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
             position=_mass_centre,
             observe_more=_body_observations,
-            contact_cost=lambda f: jnp.minimum(5e-7 * jnp.sum(f**2), 10.0),
+            contact_cost=_impact_cost,
         ),
         "humanoidstandup": Task(
             gymnasium_id="HumanoidStandup-v5",
@@ -285,7 +290,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             hidden_positions=2,
             fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
             observe_more=_body_observations,
-            contact_cost=lambda f: jnp.minimum(5e-7 * jnp.sum(f**2), 10.0),
+            contact_cost=_impact_cost,
             # The height over the duration of a time step.
             reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
         ),
