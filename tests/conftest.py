@@ -15,6 +15,8 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
     _cache = tempfile.mkdtemp(prefix="gasil-jax-tests-")
     os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
     atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+# XLA reports an error for each program that it loads, where tests compare the output.
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # By default programs that compile in less than a second are compiled by each process.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
