@@ -203,7 +203,7 @@ class Page:
     SLOTS = (
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "grids", "searches", "importance", "ranks", "published"),
-        *("passing", "shares", "lead", "chosen"),
+        *("passing", "shares", "lead", "means", "better", "chosen"),
     )
 
     def __init__(
@@ -288,18 +288,45 @@ class Page:
           *panels: the panels; or "delayed" or "dense", and "raw" for rewards that are
             not normalized; default all.
         """
+        panels = self._chosen(*panels)
+        if not panels:
+            return ""
+        return self._tally(self.scores, self.comparisons, panels)
+
+    def _chosen(self, *panels: str) -> tuple[str, ...]:
+        """Return the panels that `tally`'s arguments name."""
         if panels and panels[0] in ("delayed", "dense"):
             family = (panels[0] == "delayed", panels[1:] == ("raw",))
-            panels = tuple(
+            return tuple(
                 panel
                 for panel, curves in self.figure.panels.items()
                 if next(iter(curves.values())).family[:2] == family
             )
-            if not panels:
-                return ""
         if not set(panels) <= set(self.figure.panels):
             raise self._no_slot("tally", *panels)
-        return self._tally(self.scores, self.comparisons, panels)
+        return panels or tuple(self.figure.panels)
+
+    def better(self, rewards: str, ours: str, *others: str) -> str:
+        """Return on how many tasks a curve is better than others, as half a sentence.
+
+        Args:
+          rewards: "delayed" or "dense"; empty for all panels.
+          ours: the curve.
+          *others: the curves it is compared with.
+        """
+        panels = self._chosen(*filter(None, [rewards]))
+        parts = []
+        for other in others:
+            keys = [(p, ours, other) for p in panels if other in self.figure.panels[p]]
+            verdicts = [
+                self.comparisons[key].verdict for key in keys if key in self.comparisons
+            ]
+            measured = "" if len(verdicts) == len(keys) else " measured"
+            better = verdicts.count("better")
+            parts.append(
+                f"than {other.upper()} on {better} of {len(verdicts)}{measured} tasks"
+            )
+        return f"better {', '.join(parts)}"
 
     def evaluated(self) -> str:
         """Return the tally of evaluated returns, which are a separate family of tests.
@@ -323,7 +350,7 @@ class Page:
         *,
         lacking: str = "not measured yet",
     ) -> str:
-        lines, panels = [], panels or tuple(self.figure.panels)
+        lines, panels = [], panels or self._chosen()
         for other in self.figure.names(panels):
             with_other = [p for p in panels if other in self.figure.panels[p]]
             ours = str(self.figure.rival(with_other[0], other))
@@ -548,6 +575,16 @@ class Page:
             for name in self.figure.names(panels)
             if all((p, name) in solved for p in panels)
         }
+
+    def means(self, kind: str, *names: str) -> str:
+        """Return `mean_shares` of some curves as text, those that are complete.
+
+        Args:
+          kind: "noisy" for the tasks with noise; empty for those without.
+          *names: the curves.
+        """
+        mean = self.mean_shares(kind)
+        return ", ".join(f"{x.upper()} {mean[x]:.2f}" for x in names if x in mean)
 
     def lead(self, ours: str = "", kind: str = "", *others: str) -> str:
         """Return how a curve's shares of solving seeds compare with other curves'.

@@ -32,6 +32,8 @@ from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
 
+#: The pages that tell of several figures.
+SUMMARIES = ("README", "when_self_imitation_helps", "comparisons")
 README = pathlib.Path(__file__).parent.parent / "README.md"
 #: The key of a comparison of a page, and the verdict that a claim expects.
 _Expected = tuple[tuple[str, ...], str]
@@ -110,8 +112,6 @@ def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
 
 
 _OTHERS, _CONTROL = PAPERS[:-1], ("ppo+bonus",)
-#: The agents whose shares of solving seeds the README tells.
-_ON_SPARSE = (*PAPERS, "ppo+novelty", "ppo+bc+novelty")
 _GROWS = [key for key in FIGURES["stochastic_walker2d"].compared() if len(key) == 4]
 CLAIMS = (
     _tuned(
@@ -254,49 +254,8 @@ class Summary:
         return budgets
 
     def front(self) -> str:
-        """Return what reproduces, what ends it, and what is better.
-
-        First with delayed rewards, then with sparse ones.
-        """
-        protocol, tuned, decomposed = (
-            [self._lead(figure, ours, other) for other in others]
-            for figure, ours, others in (
-                ("paper_protocol", "ppo+gasil", _OTHERS),
-                ("matrix", "ppo+gasil", _OTHERS),
-                ("delayed_rewards", "ppo (decomposed)", ("ppo+gasil",)),
-            )
-        )
-        return (
-            "**With delayed rewards**, under [the paper's own protocol]"
-            "(experiments/results/paper_protocol.md), PPO+GASIL is better than "
-            f"{', than '.join(protocol)}. If lambda, gamma, exploration and the "
-            "learning rate are [tuned for every agent](experiments/results/matrix.md) "
-            f"too, it is better than {', than '.join(tuned)}. PPO that [learns which "
-            "steps earned a reward](experiments/results/delayed_rewards.md), without "
-            f"imitation, is better than the tuned {decomposed[0]}.\n\n"
-            f"{self._sparse()}"
-        )
-
-    def _sparse(self) -> str:
-        """Return how often agents with one setting each solve the sparse tasks."""
-        mean = self.pages["sparse"].mean_shares()
-        agents = [x for x in _ON_SPARSE if x in mean]
-        listed = ", ".join(f"{x.upper()} {mean[x]:.2f}" for x in agents)
-        return (
-            "**With sparse rewards**, and one setting of each agent for [all of these "
-            "tasks](experiments/results/sparse.md), the mean share of seeds that solve "
-            f"a task is: {listed}. NOVELTY explores what it has seldom seen; BC clones "
-            "the best episodes."
-        )
-
-    def _lead(self, name: str, ours: str, other: str) -> str:
-        """Return on how many delayed tasks an agent is better than another one."""
-        keys = [(name_of(env, DELAY), ours, other) for env in TASKS]
-        compared = self.pages[name].comparisons
-        verdicts = [compared[key].verdict for key in keys if key in compared]
-        measured = "" if len(verdicts) == len(keys) else " measured"
-        better = verdicts.count("better")
-        return f"{other.upper()} on {better} of {len(verdicts)}{measured} tasks"
+        """Return the README's text on the results."""
+        return self.text("front").rstrip()
 
     def figures(self) -> str:
         """Return links to the pages of all figures."""
@@ -318,9 +277,9 @@ class Summary:
             f"{', '.join(self.SLOTS)}, or a figure and its slot"
         )
 
-    def text(self) -> str:
-        """Return the page of all claims as Markdown."""
-        return report.fill((report.NOTES / "README.md").read_text(), self.value)
+    def text(self, page: str) -> str:
+        """Return a page of `SUMMARIES` as Markdown."""
+        return report.fill((report.NOTES / f"{page}.md").read_text(), self.value)
 
     def tuned(self) -> str:
         """Return the tuned presets as JSON, updated by what complete searches chose."""
@@ -347,12 +306,12 @@ class Summary:
         return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
     def write(self) -> None:
-        """Write the page of all claims, the README's blocks and the presets."""
+        """Write the pages of all claims, the README's blocks and the presets."""
         text = report.fill_blocks(README.read_text(), self.value)
         picture = plots.draw_search_budget(self.budgets())
         plots.save_png(picture, RESULTS / "search_budget.png")
         for path, content in (
-            (RESULTS / "README.md", self.text()),
+            *((RESULTS / f"{page}.md", self.text(page)) for page in SUMMARIES),
             (README, text),
             (presets.TUNED, self.tuned()),
         ):

@@ -92,6 +92,7 @@ def test_a_page_tells_shares_and_verdicts(tmp_path):
     assert "| mean | 0.00 |" in table and "1.00 (1)" in table
     words = "novelty against ppo: mean share +1.00 [+1.00, +1.00], better; better on 3"
     assert f"{words} of 3 tasks" in page.lead("novelty")
+    assert page.value("means", "", "ppo", "novelty") == "PPO 0.00, NOVELTY 1.00"
     assert "How to read this" in page.text()
     assert page.picture().axes
     with pytest.raises(InputError):
