@@ -2,5 +2,6 @@
 
 from gasil_jax.host import interruption
 
-interruption.quit_during_imports(__name__)
+if interruption.runs_as_program(__name__):
+    interruption.quit_during_imports()
 del interruption

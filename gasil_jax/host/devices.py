@@ -45,8 +45,9 @@ def _keep_compiled_programs() -> None:
     There is a folder for each version of jaxlib and each processor, because a program
     compiled for another one may crash.
     """
-    # Older versions print a warning for every program that is loaded from the cache.
+    # Older versions report an error for every program that is loaded from the cache.
     quiet = jaxlib.version.__version_info__ >= (0, 12)
+    quiet |= os.environ.get("TF_CPP_MIN_LOG_LEVEL", "") >= "3"
     config: Any = jax.config  # Its type does not declare its options.
     if config.jax_compilation_cache_dir is not None or not quiet:
         return

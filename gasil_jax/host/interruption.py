@@ -9,16 +9,19 @@ from types import FrameType
 from typing import Any
 
 
-def quit_during_imports(package: str) -> None:
-    """Let Ctrl-C end this process in a line until `allow_interrupts` is called.
+def runs_as_program(package: str) -> bool:
+    """Whether Python is about to run a module of the package as a program.
 
-    Only if Python is about to run a module of the package as a program: it imports the
-    package before it.
+    It imports the package before it. While it looks for the module that -m names, the
+    first argument is "-m".
     """
     ours = any(x.removeprefix("-m").split(".")[0] == package for x in sys.orig_argv)
-    default = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    # While Python looks for the module that -m names, the first argument is "-m".
-    if ours and default and sys.argv[:1] == ["-m"]:
+    return ours and sys.argv[:1] == ["-m"]
+
+
+def quit_during_imports() -> None:
+    """Let Ctrl-C end this process in a line until `allow_interrupts` is called."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _quit)
 
 

@@ -47,18 +47,19 @@ raise ImportError
 
 
 def test_only_commands_of_the_package_take_ctrl_c_for_themselves(monkeypatch):
-    before = signal.getsignal(signal.SIGINT)
     cases = {
-        ("-m", "-m theirs"): before,
-        ("theirs.py", "theirs.py"): before,
-        ("/gasil_jax/run.py", "-m gasil_jax.run"): before,
-        ("-m", "-m gasil_jax.run"): interruption._quit,
+        ("-m", "-m theirs"): False,
+        ("theirs.py", "theirs.py"): False,
+        ("/gasil_jax/run.py", "-m gasil_jax.run"): False,
+        ("-m", "-m gasil_jax.run"): True,
     }
-    for (first, given), handler in cases.items():
+    for (first, given), ours in cases.items():
         monkeypatch.setattr(sys, "argv", [first])
         monkeypatch.setattr(sys, "orig_argv", ["python", *given.split()])
-        interruption.quit_during_imports("gasil_jax")
-        assert signal.getsignal(signal.SIGINT) is handler
+        assert interruption.runs_as_program("gasil_jax") is ours
+    before = signal.getsignal(signal.SIGINT)
+    interruption.quit_during_imports()
+    assert signal.getsignal(signal.SIGINT) is interruption._quit
     interruption.allow_interrupts()
     assert signal.getsignal(signal.SIGINT) is before
 

@@ -37,9 +37,13 @@ SMALL = (
 OFTEN = ("--checkpoint-every", str(20 * 128))
 
 
-def start(out, *arguments):
+def start(out, *arguments, cache):
+    """Start a run that keeps compiled programs in a folder of the user's cache."""
+    tests = ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL")
+    mine = {name: value for name, value in os.environ.items() if name not in tests}
     return subprocess.Popen(
         [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
+        env=mine | {"XDG_CACHE_HOME": str(cache)},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -70,13 +74,18 @@ def rows(out):
 
 
 @pytest.fixture(scope="module")
-def whole_and_memory(tmp_path_factory):
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="module")
+def whole_and_memory(tmp_path_factory, cache):
     """An undisturbed run without checkpoints on the way, and its memory in MB.
 
     The memory is that of the process after 80, 200, 300 and 390 iterations.
     """
     out = tmp_path_factory.mktemp("whole") / "out"
-    child = start(out, *SMALL)
+    child = start(out, *SMALL, cache=cache)
     statistics = pathlib.Path(f"/proc/{child.pid}/statm")
     memory = []
     for iterations in (80, 200, 300, 390):
@@ -113,12 +122,14 @@ def interrupt_at_call(count, number, monkeypatch):
 
 
 def test_killed_again_and_again_it_ends_as_if_undisturbed(
-    whole, tmp_path, monkeypatch, capsys
+    whole, cache, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "out"
+    compiled = {x.name: x.stat().st_mtime_ns for x in cache.rglob("*-cache")}
+    assert compiled
 
     # While it runs, its folder is locked.
-    child = start(out, *SMALL, "--checkpoint-every", str(10**9))
+    child = start(out, *SMALL, "--checkpoint-every", str(10**9), cache=cache)
     wait_for(lambda: rows(out) > 30, child)
     assert run.main(["--resume", "--out", str(out)]) == 2
     assert f"process {child.pid}" in capsys.readouterr().err
@@ -130,11 +141,14 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(
     assert checkpoints(out) == []
 
     # After one, with rows in metrics.csv that it has not seen.
-    child = start(out, "--resume", *OFTEN)
+    child = start(out, "--resume", *OFTEN, cache=cache)
     new = lambda: checkpoints(out)
     wait_for(lambda: new() and rows(out) > 1 + 3 * (int(max(new())) + 5), child)
     child.kill()
-    finish(child)
+    _, _, err = finish(child)
+    # Both have loaded what the undisturbed run compiled, and XLA told nothing.
+    again = {x.name: x.stat().st_mtime_ns for x in cache.rglob("*-cache")}
+    assert again == compiled and "Loading" not in err
 
     # From here on in this process: programs and folders are the same. SIGTERM and
     # Ctrl-C save and say how to continue.
