@@ -23,7 +23,7 @@ CELLS = ["1.5", "inf", "1e999", "a", '"', "é", "0x1"]
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     parent = tmp_path_factory.mktemp("whole")
-    # The two points of one seed are as many members as the run's, and share its program.
+    # Two points of one seed are as many members as the run has, and share its program.
     grid = ["--seeds", "1", "--grid", "gamma=0.9,0.99"]
     assert run.main([*SMALL, "--out", str(parent / "run")]) == 0
     assert sweep.main([*SMALL, *grid, "--out", str(parent / "sweep")]) == 0
