@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Annotated, Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import tyro
 
@@ -106,8 +105,8 @@ def _score(options: Options, policies: Policies) -> dict[str, np.ndarray]:
     def fold(seed: jax.Array) -> jax.Array:
         return jax.random.fold_in(jax.random.key(options.key), seed)
 
-    keys = jax.vmap(fold)(jnp.array(policies.seeds, jnp.uint32))
-    weights = jax.tree.map(lambda *x: jnp.stack(x), *policies.weights)
+    keys = jax.jit(jax.vmap(fold))(np.array(policies.seeds, np.uint32))
+    weights = jax.tree.map(lambda *x: np.stack(x), *policies.weights)
     return jax.tree.map(np.asarray, jax.jit(jax.vmap(score))(weights, keys))
 
 

@@ -31,7 +31,7 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
     """
     learner = state.actor_critic.policy
     params = learner.params["params"]
-    mean, scale = normalization.moments(state.normalizer)
+    mean, scale = jax.jit(normalization.moments)(state.normalizer)
     arrays: dict[str, Any] = {"mean": mean, "scale": scale}
     if wrappers.is_discrete(env):
         arrays["num_actions"] = np.int32(env.num_actions)

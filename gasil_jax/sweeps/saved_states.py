@@ -129,7 +129,13 @@ def load(
         if seed not in seeds:
             raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
         seeds = [seed]
-    stacked = jax.tree.map(lambda *x: jnp.stack(x), *(states[x] for x in seeds))
+
+    # JAX would compile a program for each shape, but only it can stack random keys.
+    def stack(*leaves: Any) -> jax.Array:
+        library = jnp if isinstance(leaves[0], jax.Array) else np
+        return jax.device_put(library.stack(leaves))
+
+    stacked = jax.tree.map(stack, *(states[x] for x in seeds))
     first, (index, *_) = every[0]
     return env, first.runs[index].algorithm, seeds, stacked
 

@@ -320,26 +320,29 @@ def test_without_a_name_the_figures_are_listed(capsys):
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
 def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
-    """The second run is only requested once the first is stored, as after a search."""
+    """The last run is only requested once the first is stored, as after a search.
+
+    One that fails, beside the first, keeps none from being trained.
+    """
     store = Store(tmp_path / "store")
     setup = Setup(tmp_path / "runs", evaluate_episodes=2, processes=2, members=1)
+    broken = run(7, num_envs=256, batch_steps=128)
+    first, _, last = RUNS
 
     def missing():
         stored = Store(store.folder)
-        later = RUNS[2:] if not stored.missing(RUNS[:2]) else []
-        return stored.missing([*RUNS[:2], *later])
+        later = [] if stored.missing([first]) else [last]
+        return stored.missing([first, broken, *later])
 
-    engine.train_in_processes(missing, store, setup)
+    with pytest.raises(InputError, match=r"1 programs failed: see .*\.log"):
+        engine.train_in_processes(missing, store, setup)
     stored, (*_, alone) = Store(store.folder), trained
-    for one in RUNS:
+    for one in (first, last):
         same = np.testing.assert_allclose
         same(stored[one].episode_return, alone[one].episode_return, rtol=1e-4)
         assert len(stored[one].evaluation_return)
     logs = list((tmp_path / "runs").glob("*/*.log"))
     assert len(logs) == 3
-    broken = run(7, num_envs=256, batch_steps=128)
-    with pytest.raises(InputError, match=r"1 programs failed: see .*\.log"):
-        engine.train_in_processes(lambda: [broken], store, setup)
     with pytest.raises(InputError, match=r"processes is 9999: it must be at most"):
         many = dataclasses.replace(setup, processes=9999)
         engine.train_in_processes(missing, store, many)

@@ -7,6 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from small_training import FLAGS
 
 from gasil_jax import merge, plot, run, sweep
@@ -22,7 +23,8 @@ CELLS = ["1.5", "inf", "1e999", "a", '"', "é", "0x1"]
 @pytest.fixture(scope="module")
 def folders(tmp_path_factory):
     parent = tmp_path_factory.mktemp("whole")
-    grid = ["--grid", "gamma=0.9,0.99"]
+    # Two points of one seed are as many members as the run has, and share its program.
+    grid = ["--seeds", "1", "--grid", "gamma=0.9,0.99"]
     assert run.main([*SMALL, "--out", str(parent / "run")]) == 0
     assert sweep.main([*SMALL, *grid, "--out", str(parent / "sweep")]) == 0
     return parent
@@ -63,7 +65,11 @@ def alter(path, draw):
     path.write_text("\n".join([*lines, ""]))
 
 
-def test_an_altered_file_is_refused_or_changes_nothing(folders, tmp_path, capsys):
+def test_an_altered_file_is_refused_or_changes_nothing(
+    folders, tmp_path, capsys, monkeypatch
+):
+    # To render pictures takes most of a command's time.
+    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.touch())
     draw, work, figures = np.random.default_rng(0), tmp_path / "work", iter(range(9999))
 
     def ended(name, arguments, path=None):

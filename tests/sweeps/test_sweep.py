@@ -217,19 +217,21 @@ def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
 
     alone = tmp_path / "alone"
     more = ("--discriminator-updates", "3", "--out", str(alone))
-    assert run.main([*SMALL, "--seeds", "2", *more]) == 0
+    # As many members as a program of the sweep has, which it shares.
+    assert run.main([*SMALL, "--seeds", "4", *more]) == 0
     expected = json.loads((alone / "summary.json").read_text())["final_return"]
     result = {
         row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
     }
-    assert result == pytest.approx(expected, rel=1e-3, abs=1e-3)
+    single = {seed: expected[seed] for seed in ("0", "1")}
+    assert result == pytest.approx(single, rel=1e-3, abs=1e-3)
     _, algorithm, seeds, states = saved_states.load(out, point=1)
     assert algorithm.agent.discriminator_updates == 3 and seeds == [0, 1]
     _, _, _, by_itself = saved_states.load(alone)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
         states.actor_critic.params,
-        by_itself.actor_critic.params,
+        jax.tree.map(lambda x: np.asarray(x)[:2], by_itself.actor_critic.params),
     )
     with pytest.raises(ValueError, match="it must be 'last'"):
         saved_states.load(out, "best", point=1)
