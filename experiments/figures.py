@@ -37,6 +37,8 @@ from experiments.search import (
     PAPERS,
     SPARSE,
     SPARSE_BASE,
+    SPARSE_GRIDS,
+    SPARSE_ROBOTS,
     SPARSE_SEARCHED,
     SPARSE_SPACES,
     SPARSE_STEPS,
@@ -361,6 +363,7 @@ def _changes() -> Comparisons:
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
+_NOISY_ROBOTS = [f"{env}_noisy" for env in SPARSE_ROBOTS]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
@@ -651,10 +654,15 @@ FIGURES: Mapping[str, Figure] = {
         "Sparse rewards: imitation, and exploration",
         "",
         joined(
-            grid(tasks, arms, base=base, seeds=20, total_steps=SPARSE_STEPS)
+            grid(tasks, arms, base=base, seeds=20, total_steps=steps)
+            for tasks, noisy, steps in (
+                (SPARSE, _NOISY, SPARSE_STEPS),
+                (SPARSE_ROBOTS, _NOISY_ROBOTS, STEPS),
+                (SPARSE_GRIDS, (), STEPS),
+            )
             for tasks, arms, base in (
-                ((*SPARSE, *_NOISY), [*SPARSE_SPACES], SparseSearch),
-                (SPARSE, _SPARSE_SHARED, SparseShared),
+                ((*tasks, *noisy), [*SPARSE_SPACES], SparseSearch),
+                (tasks, _SPARSE_SHARED, SparseShared),
             )
         ),
         searches={

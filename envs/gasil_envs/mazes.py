@@ -1,4 +1,4 @@
-"""Sparse tasks by name, as sparse:NAME: mazes of a point or a grid, deep sea, a car.
+"""Sparse tasks by name, as sparse:NAME: mazes, deep sea, a car, and far robots.
 
 Nothing is paid until a long sequence of right actions has succeeded once. A maze is
 data: rows of characters, one for each cell. `#` is a wall and `S` the start. `G`, a
@@ -17,7 +17,7 @@ import numpy as np
 from brax.envs import State
 from flax import struct
 
-from gasil_envs import wrappers
+from gasil_envs import locomotion, wrappers
 
 #: The reward of each object, which is collected once, and those that end an episode.
 REWARDS: Mapping[str, float] = {"G": 1.0, "K": 1.0, "A": 1.0, "T": 10.0}
@@ -341,6 +341,33 @@ class MountainCar:
         return _enlarged(picture, size, np.array([ground[int(column)] - 1, column]), 2)
 
 
+class FarRobot(locomotion.Locomotion):
+    """A robot that gets 1 for each step that ends beyond a distance, and no more.
+
+    VIME's SparseHalfCheetah (Houthooft et al. 2016) is this with 5 m. Episodes end as
+    in the robot's own task. All of its position is observed, as it decides the reward.
+
+    Args:
+      name: the robot, one of `locomotion.TASKS`.
+      metres: the distance.
+    """
+
+    solved = 500.0
+
+    def __init__(self, name: str, metres: float):
+        task = dataclasses.replace(
+            locomotion.TASKS[name],
+            gymnasium_id=None,
+            forward_reward=0.0,
+            control_cost=0.0,
+            contact_cost=None,
+            healthy_reward=1.0,
+            paid_beyond=metres,
+            hidden_positions=0,
+        )
+        super().__init__(task)
+
+
 def _enlarged(
     cells: np.ndarray, size: tuple[int, int], at: np.ndarray, radius: float = 0.35
 ) -> np.ndarray:
@@ -396,6 +423,15 @@ class ActionNoise:
         return self._env.step(state.replace(info=info), action)
 
 
+#: How far each robot must go, in metres.
+ROBOTS: Mapping[str, float] = {
+    "hopper": 1.0,
+    "halfcheetah": 5.0,
+    "walker2d": 1.0,
+    "swimmer": 3.0,
+    "ant": 3.0,
+    "humanoid": 0.6,
+}
 #: The tasks without noise, by name.
 TASKS: Mapping[str, Any] = {
     "u_maze": Layout(_U, 150),
@@ -413,6 +449,7 @@ TASKS: Mapping[str, Any] = {
     "two_keys_maze": Layout(_TWO_KEYS, 200, speed=0.25, solved=10.0),
     "far_key_maze": Layout(_FAR_KEY, 250, speed=0.3, solved=10.0),
     "two_doors": Layout(_TWO_DOORS, 25, speed=1.0),
+    **ROBOTS,
 }
 _NOISY, _NOISE = "_noisy", {"point": 0.5, "discrete": 0.1}
 
@@ -428,10 +465,13 @@ def build(name: str) -> Any:
     Args:
       name: one of `names`.
     """
-    task = TASKS[name.removesuffix(_NOISY)]
+    bare = name.removesuffix(_NOISY)
+    task = TASKS[bare]
     env: Any
     if isinstance(task, Layout):
         env = Maze(task)
+    elif bare in ROBOTS:
+        env = FarRobot(bare, task)
     else:
         env = MountainCar() if task is None else DeepSea(task)
     if not name.endswith(_NOISY):

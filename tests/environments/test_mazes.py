@@ -6,13 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environment_contract import check_reset_and_step
+from environment_contract import BATCH, check_reset_and_step
 
 import gasil_envs
-from gasil_envs import mazes, own_environment, pictures, wrappers
+from gasil_envs import locomotion, mazes, own_environment, pictures, wrappers
 
 
-@pytest.mark.parametrize("name", mazes.names())
+def is_robot(name):
+    return name.removesuffix("_noisy") in mazes.ROBOTS
+
+
+@pytest.mark.parametrize("name", [x for x in mazes.names() if not is_robot(x)])
 def test_reset_and_step(name):
     env = gasil_envs.make(f"sparse:{name}")
     own_environment.check(name, env.env, env)
@@ -25,6 +29,44 @@ def test_reset_and_step(name):
     state = env.reset(jax.random.key(0)).pipeline_state
     picture = pictures.painter(env, (60, 40)).draw([jax.tree.map(np.asarray, state)])
     assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()
+
+
+@pytest.mark.parametrize("name", ["hopper", "halfcheetah_noisy"])
+def test_a_robot_is_paid_for_each_healthy_step_beyond_its_distance_alone(name):
+    env = gasil_envs.make(f"sparse:{name}")
+    own_environment.check(name, env.env, env)
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    check_reset_and_step(env, reset, step)
+    start = reset(jax.random.split(jax.random.key(0), BATCH))
+    physics = start.pipeline_state.physics
+    metres = mazes.ROBOTS[name.removesuffix("_noisy")]
+    moved = metres + jnp.linspace(-0.1, 0.1, BATCH)
+    # Every other robot lies on its head, which ends a hopper's episode.
+    qpos = physics.qpos.at[:, 0].set(moved).at[::2, 2].set(2.0)
+    inner = start.pipeline_state.replace(physics=physics.replace(qpos=qpos))
+    after = step(
+        start.replace(pipeline_state=inner), jnp.zeros((BATCH, env.action_size))
+    )
+    x = np.array(after.pipeline_state.physics.qpos[:, 0])
+    paid = (x > metres) & ~np.array(after.done, bool)
+    np.testing.assert_array_equal(after.reward, np.where(paid, 1.0, 0.0))
+    assert 0.2 < paid.mean() < 0.6 and (after.done.mean() == 0.5) == env.ends_early
+    # What decides the reward is seen.
+    np.testing.assert_array_equal(after.obs[:, 0], x)
+
+
+@pytest.mark.parametrize("name", mazes.ROBOTS)
+def test_a_robot_sees_all_of_its_position_and_moves_as_in_its_own_task(name):
+    env, own = gasil_envs.make(f"sparse:{name}"), locomotion.TASKS[name]
+    theirs = gasil_envs.make(name).unwrapped
+    assert env.observation_size == theirs.observation_size + own.hidden_positions
+    assert env.action_size == theirs.action_size
+    assert env.unwrapped.ends_early == theirs.ends_early
+    assert env.unwrapped.solved < env.episode_length
+    # A start of its own task is observed as there.
+    key = jax.random.key(0)
+    first = env.reset(key).obs[own.hidden_positions :]
+    np.testing.assert_array_equal(first, theirs.reset(key).obs)
 
 
 MAZES = [name for name, x in mazes.TASKS.items() if isinstance(x, mazes.Layout)]
