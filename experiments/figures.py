@@ -394,6 +394,7 @@ _CAUSES = [
             ("one episode", {"buffer_episodes": 1}),
         )
     ),
+    Arm("cloning, by the gap", "ppo+bc-adaptive", _CLONED),
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
     Arm(
