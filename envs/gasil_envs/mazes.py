@@ -387,42 +387,6 @@ def _enlarged(
     return picture
 
 
-class ActionNoise:
-    """Add noise to the actions of an environment.
-
-    A vector gets Gaussian noise of the deviation `scale` in units of half its range; a
-    discrete action is replaced, with the probability `scale`, by a random one.
-    """
-
-    def __init__(self, env: Any, scale: float):
-        self._env, self._scale = env, scale
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_env":
-            raise AttributeError(name)
-        return getattr(self._env, name)
-
-    def reset(self, rng: jax.Array) -> State:
-        """Start an episode; `rng` also draws the noise of its steps."""
-        env_key, key = jax.random.split(rng)
-        state = self._env.reset(env_key)
-        return state.replace(info={**state.info, "action_noise_key": key})
-
-    def step(self, state: State, action: jax.Array) -> State:
-        """Take a step with another action."""
-        key, first, second = jax.random.split(state.info["action_noise_key"], 3)
-        if wrappers.is_discrete(self._env):
-            other = jax.random.randint(first, (), 0, self._env.num_actions)
-            is_other = jax.random.bernoulli(second, self._scale)
-            action = jnp.where(is_other, other, action)
-        else:
-            low, high = wrappers.action_range(self._env)
-            noise = jax.random.normal(first, action.shape)
-            action = action + self._scale * 0.5 * (high - low) * noise
-        info = {**state.info, "action_noise_key": key}
-        return self._env.step(state.replace(info=info), action)
-
-
 #: How far each robot must go, in metres.
 ROBOTS: Mapping[str, float] = {
     "hopper": 1.0,
@@ -477,4 +441,4 @@ def build(name: str) -> Any:
     if not name.endswith(_NOISY):
         return env
     kind = "discrete" if wrappers.is_discrete(env) else "point"
-    return ActionNoise(env, _NOISE[kind])
+    return wrappers.ActionNoise(env, _NOISE[kind])

@@ -205,7 +205,7 @@ def test_a_car_that_pushes_with_its_velocity_leaves():
 
 
 def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
-    env = mazes.ActionNoise(mazes.build("u_maze"), 0.5)
+    env = wrappers.ActionNoise(mazes.build("u_maze"), 0.5)
     step = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(2)))
     moved = jax.vmap(step)(jax.random.split(jax.random.key(0), 500))
     moves = (
@@ -219,10 +219,43 @@ def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
     np.testing.assert_array_equal(
         step(jax.random.key(3)).obs, step(jax.random.key(3)).obs
     )
-    grid = mazes.ActionNoise(mazes.build("key_grid"), 0.4)
+    grid = wrappers.ActionNoise(mazes.build("key_grid"), 0.4)
     after = jax.vmap(lambda key: grid.step(grid.reset(key), jnp.int32(1)))(
         jax.random.split(jax.random.key(1), 1000)
     )
     other = jax.vmap(grid.reset)(jax.random.split(jax.random.key(1), 1000))
     down = after.pipeline_state.position[:, 0] - other.pipeline_state.position[:, 0]
     assert np.mean(down == 1) == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize(("name", "noise"), [("u_maze", 0.5), ("key_grid", 0.1)])
+def test_a_noisy_task_is_the_task_with_noise_on_its_actions(name, noise):
+    envs = [
+        gasil_envs.make(f"sparse:{name}", action_noise=noise),
+        gasil_envs.make(f"sparse:{name}_noisy"),
+        gasil_envs.make(f"sparse:{name}"),
+    ]
+
+    def walk(env):
+        zero = wrappers.zero_action(env)
+        start = env.reset(jax.random.key(0))
+        step = lambda state, _: (env.step(state, zero), state.pipeline_state.position)
+        return jax.jit(lambda x: jax.lax.scan(step, x, length=40)[1])(start)
+
+    given, noisy, calm = map(walk, envs)
+    np.testing.assert_array_equal(given, noisy)
+    assert (np.array(given) != calm).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "noise", "allowed"),
+    [
+        ("sparse:u_maze_noisy", 0.1, "0: sparse:u_maze_noisy has its own"),
+        ("sparse:key_grid", 1.5, "at most 1, a share, for sparse:key_grid"),
+        ("hopper", -1.0, "finite and 0 or more"),
+        ("hopper", "loud", "finite and 0 or more"),
+    ],
+)
+def test_noise_that_can_not_be_is_refused(name, noise, allowed):
+    with pytest.raises(ValueError, match=f"^action_noise is .*: it must be {allowed}$"):
+        gasil_envs.make(name, action_noise=noise)

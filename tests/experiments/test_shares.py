@@ -122,6 +122,9 @@ def test_longer_tasks_are_told_apart_and_without_their_package(tmp_path, monkeyp
     share = len(SPARSE_GRIDS) / len((*SPARSE_ROBOTS, *SPARSE_GRIDS))
     assert page().mean_shares("long")["ppo"] == pytest.approx(share)
     assert page().mean_shares()["ppo"] == 1.0
+    for panel, noise in ((SPARSE_GRIDS[0], 0.0), (f"{SPARSE_GRIDS[0]}_noisy", 0.1)):
+        runs = figure.panels[panel]["ppo+bc"].runs(store)
+        assert {run.settings.action_noise for run in runs} == {noise}
     table = page().shares("long")
     assert "| halfcheetah | 0.00 |" in table and "maze" not in table
     assert page().shares("long noisy") == ""  # Nothing of it is stored.
