@@ -31,6 +31,7 @@ class Curve:
       changes: settings of the algorithm to change, by name.
       reward_delay: the task's reward delay, in steps.
       obs_noise: standard deviation of the task's observation noise.
+      action_noise: noise on the task's actions, see `Settings`.
       terminal_limits: whether the task's step limit terminates an episode.
       observe_phase: whether the observation has the phase of the task's delay.
       base: the settings before the changes: a preset's, by its name; the defaults, by
@@ -46,6 +47,7 @@ class Curve:
     changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
     obs_noise: float = 0.0
+    action_noise: float = 0.0
     terminal_limits: bool = False
     observe_phase: bool = False
     base: str | Callable[[str, str, int], Search] | None = "tuned"
@@ -94,6 +96,7 @@ class Curve:
         settings = Settings(
             reward_delay=self.reward_delay,
             obs_noise=self.obs_noise,
+            action_noise=self.action_noise,
             terminal_limits=self.terminal_limits,
             observe_phase=self.observe_phase,
         )

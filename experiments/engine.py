@@ -103,6 +103,8 @@ def title(program: Program) -> str:
     words = [f"{run.env} {run.algorithm.agent.name}"]
     words += [f"{config.num_envs} environments"]
     words += [f"delayed {delay}"] if delay > 1 else []
+    noise = run.settings.action_noise
+    words += [f"noise {noise:g} on actions"] if noise else []
     words += [] if config.stagger_episodes else ["in step"]
     words += [f"seed {run.seed}" if count == 1 else f"{count} runs"]
     return ", ".join(words)

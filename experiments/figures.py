@@ -37,6 +37,8 @@ from experiments.search import (
     PAPERS,
     SPARSE,
     SPARSE_BASE,
+    SPARSE_GRIDS,
+    SPARSE_ROBOTS,
     SPARSE_SEARCHED,
     SPARSE_SPACES,
     SPARSE_STEPS,
@@ -361,9 +363,25 @@ def _changes() -> Comparisons:
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
+_NOISY_ROBOTS = [f"{env}_noisy" for env in SPARSE_ROBOTS]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
+
+
+def _sparse_panels(
+    tasks: Sequence[str], shared: Sequence[str], total_steps: int
+) -> list[Panels]:
+    """Return all agents on tasks, and on some of them those with PPO's values too."""
+    return [
+        grid(own, arms, base=base, seeds=20, total_steps=total_steps)
+        for own, arms, base in (
+            (tasks, [*SPARSE_SPACES], SparseSearch),
+            (shared, _SPARSE_SHARED, SparseShared),
+        )
+    ]
+
+
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
 _GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
 _CENTRED = {**_GASIL, "bonus": "centered"}
@@ -391,6 +409,7 @@ _CAUSES = [
             ("one episode", {"buffer_episodes": 1}),
         )
     ),
+    Arm("cloning, by the gap", "ppo+bc-adaptive", _CLONED),
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
     Arm(
@@ -651,11 +670,20 @@ FIGURES: Mapping[str, Figure] = {
         "Sparse rewards: imitation, and exploration",
         "",
         joined(
-            grid(tasks, arms, base=base, seeds=20, total_steps=SPARSE_STEPS)
-            for tasks, arms, base in (
-                ((*SPARSE, *_NOISY), [*SPARSE_SPACES], SparseSearch),
-                (SPARSE, _SPARSE_SHARED, SparseShared),
-            )
+            [
+                *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
+                *_sparse_panels((*SPARSE_ROBOTS, *_NOISY_ROBOTS), SPARSE_ROBOTS, STEPS),
+                *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
+                grid(
+                    SPARSE_GRIDS,
+                    [*SPARSE_SPACES],
+                    panel="{env}_noisy",
+                    action_noise=0.1,
+                    base=SparseSearch,
+                    seeds=20,
+                    total_steps=STEPS,
+                ),
+            ]
         ),
         searches={
             f"{env} {agent}": SparseSearch(env, agent)

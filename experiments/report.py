@@ -40,6 +40,7 @@ from experiments.search import (
     SPACES,
     SPARSE,
     SPARSE_PROTOCOL,
+    SPARSE_STEPS,
     TASKS,
     importance,
     mean_ranks,
@@ -524,9 +525,19 @@ class Page:
         }
 
     def _sparse(self, kind: str) -> list[str]:
-        """Return the panels of tasks with noise, for "noisy", or without."""
-        noisy = kind == "noisy"
-        return [x for x in self.figure.panels if x.endswith("_noisy") == noisy]
+        """Return the panels of a kind of tasks.
+
+        Args:
+          kind: words: "noisy" for tasks with noise, and "long" for those that are
+            trained longer than the others; default those without either.
+        """
+        return [
+            panel
+            for panel, curves in self.figure.panels.items()
+            if panel.endswith("_noisy") == ("noisy" in kind)
+            and (next(iter(curves.values())).total_steps > SPARSE_STEPS)
+            == ("long" in kind)
+        ]
 
     def shares(self, kind: str = "") -> str:
         """Return the share of seeds that solve each task: a column for each curve.
@@ -534,13 +545,15 @@ class Page:
         In brackets are the thousands of steps until then, the median over those seeds.
 
         Args:
-          kind: "noisy" for the tasks with noise; default those without.
+          kind: the kind of tasks, see `_sparse`.
         """
         solved, from_ = self._solved(), self.figure.solved_from
         panels = self._sparse(kind)
         names = self.figure.names(panels)
         rows = []
         for panel in panels:
+            if not any((panel, name) in solved for name in names):
+                continue
             cells = [panel.removeprefix("sparse:")]
             for name in names:
                 cell = ""
@@ -558,8 +571,8 @@ class Page:
                 cells.append(cell)
             rows.append(cells)
         mean = self.mean_shares(kind)
-        means = [f"{mean[x]:.2f}" if x in mean else "" for x in names]
-        return markdown_table(["task", *names], [*rows, ["mean", *means]])
+        means = ["mean", *(f"{mean[x]:.2f}" if x in mean else "" for x in names)]
+        return markdown_table(["task", *names], [*rows, means] if rows else [])
 
     def mean_shares(self, kind: str = "") -> dict[str, float]:
         """Return the mean over tasks of the shares of solving seeds, by curve.
@@ -567,7 +580,7 @@ class Page:
         Only of curves that are complete on all tasks.
 
         Args:
-          kind: "noisy" for the tasks with noise; default those without.
+          kind: the kind of tasks, see `_sparse`.
         """
         solved, panels = self._solved(), self._sparse(kind)
         return {
@@ -594,7 +607,7 @@ class Page:
         Args:
           ours: the curve, which is compared with each other one; default the figure's
             own comparisons.
-          kind: "noisy" for the tasks with noise; default those without.
+          kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
         solved, panels = self._solved(), self._sparse(kind)

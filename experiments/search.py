@@ -344,6 +344,10 @@ SPARSE = tuple(
         *("key_grid_large", "u_maze_large", "two_keys_maze", "far_key_maze"),
     )
 )
+#: Sparse tasks that are trained longer, for `STEPS`: robots, and a grid of navix. No
+#: search trains on them. (In navix 0.7.4 no action reaches the ball of KeyCorridor.)
+SPARSE_ROBOTS = ("sparse:hopper", "sparse:halfcheetah")
+SPARSE_GRIDS = ("navix:Navix-DoorKey-6x6-v0",)
 _ENTROPIES: Space = {"entropy_coefficient": (0.0, 0.01, 0.03)}
 #: Those that the searches train on; the others have no part in any choice.
 SPARSE_SEARCHED = tuple(SPARSE[i] for i in (0, 2, 4, 6, 7))
@@ -367,9 +371,9 @@ SPARSE_BASE: Point = {
 
 #: How the searches of the sparse tasks choose, for the page.
 SPARSE_PROTOCOL = (
-    f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps, rewards "
-    "normalized. For every agent six points were tried, each with "
-    f"{len(_SPARSE_SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
+    f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps ({STEPS:,} for "
+    "robots and navix), rewards normalized. For every agent six points were tried, "
+    f"each with {len(_SPARSE_SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
     f"{', '.join(x.partition(':')[2] for x in SPARSE_SEARCHED)}: three weights of the "
     "entropy, and two learning rates for PPO or two weights of imitation or of novelty "
     "for the others. The point with the highest return over the last fifth of "
@@ -441,6 +445,9 @@ class SparseShared(SparseSearch):
 @functools.cache
 def solved_from(env: str) -> float:
     """Return the return from which on a sparse task is solved."""
+    if env in SPARSE_GRIDS:
+        # They pay 1 for a success, and their package may be missing.
+        return 1.0
     return make_env(env).unwrapped.solved
 
 

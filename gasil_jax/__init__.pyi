@@ -12,6 +12,7 @@ from .imitation import PPOBC as PPOBC
 from .imitation import PPOGASIL as PPOGASIL
 from .imitation import PPOSIL as PPOSIL
 from .imitation import Agent as Agent
+from .imitation import PPOBCAdaptive as PPOBCAdaptive
 from .imitation import PPOBCNovelty as PPOBCNovelty
 from .imitation import PPOBonus as PPOBonus
 from .imitation import PPOGASILAdaptive as PPOGASILAdaptive

@@ -64,6 +64,8 @@ class Task:
       observe: (state, fields) -> the whole observation; None for positions, velocities
         and what `observe_more` returns.
       contact_cost: contact forces, ``cfrc_ext`` (nbody, 6) -> cost.
+      paid_beyond: forward position qpos[0] in metres up to which nothing is paid; None
+        pays everywhere.
       reward: (state before, state after, fields, action) -> reward (), added to the
         others.
       healthy: (state, fields) -> bool (), whether an episode goes on.
@@ -93,6 +95,7 @@ class Task:
     observe_more: Callable[[Fields], jax.Array] | None = None
     observe: Callable[[PhysicsState, Fields], jax.Array] | None = None
     contact_cost: Callable[[jax.Array], jax.Array] | None = None
+    paid_beyond: float | None = None
     reward: (
         Callable[[PhysicsState, PhysicsState, Fields, jax.Array], jax.Array] | None
     ) = None
@@ -560,6 +563,8 @@ class Locomotion(Env):
             reward = reward - task.contact_cost(fields["cfrc_ext"])
         if task.reward is not None:
             reward = reward + task.reward(before.physics, physics, fields, action)
+        if task.paid_beyond is not None:
+            reward = jnp.where(physics.qpos[0] > task.paid_beyond, reward, 0.0)
         return state.replace(
             pipeline_state=LocomotionState(physics, position),
             obs=self._observe(physics, fields),

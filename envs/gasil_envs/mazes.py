@@ -1,4 +1,4 @@
-"""Sparse tasks by name, as sparse:NAME: mazes of a point or a grid, deep sea, a car.
+"""Sparse tasks by name, as sparse:NAME: mazes, deep sea, a car, and far robots.
 
 Nothing is paid until a long sequence of right actions has succeeded once. A maze is
 data: rows of characters, one for each cell. `#` is a wall and `S` the start. `G`, a
@@ -17,7 +17,7 @@ import numpy as np
 from brax.envs import State
 from flax import struct
 
-from gasil_envs import wrappers
+from gasil_envs import locomotion, wrappers
 
 #: The reward of each object, which is collected once, and those that end an episode.
 REWARDS: Mapping[str, float] = {"G": 1.0, "K": 1.0, "A": 1.0, "T": 10.0}
@@ -341,6 +341,33 @@ class MountainCar:
         return _enlarged(picture, size, np.array([ground[int(column)] - 1, column]), 2)
 
 
+class FarRobot(locomotion.Locomotion):
+    """A robot that gets 1 for each step that ends beyond a distance, and no more.
+
+    VIME's SparseHalfCheetah (Houthooft et al. 2016) is this with 5 m. Episodes end as
+    in the robot's own task. All of its position is observed, as it decides the reward.
+
+    Args:
+      name: the robot, one of `locomotion.TASKS`.
+      metres: the distance.
+    """
+
+    solved = 500.0
+
+    def __init__(self, name: str, metres: float):
+        task = dataclasses.replace(
+            locomotion.TASKS[name],
+            gymnasium_id=None,
+            forward_reward=0.0,
+            control_cost=0.0,
+            contact_cost=None,
+            healthy_reward=1.0,
+            paid_beyond=metres,
+            hidden_positions=0,
+        )
+        super().__init__(task)
+
+
 def _enlarged(
     cells: np.ndarray, size: tuple[int, int], at: np.ndarray, radius: float = 0.35
 ) -> np.ndarray:
@@ -360,42 +387,15 @@ def _enlarged(
     return picture
 
 
-class ActionNoise:
-    """Add noise to the actions of an environment.
-
-    A vector gets Gaussian noise of the deviation `scale` in units of half its range; a
-    discrete action is replaced, with the probability `scale`, by a random one.
-    """
-
-    def __init__(self, env: Any, scale: float):
-        self._env, self._scale = env, scale
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_env":
-            raise AttributeError(name)
-        return getattr(self._env, name)
-
-    def reset(self, rng: jax.Array) -> State:
-        """Start an episode; `rng` also draws the noise of its steps."""
-        env_key, key = jax.random.split(rng)
-        state = self._env.reset(env_key)
-        return state.replace(info={**state.info, "action_noise_key": key})
-
-    def step(self, state: State, action: jax.Array) -> State:
-        """Take a step with another action."""
-        key, first, second = jax.random.split(state.info["action_noise_key"], 3)
-        if wrappers.is_discrete(self._env):
-            other = jax.random.randint(first, (), 0, self._env.num_actions)
-            is_other = jax.random.bernoulli(second, self._scale)
-            action = jnp.where(is_other, other, action)
-        else:
-            low, high = wrappers.action_range(self._env)
-            noise = jax.random.normal(first, action.shape)
-            action = action + self._scale * 0.5 * (high - low) * noise
-        info = {**state.info, "action_noise_key": key}
-        return self._env.step(state.replace(info=info), action)
-
-
+#: How far each robot must go, in metres.
+ROBOTS: Mapping[str, float] = {
+    "hopper": 1.0,
+    "halfcheetah": 5.0,
+    "walker2d": 1.0,
+    "swimmer": 3.0,
+    "ant": 3.0,
+    "humanoid": 0.6,
+}
 #: The tasks without noise, by name.
 TASKS: Mapping[str, Any] = {
     "u_maze": Layout(_U, 150),
@@ -413,6 +413,7 @@ TASKS: Mapping[str, Any] = {
     "two_keys_maze": Layout(_TWO_KEYS, 200, speed=0.25, solved=10.0),
     "far_key_maze": Layout(_FAR_KEY, 250, speed=0.3, solved=10.0),
     "two_doors": Layout(_TWO_DOORS, 25, speed=1.0),
+    **ROBOTS,
 }
 _NOISY, _NOISE = "_noisy", {"point": 0.5, "discrete": 0.1}
 
@@ -428,13 +429,16 @@ def build(name: str) -> Any:
     Args:
       name: one of `names`.
     """
-    task = TASKS[name.removesuffix(_NOISY)]
+    bare = name.removesuffix(_NOISY)
+    task = TASKS[bare]
     env: Any
     if isinstance(task, Layout):
         env = Maze(task)
+    elif bare in ROBOTS:
+        env = FarRobot(bare, task)
     else:
         env = MountainCar() if task is None else DeepSea(task)
     if not name.endswith(_NOISY):
         return env
     kind = "discrete" if wrappers.is_discrete(env) else "point"
-    return ActionNoise(env, _NOISE[kind])
+    return wrappers.ActionNoise(env, _NOISE[kind])

@@ -41,7 +41,8 @@ class LocomotionPainter:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, size[0])
         model.vis.global_.offheight = max(model.vis.global_.offheight, size[1])
         self._data = mujoco.MjData(model)
-        self._walks = env.task.forward_reward != 0.0
+        task = env.task
+        self._walks = task.forward_reward != 0.0 or task.paid_beyond is not None
         self._camera: int | mujoco.MjvCamera = 0
         if not model.ncam:
             self._camera = mujoco.MjvCamera()

@@ -32,6 +32,8 @@ class Settings:
         also given when the episode ends (paper, section 5.4). 1 means no delay.
       obs_noise: standard deviation of Gaussian noise on the observations (paper,
         section 5.3); 0 means no noise.
+      action_noise: standard deviation of Gaussian noise on the actions, in halves of
+        their range; of discrete actions this share is replaced by random ones.
       physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
         host's cores.
       solver: implementation of the JAX physics: small, our own dynamics and solver, or
@@ -49,6 +51,7 @@ class Settings:
 
     reward_delay: int = 1
     obs_noise: float = 0.0
+    action_noise: float = 0.0
     physics: str = "mjx"
     solver: str = "small"
     integrator: str = "model"
@@ -192,15 +195,19 @@ def check(name: str, settings: Settings) -> None:
             raise _refusal(field, value, "True or False")
     if settings.observe_phase and settings.reward_delay == 1:
         raise ValueError("observe_phase is True: it needs a reward_delay above 1")
-    delay, noise = settings.reward_delay, settings.obs_noise
+    delay = settings.reward_delay
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
         raise _refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
-    # NumPy would convert the limit to the number's own type, such as float16.
-    noise = noise.item() if isinstance(noise, np.generic) else noise
-    # Numbers are float32.
-    if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
-        raise _refusal("obs_noise", settings.obs_noise, "finite and 0 or more")
+    for field in ("obs_noise", "action_noise"):
+        noise = getattr(settings, field)
+        # NumPy would convert the limit to the number's own type, such as float16.
+        noise = noise.item() if isinstance(noise, np.generic) else noise
+        # Numbers are float32.
+        if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
+            raise _refusal(field, getattr(settings, field), "finite and 0 or more")
+    if settings.action_noise and name.startswith("sparse:") and "_noisy" in name:
+        raise _refusal("action_noise", settings.action_noise, f"0: {name} has its own")
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:
@@ -230,8 +237,8 @@ def make(name: str, **settings: Any) -> Env:
       name: one of `names()`; one of another package, as FAMILY:NAME (see `worlds`); or
         MODULE:NAME of your own class or function that builds an environment with Brax's
         interface.
-      **settings: fields of `Settings`: reward_delay, obs_noise, physics, solver,
-        integrator, terminal_limits, max_episode_steps, observe_phase.
+      **settings: fields of `Settings`: reward_delay, obs_noise, action_noise, physics,
+        solver, integrator, terminal_limits, max_episode_steps, observe_phase.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
@@ -249,6 +256,12 @@ def make(name: str, **settings: Any) -> Env:
             own_limit = f"a whole number from 1 to {limit}, the environment's own limit"
             raise _refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
         limit = int(chosen.max_episode_steps)
+    if chosen.action_noise > 0:
+        if wrappers.is_discrete(env) and chosen.action_noise > 1:
+            raise _refusal(
+                "action_noise", chosen.action_noise, f"at most 1, a share, for {name}"
+            )
+        env = wrappers.ActionNoise(env, float(chosen.action_noise))
     env = wrappers.EpisodeLimit(env, limit, terminal=chosen.terminal_limits)
     if chosen.reward_delay > 1:
         env = wrappers.RewardDelay(env, int(chosen.reward_delay))

@@ -1,9 +1,9 @@
 """Wrappers that compose with every Brax-style environment.
 
 Each keeps its own state in ``State.info`` and leaves the keys of the wrappers
-below it alone. Order, innermost first: `EpisodeLimit` (it decides when an episode
-ends), `RewardDelay` (it must see that end), `DelayPhase`, `ObservationNoise`,
-`AutoReset`.
+below it alone. Order, innermost first: `ActionNoise`, `EpisodeLimit` (it decides when
+an episode ends), `RewardDelay` (it must see that end), `DelayPhase`,
+`ObservationNoise`, `AutoReset`.
 """
 
 from typing import Any
@@ -75,6 +75,43 @@ def _refuse_taken(state: State, *names: str) -> None:
     for name in names:
         if name in state.info:
             raise ValueError(f"info[{name!r}] is used by a wrapper: rename yours")
+
+
+class ActionNoise:
+    """Add noise to the actions of an environment.
+
+    A vector gets Gaussian noise of the deviation `scale` in units of half its range; a
+    discrete action is replaced, with the probability `scale`, by a random one.
+    """
+
+    def __init__(self, env: Any, scale: float):
+        self._env, self._scale = env, scale
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "_env":
+            raise AttributeError(name)
+        return getattr(self._env, name)
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; `rng` also draws the noise of its steps."""
+        env_key, key = jax.random.split(rng)
+        state = self._env.reset(env_key)
+        _refuse_taken(state, "action_noise_key")
+        return state.replace(info={**state.info, "action_noise_key": key})
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take a step with another action."""
+        key, first, second = jax.random.split(state.info["action_noise_key"], 3)
+        if is_discrete(self._env):
+            other = jax.random.randint(first, (), 0, self._env.num_actions)
+            is_other = jax.random.bernoulli(second, self._scale)
+            action = jnp.where(is_other, other, action)
+        else:
+            low, high = action_range(self._env)
+            noise = jax.random.normal(first, action.shape)
+            action = action + self._scale * 0.5 * (high - low) * noise
+        info = {**state.info, "action_noise_key": key}
+        return self._env.step(state.replace(info=info), action)
 
 
 class EpisodeLimit(Wrapper):

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from gasil_jax.config import names
 from gasil_jax.imitation.adaptive import PPOGASILAdaptive
 from gasil_jax.imitation.adversarial import GAIL, GASIL, PPOGASIL
-from gasil_jax.imitation.behavior_cloning import PPOBC
+from gasil_jax.imitation.behavior_cloning import PPOBC, PPOBCAdaptive
 from gasil_jax.imitation.constant_bonus import PPOBonus
 from gasil_jax.imitation.interface import Agent
 from gasil_jax.imitation.none import PPO
@@ -23,6 +23,7 @@ AGENTS: Mapping[str, type[Agent]] = {
         PPO,
         PPOBonus,
         PPOBC,
+        PPOBCAdaptive,
         PPONovelty,
         PPOBCNovelty,
         PPOSIL,
@@ -53,6 +54,7 @@ __all__ = [
     "PPOGASIL",
     "PPOSIL",
     "Agent",
+    "PPOBCAdaptive",
     "PPOBCNovelty",
     "PPOBonus",
     "PPOGASILAdaptive",

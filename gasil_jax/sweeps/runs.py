@@ -27,6 +27,7 @@ _WAYS = ("physics", "solver")
 NEWER: Mapping[str, Any] = {
     "max_episode_steps": None,
     "observe_phase": False,
+    "action_noise": 0.0,
     "decomposition_inputs": "transition",
     "policy_components": 1,
     "sharing_distance": 0.0,
@@ -68,7 +69,8 @@ class Run:
                 if values[name] is not None:
                     values[name] = (int if allowed.whole else float)(values[name])
         settings = dataclasses.asdict(self.settings)
-        settings["obs_noise"] = float(settings["obs_noise"])
+        for name in ("obs_noise", "action_noise"):
+            settings[name] = float(settings[name])
         for group in (values, settings):
             for name in NEWER.keys() & group.keys():
                 if group[name] == NEWER[name]:

@@ -34,6 +34,7 @@ SELF_TAUGHT = (
     gasil_jax.PPOBonus(alpha=0.1),
     # The best two episodes, which differ from the others.
     gasil_jax.PPOBC(buffer_steps=100),
+    gasil_jax.PPOBCAdaptive(buffer_steps=100),
     gasil_jax.PPONovelty(),
     gasil_jax.PPOBCNovelty(buffer_steps=100),
     gasil_jax.PPOSIL(),

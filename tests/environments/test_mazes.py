@@ -6,13 +6,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from environment_contract import check_reset_and_step
+from environment_contract import BATCH, check_reset_and_step
 
 import gasil_envs
-from gasil_envs import mazes, own_environment, pictures, wrappers
+from gasil_envs import locomotion, mazes, own_environment, pictures, wrappers
 
 
-@pytest.mark.parametrize("name", mazes.names())
+def is_robot(name):
+    return name.removesuffix("_noisy") in mazes.ROBOTS
+
+
+@pytest.mark.parametrize("name", [x for x in mazes.names() if not is_robot(x)])
 def test_reset_and_step(name):
     env = gasil_envs.make(f"sparse:{name}")
     own_environment.check(name, env.env, env)
@@ -25,6 +29,44 @@ def test_reset_and_step(name):
     state = env.reset(jax.random.key(0)).pipeline_state
     picture = pictures.painter(env, (60, 40)).draw([jax.tree.map(np.asarray, state)])
     assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()
+
+
+@pytest.mark.parametrize("name", ["hopper", "halfcheetah_noisy"])
+def test_a_robot_is_paid_for_each_healthy_step_beyond_its_distance_alone(name):
+    env = gasil_envs.make(f"sparse:{name}")
+    own_environment.check(name, env.env, env)
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    check_reset_and_step(env, reset, step)
+    start = reset(jax.random.split(jax.random.key(0), BATCH))
+    physics = start.pipeline_state.physics
+    metres = mazes.ROBOTS[name.removesuffix("_noisy")]
+    moved = metres + jnp.linspace(-0.1, 0.1, BATCH)
+    # Every other robot lies on its head, which ends a hopper's episode.
+    qpos = physics.qpos.at[:, 0].set(moved).at[::2, 2].set(2.0)
+    inner = start.pipeline_state.replace(physics=physics.replace(qpos=qpos))
+    after = step(
+        start.replace(pipeline_state=inner), jnp.zeros((BATCH, env.action_size))
+    )
+    x = np.array(after.pipeline_state.physics.qpos[:, 0])
+    paid = (x > metres) & ~np.array(after.done, bool)
+    np.testing.assert_array_equal(after.reward, np.where(paid, 1.0, 0.0))
+    assert 0.2 < paid.mean() < 0.6 and (after.done.mean() == 0.5) == env.ends_early
+    # What decides the reward is seen.
+    np.testing.assert_array_equal(after.obs[:, 0], x)
+
+
+@pytest.mark.parametrize("name", mazes.ROBOTS)
+def test_a_robot_sees_all_of_its_position_and_moves_as_in_its_own_task(name):
+    env, own = gasil_envs.make(f"sparse:{name}"), locomotion.TASKS[name]
+    theirs = gasil_envs.make(name).unwrapped
+    assert env.observation_size == theirs.observation_size + own.hidden_positions
+    assert env.action_size == theirs.action_size
+    assert env.unwrapped.ends_early == theirs.ends_early
+    assert env.unwrapped.solved < env.episode_length
+    # A start of its own task is observed as there.
+    key = jax.random.key(0)
+    first = env.reset(key).obs[own.hidden_positions :]
+    np.testing.assert_array_equal(first, theirs.reset(key).obs)
 
 
 MAZES = [name for name, x in mazes.TASKS.items() if isinstance(x, mazes.Layout)]
@@ -163,7 +205,7 @@ def test_a_car_that_pushes_with_its_velocity_leaves():
 
 
 def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
-    env = mazes.ActionNoise(mazes.build("u_maze"), 0.5)
+    env = wrappers.ActionNoise(mazes.build("u_maze"), 0.5)
     step = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(2)))
     moved = jax.vmap(step)(jax.random.split(jax.random.key(0), 500))
     moves = (
@@ -177,10 +219,43 @@ def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
     np.testing.assert_array_equal(
         step(jax.random.key(3)).obs, step(jax.random.key(3)).obs
     )
-    grid = mazes.ActionNoise(mazes.build("key_grid"), 0.4)
+    grid = wrappers.ActionNoise(mazes.build("key_grid"), 0.4)
     after = jax.vmap(lambda key: grid.step(grid.reset(key), jnp.int32(1)))(
         jax.random.split(jax.random.key(1), 1000)
     )
     other = jax.vmap(grid.reset)(jax.random.split(jax.random.key(1), 1000))
     down = after.pipeline_state.position[:, 0] - other.pipeline_state.position[:, 0]
     assert np.mean(down == 1) == pytest.approx(0.7, abs=0.05)
+
+
+@pytest.mark.parametrize(("name", "noise"), [("u_maze", 0.5), ("key_grid", 0.1)])
+def test_a_noisy_task_is_the_task_with_noise_on_its_actions(name, noise):
+    envs = [
+        gasil_envs.make(f"sparse:{name}", action_noise=noise),
+        gasil_envs.make(f"sparse:{name}_noisy"),
+        gasil_envs.make(f"sparse:{name}"),
+    ]
+
+    def walk(env):
+        zero = wrappers.zero_action(env)
+        start = env.reset(jax.random.key(0))
+        step = lambda state, _: (env.step(state, zero), state.pipeline_state.position)
+        return jax.jit(lambda x: jax.lax.scan(step, x, length=40)[1])(start)
+
+    given, noisy, calm = map(walk, envs)
+    np.testing.assert_array_equal(given, noisy)
+    assert (np.array(given) != calm).any()
+
+
+@pytest.mark.parametrize(
+    ("name", "noise", "allowed"),
+    [
+        ("sparse:u_maze_noisy", 0.1, "0: sparse:u_maze_noisy has its own"),
+        ("sparse:key_grid", 1.5, "at most 1, a share, for sparse:key_grid"),
+        ("hopper", -1.0, "finite and 0 or more"),
+        ("hopper", "loud", "finite and 0 or more"),
+    ],
+)
+def test_noise_that_can_not_be_is_refused(name, noise, allowed):
+    with pytest.raises(ValueError, match=f"^action_noise is .*: it must be {allowed}$"):
+        gasil_envs.make(name, action_noise=noise)

@@ -1,6 +1,7 @@
 """Shares of seeds that solve a task: against SciPy, and what a page says of them."""
 
 import dataclasses
+import sys
 
 import numpy as np
 import pytest
@@ -9,6 +10,9 @@ import scipy.stats
 from experiments import report, shares
 from experiments.figures import FIGURES
 from experiments.search import (
+    SPARSE,
+    SPARSE_GRIDS,
+    SPARSE_ROBOTS,
     SPARSE_SEARCHED,
     SPARSE_SPACES,
     SparseSearch,
@@ -97,3 +101,31 @@ def test_a_page_tells_shares_and_verdicts(tmp_path):
     assert page.picture().axes
     with pytest.raises(InputError):
         report.Page("matrix", store).shares()
+
+
+def test_longer_tasks_are_told_apart_and_without_their_package(tmp_path, monkeypatch):
+    """The mean of the others must not wait for them, nor mix with them."""
+    monkeypatch.setitem(sys.modules, "navix", None)
+    monkeypatch.delitem(sys.modules, "gasil_envs.of_navix", raising=False)
+    monkeypatch.setattr(SparseSearch, "chosen", lambda *_: {})
+    store, figure = Store(tmp_path), FIGURES["sparse"]
+    page = lambda: report.Page("sparse", store)
+    for env in SPARSE:
+        (run, *_) = runs = figure.panels[env]["ppo"].runs(store)
+        assert run.algorithm.config.total_steps == 500_000
+        store.add(dict.fromkeys(runs, record(*[solved_from(env)] * 10)))
+    assert page().mean_shares()["ppo"] == 1.0 and page().mean_shares("long") == {}
+    for env in (*SPARSE_ROBOTS, *SPARSE_GRIDS):
+        (run, *_) = runs = figure.panels[env]["ppo"].runs(store)
+        assert run.algorithm.config.total_steps == 1_000_000
+        best = solved_from(env) * (env in SPARSE_GRIDS)
+        store.add(dict.fromkeys(runs, record(*[best] * 10)))
+    share = len(SPARSE_GRIDS) / len((*SPARSE_ROBOTS, *SPARSE_GRIDS))
+    assert page().mean_shares("long")["ppo"] == pytest.approx(share)
+    assert page().mean_shares()["ppo"] == 1.0
+    for panel, noise in ((SPARSE_GRIDS[0], 0.0), (f"{SPARSE_GRIDS[0]}_noisy", 0.1)):
+        runs = figure.panels[panel]["ppo+bc"].runs(store)
+        assert {run.settings.action_noise for run in runs} == {noise}
+    table = page().shares("long")
+    assert "| halfcheetah | 0.00 |" in table and "maze" not in table
+    assert page().shares("long noisy") == ""  # Nothing of it is stored.

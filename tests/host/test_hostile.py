@@ -157,6 +157,7 @@ CASES = [
         for name, valid in (
             ("reward_delay", is_whole),
             ("obs_noise", is_real),
+            ("action_noise", is_real),
             ("physics", is_one_of("mjx", "mujoco")),
             ("terminal_limits", is_bool),
             ("observe_phase", lambda x: x is False),  # Without a delay.
