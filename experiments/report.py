@@ -592,12 +592,15 @@ class Page:
     def means(self, kind: str, *names: str) -> str:
         """Return `mean_shares` of some curves as text, those that are complete.
 
+        What stands in brackets in a curve's name is for the text around it to say.
+
         Args:
           kind: "noisy" for the tasks with noise; empty for those without.
           *names: the curves.
         """
         mean = self.mean_shares(kind)
-        return ", ".join(f"{x.upper()} {mean[x]:.2f}" for x in names if x in mean)
+        plain = {x: x.partition(" (")[0].upper() for x in names if x in mean}
+        return ", ".join(f"{words} {mean[x]:.2f}" for x, words in plain.items())
 
     def lead(self, ours: str = "", kind: str = "", *others: str) -> str:
         """Return how a curve's shares of solving seeds compare with other curves'.
