@@ -231,19 +231,6 @@ class Search:
         best = self.best(store)
         return None if best is None else best[0]
 
-    def leading(self, store: Store) -> Point | None:
-        """Return the chosen point or, until it is known, the best by the first seeds.
-
-        It is None if runs of the drawn points are missing.
-        """
-        if (chosen := self.chosen(store)) is not None:
-            return chosen
-        if finalists := self.finalists(store):
-            return finalists[0]
-        drawn = draw(self.agent)
-        scores = self.scores(drawn, store)
-        return None if scores is None else drawn[int(scores.mean(axis=1).argmax())]
-
 
 #: The values of the paper's appendix, and for PPO+BC and PPO+SIL, of which it gives
 #: none, those around what the authors of SIL used.
