@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if run_folder.has_run(out):
         every = list(dict.fromkeys([out, *every]))
     united = _united(every)
-    plan = stored_plan(every[0], united)
+    plan = stored_plan(united)
     trained = [each for folder in every for each in plan.trained(folder)]
     # Nothing has been written if a run is missing or has two different results.
     results = tables.read(plan, trained)
@@ -61,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run_folder.refuse_used(out)
         for each in trained:
             _copy(each.path, programs_of(out))
-        run_folder.write_description(out, {**united, "out": str(out)})
+        run_folder.write_description(out, united)
     tables.finish(out, results)
     return 0
 

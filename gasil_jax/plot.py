@@ -110,7 +110,7 @@ def _saved(
     run = run_folder.read(folder)
     saved = [
         (stored.path, len(stored.runs), indices)
-        for stored, indices in saved_states.find(folder, run, point)
+        for stored, indices in saved_states.find(run, point)
     ]
     return run["env"], run["algorithm"].agent.name, saved
 

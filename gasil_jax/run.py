@@ -48,13 +48,7 @@ def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
-        tables = run_results.read(folder, options.seeds)
-        summary = run_results.write(
-            folder, options.env, members=members, outcome=outcome, tables=tables
-        )
-    if outcome.unsaved is not None:
-        raise outcome.unsaved
-    return summary
+        return run_results.finish(folder, options.env, members, outcome)[1]
 
 
 def _print_next(env: Any, folder: pathlib.Path) -> None:

@@ -21,13 +21,12 @@ import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.sweeps import assembly, launch, points, run_results, shards, tables
 from gasil_jax.sweeps.plan import Plan, stored_plan
 from gasil_jax.sweeps.programs import NOWHERE
@@ -87,20 +86,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def make_plan(options: Options, stored: StoredRun | None = None) -> Plan:
+def make_plan(options: Options, stored: Mapping[str, Any] | None = None) -> Plan:
     """Return the plan of a sweep, checked.
 
     Args:
       options: the options, which `run_options.check` accepts.
-      stored: the sweep that is continued, whose points come first.
+      stored: config.json of the sweep that is continued, whose points come first.
 
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
     """
     algorithm, file = options.algorithm, options.points_file
-    every = [] if stored is None else [*stored_plan(*stored).points]
+    every = [] if stored is None else [*stored_plan(stored).points]
     # A sweep that has begun has its points in config.json; their file may be gone.
-    own_file = stored is not None and file == stored.description.get("points_file")
+    own_file = stored is not None and file == stored.get("points_file")
     if file is None or not own_file or pathlib.Path(file).exists():
         named = points.make_points(
             options.grid,

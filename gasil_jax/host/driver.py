@@ -77,20 +77,15 @@ class Outcome:
 
     Attributes:
       states: the members' states after the last iteration.
-      new_steps: environment steps that this process took, over all members.
-      compile_seconds: time that this process spent on compiling the training.
-      train_seconds: time that this process spent on training, without evaluations.
-      evaluation_seconds: time that this process spent on evaluations, including
-        compilation; None without evaluations.
+      measured: how this process trained, for a JSON file: "env_steps" over all members,
+        the seconds of compiling, of training without evaluations and of evaluations
+        (None without any), devices and versions.
       unsaved: why the last checkpoint could not be written, to raise once the results
         are written; None if it was.
     """
 
     states: Any
-    new_steps: int
-    compile_seconds: float
-    train_seconds: float
-    evaluation_seconds: float | None
+    measured: Mapping[str, Any]
     unsaved: checkpoint.WriteError | None
 
 
@@ -416,9 +411,14 @@ def drive(
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
         states=members.trim(training.states),
-        new_steps=members.env_steps(training.done - first),
-        compile_seconds=compile_seconds,
-        train_seconds=train_seconds - (evaluation_seconds or 0.0),
-        evaluation_seconds=evaluation_seconds,
+        measured={
+            "env_steps": members.env_steps(training.done - first),
+            "compile_seconds": compile_seconds,
+            "train_seconds": train_seconds - (evaluation_seconds or 0.0),
+            "evaluation_seconds": evaluation_seconds,
+            "device": members.device_kind,
+            "device_count": len(members.devices),
+            "versions": metrics_files.versions(),
+        },
         unsaved=unsaved,
     )

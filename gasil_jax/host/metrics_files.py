@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import hashlib
 import importlib.metadata
+import io
 import itertools
 import json
 import math
@@ -128,7 +129,8 @@ class MetricsWriter:
             with path.open(newline="") as file:
                 self._columns = tuple(next(csv.reader(file), ())) or None
             self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file)
+        # Those of all lines so far.
+        self._rows, self._digest = _rows_and_digest(path)
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
         """Write arrays (members, iterations), one for each metric.
@@ -138,14 +140,21 @@ class MetricsWriter:
             path any more.
         """
         self._check_in_place()
+        lines = self._lines(metrics)
         with self._errors_named():
-            self._write(metrics)
+            self._file.write(lines)
+            self._file.flush()
+        self._rows += lines.count("\n")
+        self._digest.update(lines.replace("\r\n", "\n").encode(self._file.encoding))
 
-    def _write(self, metrics: Mapping[str, np.ndarray]) -> None:
+    def _lines(self, metrics: Mapping[str, np.ndarray]) -> str:
+        """Return the rows of metrics, and before the first ones the names."""
+        lines = io.StringIO(newline="")
+        writer = csv.writer(lines)
         if self._columns is None:
             others = tuple(sorted(set(metrics) - set(self._first)))
             self._columns = (*self._labels, *self._first, *others)
-            self._writer.writerow(self._columns)
+            writer.writerow(self._columns)
         members, iterations = metrics["env_steps"].shape
         labels = list(zip(*self._labels.values(), strict=True))
         names = self._columns[len(self._labels) :]
@@ -155,8 +164,8 @@ class MetricsWriter:
                     _cell(metrics[name][member, iteration]) if name in metrics else ""
                     for name in names
                 )
-                self._writer.writerow([*labels[member], *cells])
-        self._file.flush()
+                writer.writerow([*labels[member], *cells])
+        return lines.getvalue()
 
     def record(self) -> dict[str, Any]:
         """Write everything to the disk; return what a checkpoint records of the file.
@@ -171,9 +180,11 @@ class MetricsWriter:
             self._file.flush()
             output_file.flush(self._file.fileno())
             size, name = os.fstat(self._file.fileno()).st_size, self._path.stem
-            rows, digest = _rows_and_hash(self._path)
-        found = {"size": size, "rows": rows, "sha256": digest}
-        return {f"{name}_{field}": value for field, value in found.items()}
+        return {
+            f"{name}_size": size,
+            f"{name}_rows": self._rows,
+            f"{name}_sha256": self._digest.hexdigest(),
+        }
 
     @contextlib.contextmanager
     def _errors_named(self) -> Iterator[None]:
@@ -204,8 +215,8 @@ class MetricsWriter:
         self._file.close()
 
 
-def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, str]:
-    """Return the number of whole lines, or `most`, and their hash.
+def _rows_and_digest(path: pathlib.Path, most: int | None = None) -> tuple[int, Any]:
+    """Return the number of whole lines, or `most`, and their SHA-256.
 
     The hash does not see how lines end, because version control may change it.
     """
@@ -215,7 +226,7 @@ def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, st
             if line.endswith(b"\n"):
                 digest.update(line.rstrip(b"\r\n") + b"\n")
                 count += 1
-    return count, digest.hexdigest()
+    return count, digest
 
 
 def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
@@ -233,8 +244,8 @@ def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
         return True
     if not path.is_file():
         return False
-    count, digest = _rows_and_hash(path, rows)
-    if count == rows and digest != seen:
+    count, digest = _rows_and_digest(path, rows)
+    if count == rows and digest.hexdigest() != seen:
         raise InputError(f"{path} is damaged: it has changed since the checkpoint")
     return count == rows
 

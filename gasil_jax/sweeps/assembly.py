@@ -24,7 +24,6 @@ from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.progress import Progress, announced
 from gasil_jax.host.run_options import Options
-from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.programs import Program
 
 
@@ -148,7 +147,7 @@ def train(
                     if outcome.unsaved is not None:
                         # Its policies are nowhere else, so it is not finished.
                         raise outcome.unsaved
-                    job.finish(programs.measured(members, outcome))
+                    job.finish(outcome.measured)
             steps_before += members.env_steps(members.config.num_iterations)
     return members, outcome
 

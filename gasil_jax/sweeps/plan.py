@@ -122,18 +122,14 @@ def programs_of(folder: pathlib.Path) -> pathlib.Path:
     return folder / "programs"
 
 
-def stored_plan(folder: pathlib.Path, description: Mapping[str, Any]) -> Plan:
-    """Return the plan of a stored sweep or run.
-
-    Args:
-      folder: its folder.
-      description: its config.json, from `run_folder.read`.
+def stored_plan(description: Mapping[str, Any]) -> Plan:
+    """Return the plan of a stored sweep or run from its config.json.
 
     Raises:
       InputError: if its points can't be trained.
     """
     algorithm, of_sweep = description["algorithm"], description.get("points", ({},))
-    path = folder / run_folder.CONFIG
+    path = description["out"] / run_folder.CONFIG
     source = f"{path} is damaged, or another program wrote it: points: "
     points.check(of_sweep, algorithm, source)
     return Plan(

@@ -23,8 +23,6 @@ import numpy as np
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
 from gasil_jax.host import checkpoint, json_reader, metrics_files, run_folder
-from gasil_jax.host.driver import Outcome
-from gasil_jax.host.members import Members
 from gasil_jax.sweeps.runs import Run, read_run
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
@@ -106,7 +104,7 @@ class Program:
         """Write training.json, which says that the program is trained to its end.
 
         Args:
-          measured: what `measured` returns.
+          measured: that of its `driver.Outcome`.
         """
         content = {**self._length, **measured}
         metrics_files.write_json(self.path / _TRAINING, content)
@@ -184,19 +182,6 @@ def group(
         cuts = [len(members) * part // count for part in range(count + 1)]
         parts += [Program(members[a:b]) for a, b in itertools.pairwise(cuts)]
     return parts
-
-
-def measured(members: Members, outcome: Outcome) -> dict[str, Any]:
-    """Return what is stored of how this process trained: speed, device, versions."""
-    return {
-        "env_steps": outcome.new_steps,
-        "compile_seconds": outcome.compile_seconds,
-        "train_seconds": outcome.train_seconds,
-        "evaluation_seconds": outcome.evaluation_seconds,
-        "device": members.device_kind,
-        "device_count": len(members.devices),
-        "versions": metrics_files.versions(),
-    }
 
 
 def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:

@@ -11,7 +11,6 @@ from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
-from gasil_jax.sweeps import programs
 
 
 class Tables(NamedTuple):
@@ -24,15 +23,17 @@ class Tables(NamedTuple):
     evaluations: dict[str, np.ndarray]
 
 
-def read(folder: pathlib.Path, num_seeds: int) -> Tables:
-    """Return the tables of a run.
+def read(folder: pathlib.Path, members: Members) -> Tables:
+    """Return the tables of a run with these seeds.
 
     Raises:
       InputError: if a table is damaged.
     """
 
-    def table(path: Any, required: Any) -> Any:
-        return metrics_files.read_metrics(path, ("seed",), num_seeds, required)
+    def table(path: pathlib.Path, required: Sequence[str]) -> dict[str, np.ndarray]:
+        return metrics_files.read_metrics(
+            path, ("seed",), members.num_members, required
+        )
 
     required = (*metrics_files.SUMMARIZED, "faulty_steps")
     metrics = table(folder / "metrics.csv", required)
@@ -41,23 +42,25 @@ def read(folder: pathlib.Path, num_seeds: int) -> Tables:
     return Tables(metrics, table(path, ("mean",)) if evaluated else {})
 
 
-def write(
-    folder: pathlib.Path,
-    env_name: str,
-    *,
-    members: Members,
-    outcome: Outcome,
-    tables: Tables,
-) -> dict[str, Any]:
-    """Write policy.npz, learning_curve.png and summary.json; return the summary.
+def finish(
+    folder: pathlib.Path, env_name: str, members: Members, outcome: Outcome
+) -> tuple[Tables, dict[str, Any]]:
+    """Write policy.npz, learning_curve.png and summary.json.
 
     Args:
       folder: folder of the run.
       env_name: name of the environment.
       members: the run's seeds.
       outcome: the result of their training.
-      tables: their tables, from `read`.
+
+    Returns:
+      The tables of the run, and the summary.
+
+    Raises:
+      InputError: if a table is damaged.
+      OSError: if the folder can no longer be written, or could not before.
     """
+    metrics, evaluations = tables = read(folder, members)
     metrics, evaluations = tables
     seeds, agent = members.seeds, members.algorithm.agent.name
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
@@ -91,10 +94,12 @@ def write(
         "unhealthy_seeds": [
             seed for seed, *bad in zip(seeds, *faults.values(), strict=True) if any(bad)
         ],
-        **_trained(folder / "summary.json", programs.measured(members, outcome)),
+        **_trained(folder / "summary.json", outcome.measured),
     }
     metrics_files.write_json(folder / "summary.json", summary)
-    return summary
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
+    return tables, summary
 
 
 def _by_seed_and_over_seeds(
@@ -136,7 +141,7 @@ def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     were evaluated.
 
     Args:
-      trainings: what `programs.measured` says of each program.
+      trainings: `driver.Outcome.measured` of each program.
     """
     seconds = [f"{x}_seconds" for x in ("compile", "train", "evaluation")]
     if any(x.get("evaluation_seconds") is None for x in trainings):

@@ -38,19 +38,18 @@ class _Summary(TypedDict):
 
 
 def find(
-    folder: pathlib.Path, description: Mapping[str, Any], point: int | None
+    description: Mapping[str, Any], point: int | None
 ) -> list[tuple[Program, Sequence[int]]]:
     """Return the programs of a run, or of a sweep's point, with its members in each.
 
     Args:
-      folder: folder of the run or sweep.
-      description: its config.json, from `run_folder.read`.
+      description: config.json of the run or sweep, from `run_folder.read`.
       point: number of a sweep's point; default the best by mean.
 
     Raises:
       InputError: if the folder has no such point.
     """
-    plan = stored_plan(folder, description)
+    folder, plan = description["out"], stored_plan(description)
     last = len(plan.points) - 1
     if plan.is_run and point is not None:
         raise InputError(f"point is {point}: {folder} is a run, which has no points")
@@ -102,7 +101,7 @@ def load(
     if not isinstance(which, str) or which not in ("last", "best"):
         raise refusal("which", which, "'last' or 'best'")
     description = run_folder.read(folder)
-    every = find(folder, description, point)
+    every = find(description, point)
     settings = dataclasses.asdict(description["settings"])
     with command_line.input_checked():
         env = environments.make_env(description["env"], **settings)

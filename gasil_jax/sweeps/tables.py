@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import math
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -71,11 +71,7 @@ class Results:
 
 
 def read(plan: Plan, trained: Sequence[Program]) -> Results:
-    """Return the results of a sweep that is trained to its end.
-
-    Args:
-      plan: the points and seeds.
-      trained: the programs that are trained to their end.
+    """Return the results of a sweep from the programs that are trained to their end.
 
     Raises:
       InputError: if a run is missing or has two different results, if a table is
@@ -91,34 +87,31 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
     metrics: dict[Run, Columns] = {}
     scores: dict[Run, Columns] = {}
     for each in trained:
-        runs = each.runs
         own_metrics, own_scores = each.tables()
-        for run, columns in zip(runs, own_metrics, strict=True):
+        for run, columns in zip(each.runs, own_metrics, strict=True):
             if not _equal(metrics.setdefault(run, columns), columns):
                 raise InputError(
                     f"{each.path} has another result than another program for seed "
                     f"{run.seed} of {run.experiment}"
                 )
-        scores |= dict(zip(runs, own_scores))
+        scores |= dict(zip(each.runs, own_scores))
 
-    def by_point(value_of: Callable[[Run], float]) -> np.ndarray:
-        values = np.array([value_of(run) for run in plan.runs.values()])
-        return values.reshape(-1, len(plan.seeds))
+    def by_point(tables: Mapping[Run, Columns], name: str, final: Any) -> np.ndarray:
+        values = [final(tables[run][name]) for run in plan.runs.values()]
+        return np.reshape(values, (-1, len(plan.seeds)))
 
-    def final(name: str) -> np.ndarray:
-        return by_point(
-            lambda x: metrics_files.final_returns(metrics[x][name][None])[0]
-        )
+    def last_tenth(column: np.ndarray) -> float:
+        return metrics_files.final_returns(column[None])[0]
 
     curves = _curves(plan, metrics)
     finals = {
-        "final_return": final("episode_return"),
-        "final_length": final("episode_length"),
+        f"final_{name}": by_point(metrics, f"episode_{name}", last_tenth)
+        for name in ("return", "length")
     }
     if scores:
         of_scores = _curves(plan, scores)
         curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
-        finals["final_evaluation"] = by_point(lambda run: scores[run]["mean"][-1])
+        finals["final_evaluation"] = by_point(scores, "mean", lambda column: column[-1])
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
     trainings = {each.name: each.training for each in trained}
@@ -168,10 +161,6 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     hyperparameters.png is written only if a hyperparameter varies among the points that
     have a final return, and policy.npz, with the policies of the best point by mean,
     only if there is one whose checkpoints are there.
-
-    Args:
-      folder: folder to write to.
-      results: the results, from `read`.
     """
     _write_results(folder / "results.csv", results)
     with output_file.atomic(folder / "curves.npz") as partial:

@@ -273,6 +273,8 @@ def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypat
     (tmp_path / "full" / "file").touch()
     (tmp_path / "begun").mkdir()
     described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
+    why_no_run = "the environment is not one that gasil_jax.make_env returned"
+    described |= {"why_no_run": why_no_run, "env": "PointMass", "agent": "ppo"}
     (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(own, **{"algorithm": PPO, **changes})

@@ -178,7 +178,7 @@ def test_tables_of_shards_are_those_of_the_whole_sweep(count, tmp_path, capsys):
             assert (out / name).read_bytes() == (whole / name).read_bytes(), name
         summary = json.loads((out / "summary.json").read_text())
         assert summary["points"] == expected["points"]
-        saved = saved_states.find(out, saved_states.run_folder.read(out), 1)
+        saved = saved_states.find(saved_states.run_folder.read(out), 1)
         seeds = [x.seeds[i] for x, indices in saved for i in indices]
         assert sorted(seeds) == [0, 1, 2]
 
