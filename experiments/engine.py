@@ -29,7 +29,6 @@ from gasil_jax.host.interruption import Interrupted
 from gasil_jax.sweeps import assembly, programs
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
-from gasil_jax.sweeps.shards import Shard
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -140,12 +139,12 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     return [*begun, *new]
 
 
-def select_by_key(runs: Iterable[Run], shard: Shard) -> list[Run]:
-    """Return the runs of a shard, the same on each machine.
+def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
+    """Return the runs of one of `count` shards, the same on each machine.
 
     A run's shard depends on its key alone, not on which other runs are missing.
     """
-    return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
+    return [x for x in runs if int(x.key, 16) % count == number - 1]
 
 
 def train(stored: Program, setup: Setup) -> dict[Run, Record]:

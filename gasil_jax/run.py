@@ -1,5 +1,6 @@
 """Train an agent: ``python -m gasil_jax.run --env walker2d --seeds 10``."""
 
+import dataclasses
 import pathlib
 import shlex
 import sys
@@ -18,12 +19,11 @@ from gasil_jax.host.run_options import (
     open_folder,
     parse,
     resumed_run,
-    seeds_of,
     write_config,
 )
 from gasil_jax.sweeps import assembly, run_results
-from gasil_jax.sweeps.plan import Plan
 from gasil_jax.sweeps.programs import NOWHERE, Program
+from gasil_jax.sweeps.runs import Run
 
 
 def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
@@ -66,14 +66,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
-    seeds = seeds_of(options)
-    plan = Plan(
-        options.env, options.settings, options.algorithm, [{}], seeds, is_run=True
-    )
-    env = assembly.prepare(options, plan.stored(options.out or NOWHERE))
+    seeds, where = options.seed_numbers, options.out or NOWHERE
+    every = (Run(options.env, options.algorithm, x, options.settings) for x in seeds)
+    job = Program(tuple(every), where, {"seed": seeds})
+    env = assembly.prepare(options, [job])
     with open_folder(options, "gasil_jax.run") as folder:
-        (job,) = plan.stored(folder)
-        summary = train(options, env, job)
+        summary = train(options, env, dataclasses.replace(job, path=folder))
     scores = {
         name.replace("_", " "): np.array(list(summary[name].values()), float)
         for name in ("final_return", "final_evaluation")

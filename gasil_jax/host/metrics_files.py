@@ -22,6 +22,9 @@ import numpy as np
 from gasil_jax.errors import InputError
 from gasil_jax.host import json_reader, output_file
 
+#: The columns of a table by name.
+Columns = dict[str, np.ndarray]
+
 #: Metrics that every metrics.csv has, in this order; the agent's own metrics follow.
 COLUMNS = (
     "env_steps",
@@ -333,17 +336,29 @@ def read_metrics(
 
 
 def final_returns(returns: np.ndarray) -> np.ndarray:
-    """Return each seed's mean return over the last tenth of iterations, (seeds,).
+    """Return the mean returns over the last tenth of iterations, (..., iterations).
 
     It also works for other metrics of episodes, such as their length. If no episode of
     a seed ended in the last tenth (in some tasks all episodes end at once), the result
     is the value of the last iteration in which one ended; NaN if none ended at all.
     """
-    last = returns[:, -max(1, returns.shape[1] // 10) :]
-    count = np.isfinite(last).sum(axis=1)
-    mean = np.nansum(last, axis=1) / np.maximum(count, 1)
+    last = returns[..., -max(1, returns.shape[-1] // 10) :]
+    count = np.isfinite(last).sum(axis=-1)
+    mean = np.nansum(last, axis=-1) / np.maximum(count, 1)
     ended = np.isfinite(returns)
-    last_ended = returns.shape[1] - 1 - ended[:, ::-1].argmax(axis=1)
-    newest = np.take_along_axis(returns, last_ended[:, None], axis=1)[:, 0]
-    newest = np.where(ended.any(axis=1), newest, np.nan)
+    last_ended = returns.shape[-1] - 1 - ended[..., ::-1].argmax(axis=-1)
+    newest = np.take_along_axis(returns, last_ended[..., None], axis=-1)[..., 0]
+    newest = np.where(ended.any(axis=-1), newest, np.nan)
     return np.where(count > 0, mean, newest)
+
+
+def finals(metrics: Columns, scores: Columns) -> dict[str, np.ndarray]:
+    """Return the final values of runs by name, (...), from columns (..., rows).
+
+    They are those of metrics.csv and, if there are any, of evaluations.csv.
+    """
+    values = {
+        f"final_{name}": final_returns(metrics[f"episode_{name}"])
+        for name in ("return", "length")
+    }
+    return values | ({"final_evaluation": scores["mean"][..., -1]} if scores else {})

@@ -121,6 +121,11 @@ class Options:
         rewards += [self.normalize] if self.normalize_rewards else []
         return Algorithm(self.own, tuple(rewards), self.config)
 
+    @property
+    def seed_numbers(self) -> range:
+        """The seeds' absolute numbers, the same for every point of a sweep."""
+        return range(self.first_seed, self.first_seed + self.seeds)
+
 
 def algorithm_options(algorithm: Algorithm) -> dict[str, Any]:
     """Return the fields of `Options` that describe an algorithm."""
@@ -434,11 +439,6 @@ def note_if_untuned(options: Options) -> None:
     )
     if options.preset == presets.DEFAULT and lacking is not None:
         command_line.note(f"{lacking}: options that are not given have their defaults")
-
-
-def seeds_of(options: Options) -> range:
-    """Return the seeds' absolute numbers, the same for every point of a sweep."""
-    return run_folder.seeds_of(vars(options))
 
 
 def evaluation_schedule(options: Options) -> EvaluationSchedule | None:

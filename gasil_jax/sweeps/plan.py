@@ -18,7 +18,6 @@ from gasil_jax.sweeps import points, programs
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
-from gasil_jax.sweeps.shards import Shard
 
 #: The columns of a sweep's tables that identify its members.
 LABELS = ("point", "seed")
@@ -55,8 +54,8 @@ class Plan:
             for seed in self.seeds
         }
 
-    def part(self, shard: Shard | None) -> list[Run]:
-        """Return the runs of a shard, whatever is trained already; all for None.
+    def part(self, number: int = 1, count: int = 1) -> list[Run]:
+        """Return the runs of one of `count` shards, whatever is trained already.
 
         The sizes of shards differ by one run at most, and the runs of a program are
         divided as little as possible.
@@ -65,16 +64,13 @@ class Plan:
           InputError: if there are more shards than runs.
         """
         ordered = [x for each in programs.group(self.runs.values()) for x in each.runs]
-        if shard is None:
-            return ordered
         total = len(ordered)
-        if shard.count > total:
+        if count > total:
             raise InputError(
-                f"shard is {shard}: {total} members (points x seeds) make {total} "
-                "shards at most"
+                f"shard is {number}/{count}: {total} members (points x seeds) make "
+                f"{total} shards at most"
             )
-        first = (shard.number - 1) * total // shard.count
-        return ordered[first : shard.number * total // shard.count]
+        return ordered[(number - 1) * total // count : number * total // count]
 
     @functools.cached_property
     def _members(self) -> Mapping[Run, tuple[int, int]]:
@@ -123,7 +119,7 @@ def programs_of(folder: pathlib.Path) -> pathlib.Path:
 
 
 def stored_plan(description: Mapping[str, Any]) -> Plan:
-    """Return the plan of a stored sweep or run from its config.json.
+    """Return the plan of a stored sweep or run from its `run_folder.read`.
 
     Raises:
       InputError: if its points can't be trained.

@@ -94,13 +94,9 @@ def _read(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
 def check(points: Sequence[Point], algorithm: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed.
 
-    Args:
-      points: the points.
-      algorithm: what they change.
-      source: begins the message.
-
     Raises:
-      InputError: if one does not; the message names the value and the range.
+      InputError: if one does not; the message, which begins with `source`, names the
+        value and the range.
     """
     allowed = _kinds(algorithm)
     without_effect = run_options.without_effect(algorithm)
@@ -159,7 +155,7 @@ def make_points(
             "grid is empty: it must be NAME=VALUE,..., or use --random or --points-file"
         )
     if random is None:
-        points = list(itertools.product(*values.values()))
+        points = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in points]
     kinds = _kinds(algorithm)
     values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
@@ -173,8 +169,6 @@ def make_points(
             "and at least 1"
         )
     chosen = np.random.default_rng(seed).choice(count, random, replace=False)
-    drawn = zip(*np.unravel_index(chosen, sizes), strict=True)
-    return [
-        {name: x[i] for (name, x), i in zip(values.items(), at, strict=True)}
-        for at in drawn
-    ]
+    columns = zip(values.values(), np.unravel_index(chosen, sizes), strict=True)
+    drawn = zip(*([listed[i] for i in at] for listed, at in columns), strict=True)
+    return [dict(zip(values, point, strict=True)) for point in drawn]

@@ -23,14 +23,12 @@ import numpy as np
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
 from gasil_jax.host import checkpoint, json_reader, metrics_files, run_folder
+from gasil_jax.host.metrics_files import Columns
 from gasil_jax.sweeps.runs import Run, read_run
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
 #: Stands for a folder that is not made yet; nothing is stored in it.
 NOWHERE = pathlib.Path(os.devnull)
-
-#: The columns of a table for one run, (rows,) each, by name.
-Columns = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,23 +87,17 @@ class Program:
         """
         with run_folder.lock(run_folder.create(self.path)):
             if not (self.path / _PROGRAM).exists():
-                runs = self.runs
-                every = list(dict.fromkeys(run.experiment for run in runs))
-                listed = [[every.index(run.experiment), run.seed] for run in runs]
+                every = list(dict.fromkeys(run.experiment for run in self.runs))
                 content = {
                     "experiments": list(map(json.loads, every)),
-                    "runs": listed,
+                    "runs": [[every.index(x.experiment), x.seed] for x in self.runs],
                     "labels": {name: list(x) for name, x in self.labels.items()},
                 }
                 metrics_files.write_json(self.path / _PROGRAM, content)
             yield
 
     def finish(self, measured: Mapping[str, Any]) -> None:
-        """Write training.json, which says that the program is trained to its end.
-
-        Args:
-          measured: that of its `driver.Outcome`.
-        """
+        """Write training.json: `driver.Outcome.measured` of training to the end."""
         content = {**self._length, **measured}
         metrics_files.write_json(self.path / _TRAINING, content)
 
@@ -124,39 +116,32 @@ class Program:
         return content if self._length.items() <= content.items() else {}
 
     def tables(self) -> tuple[list[Columns], list[Columns]]:
-        """Return the metrics and the scores of each run.
-
-        The scores are none without evaluations.
+        """Return the metrics of each run, (rows,), and its scores; [] without any.
 
         Raises:
           InputError: if a table is damaged.
         """
-        rows = self.algorithm.config.num_iterations
-        metrics = self._table("metrics.csv", metrics_files.SUMMARIZED, rows)
-        if self.training.get("evaluation_seconds") is None:
-            return metrics, []
-        return metrics, self._table("evaluations.csv", ("mean",))
+        metrics = self._table("metrics.csv", metrics_files.SUMMARIZED)
+        if len(metrics[0]["env_steps"]) != self.algorithm.config.num_iterations:
+            raise InputError(f"{self.path}/metrics.csv is damaged: it lacks iterations")
+        evaluated = self.training.get("evaluation_seconds") is not None
+        return metrics, self._table("evaluations.csv", ("mean",)) if evaluated else []
 
-    def _table(
-        self, name: str, required: Sequence[str], rows: int | None = None
-    ) -> list[Columns]:
-        """Return a complete table by run, after checking its columns and `rows`."""
-        path, config = self.path / name, self.algorithm.config
-        count = len(self.runs)
+    def _table(self, name: str, required: Sequence[str]) -> list[Columns]:
+        """Return a table by run, after checking its labels, columns and last row."""
+        path, config, count = self.path / name, self.algorithm.config, len(self.runs)
         record = checkpoint.newest_record(self.path / "checkpoints")
         try:
             whole = metrics_files.has_recorded_rows(path, record)
-            columns = metrics_files.read_metrics(
-                path, (), count, (*self.labels, *required)
-            )
+            names = (*self.labels, *required)
+            columns = metrics_files.read_metrics(path, (), count, names)
         except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
         for label, values in self.labels.items():
             if (columns.pop(label) != np.array(values)[:, None]).any():
                 raise InputError(f"{path} is damaged: its rows are not in order")
-        steps = columns["env_steps"][0]
-        whole &= steps[-1] == config.num_iterations * config.batch_steps
-        if not whole or rows not in (None, len(steps)):
+        last = columns["env_steps"][0, -1]
+        if not whole or last != config.num_iterations * config.batch_steps:
             raise InputError(f"{path} is damaged: it lacks iterations")
         return [{name: x[i] for name, x in columns.items()} for i in range(count)]
 
@@ -168,10 +153,8 @@ def group(
 ) -> list[Program]:
     """Group runs into as few programs as possible.
 
-    Args:
-      runs: the runs.
-      most: the largest number of runs in a program; default no limit.
-      apart: runs for which it returns different values do not share a program.
+    Programs have `most` runs at most, by default any number. Runs for which `apart`
+    returns different values do not share one.
     """
     groups: dict[tuple[str, Any], dict[Run, None]] = {}
     for run in runs:
@@ -195,22 +178,21 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
     Raises:
       InputError: if a program.json is damaged.
     """
-    paths = sorted(parent.glob(f"[!.]*/{_PROGRAM}"))
-    return [_read(path, total_steps) for path in paths]
-
-
-def _read(path: pathlib.Path, total_steps: int | None) -> Program:
-    listed = json_reader.read(path, dict[str, Any])
-    try:
-        experiments, labels = listed["experiments"], dict(listed["labels"])
-        every = [read_run(experiments[index], seed) for index, seed in listed["runs"]]
-    except NotImportable:
-        raise
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise InputError(f"{path} is damaged: {error}") from None
-    if total_steps is not None:
-        every = [run.with_total_steps(total_steps) for run in every]
-    return Program(tuple(every), path.parent, labels)
+    begun = []
+    for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
+        listed = json_reader.read(path, dict[str, Any])
+        try:
+            every, labels = listed["experiments"], dict(listed["labels"])
+            runs = [
+                read_run(every[index], seed, total_steps)
+                for index, seed in listed["runs"]
+            ]
+        except NotImportable:
+            raise
+        except (ValueError, KeyError, IndexError, TypeError) as error:
+            raise InputError(f"{path} is damaged: {error}") from None
+        begun.append(Program(tuple(runs), path.parent, labels))
+    return begun
 
 
 def unfinished(
@@ -219,12 +201,9 @@ def unfinished(
     """Return the programs to continue for requested runs, and the runs that none has.
 
     A program that has begun trains all of its runs, also those that are not requested.
-
-    Args:
-      requested: the runs.
-      stored: the programs that have begun, which may be trained already.
+    The stored ones may be trained already.
     """
-    begun_or_trained = {run for each in stored for run in each.runs}
     asked = set(requested)
     begun = [x for x in stored if not x.training and x.trains_any(asked)]
-    return begun, [run for run in requested if run not in begun_or_trained]
+    asked.difference_update(*(x.runs for x in stored))
+    return begun, [run for run in requested if run in asked]

@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,40 +11,32 @@ from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
+from gasil_jax.host.metrics_files import Columns
 
 
-class Tables(NamedTuple):
-    """The columns of metrics.csv and evaluations.csv, (seeds, rows) each.
+def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
+    """Return the metrics and the scores of a run's seeds, (seeds, rows) each.
 
-    Those of evaluations.csv are none if nothing was evaluated.
-    """
-
-    metrics: dict[str, np.ndarray]
-    evaluations: dict[str, np.ndarray]
-
-
-def read(folder: pathlib.Path, members: Members) -> Tables:
-    """Return the tables of a run with these seeds.
+    The scores are none if nothing was evaluated.
 
     Raises:
       InputError: if a table is damaged.
     """
 
-    def table(path: pathlib.Path, required: Sequence[str]) -> dict[str, np.ndarray]:
+    def table(path: pathlib.Path, *required: str) -> Columns:
         return metrics_files.read_metrics(
             path, ("seed",), members.num_members, required
         )
 
+    metrics, scores = folder / "metrics.csv", folder / "evaluations.csv"
+    evaluated = scores.exists() and scores.stat().st_size > 0
     required = (*metrics_files.SUMMARIZED, "faulty_steps")
-    metrics = table(folder / "metrics.csv", required)
-    path = folder / "evaluations.csv"
-    evaluated = path.exists() and path.stat().st_size > 0
-    return Tables(metrics, table(path, ("mean",)) if evaluated else {})
+    return table(metrics, *required), table(scores, "mean") if evaluated else {}
 
 
 def finish(
     folder: pathlib.Path, env_name: str, members: Members, outcome: Outcome
-) -> tuple[Tables, dict[str, Any]]:
+) -> tuple[tuple[Columns, Columns], dict[str, Any]]:
     """Write policy.npz, learning_curve.png and summary.json.
 
     Args:
@@ -61,12 +53,12 @@ def finish(
       OSError: if the folder can no longer be written, or could not before.
     """
     metrics, evaluations = tables = read(folder, members)
-    metrics, evaluations = tables
     seeds, agent = members.seeds, members.algorithm.agent.name
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
-    final = metrics_files.final_returns(returns)
+    finals = metrics_files.finals(metrics, evaluations)
     # The policies come first, because a figure or a summary can be made again.
-    policy_file.save(folder / "policy.npz", outcome.states, members.env, seeds, final)
+    policies, final = folder / "policy.npz", finals["final_return"]
+    policy_file.save(policies, outcome.states, members.env, seeds, final)
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
@@ -75,12 +67,6 @@ def finish(
             title=f"{env_name}, {agent}",
             evaluations=evaluations or None,
         )
-    finals = {
-        "final_return": final,
-        "final_length": metrics_files.final_returns(metrics["episode_length"]),
-    }
-    if evaluations:
-        finals["final_evaluation"] = evaluations["mean"][:, -1]
     faults = {
         name: np.nansum(metrics[name], axis=1).astype(int)
         for name in ("faulty_steps", "skipped_updates")
@@ -108,14 +94,11 @@ def _by_seed_and_over_seeds(
     """Return each quantity, (seeds,), by seed, and over seeds; NaN becomes None."""
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
-        finite = np.isfinite(values)
-        known = [
-            x if is_finite else None for x, is_finite in zip(values.tolist(), finite)
-        ]
+        finite = values[np.isfinite(values)]
+        known = [x if np.isfinite(x) else None for x in values.tolist()]
         fields[name] = dict(zip(map(str, seeds), known, strict=True))
-        mean = float(values[finite].mean()) if finite.any() else None
+        fields[f"{name}_mean"] = float(finite.mean()) if finite.size else None
         estimate = statistics.estimate(values)
-        fields[f"{name}_mean"] = mean
         fields[f"{name}_interquartile_mean"] = estimate.interquartile_mean
         fields[f"{name}_interval"] = estimate.interval
     return fields

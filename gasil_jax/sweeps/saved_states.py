@@ -39,12 +39,12 @@ class _Summary(TypedDict):
 
 def find(
     description: Mapping[str, Any], point: int | None
-) -> list[tuple[Program, Sequence[int]]]:
+) -> list[tuple[Program, list[int]]]:
     """Return the programs of a run, or of a sweep's point, with its members in each.
 
     Args:
       description: config.json of the run or sweep, from `run_folder.read`.
-      point: number of a sweep's point; default the best by mean.
+      point: see `load`.
 
     Raises:
       InputError: if the folder has no such point.
@@ -64,14 +64,13 @@ def find(
     point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
-    requested = {plan.runs[point, seed] for seed in plan.seeds}
-    saved = [
-        (each, [i for i, run in enumerate(each.runs) if run in requested])
-        for each in plan.stored(folder)
-    ]
-    if not any(indices for _, indices in saved):
+    requested, saved = {plan.runs[point, seed] for seed in plan.seeds}, []
+    for each in plan.stored(folder):
+        if indices := [i for i, run in enumerate(each.runs) if run in requested]:
+            saved.append((each, indices))
+    if not saved:
         raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
-    return [(each, indices) for each, indices in saved if indices]
+    return saved
 
 
 def load(
@@ -113,7 +112,15 @@ def load(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        chosen = _checkpoint(folder, program.path / "checkpoints", which)
+        root = program.path / "checkpoints"
+        chosen, errors = checkpoint.latest(root)
+        for error in errors:
+            print(f"warning: {error}", file=sys.stderr)
+        if which == "best":
+            chosen = checkpoint.best(root)
+        if chosen is None:
+            scored = " with a score" if which == "best" else ""
+            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
 
         # The leaves of all members have the same shapes.
         def init(seed: Any, algorithm: Algorithm = algorithm) -> Any:
@@ -131,21 +138,6 @@ def load(
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *(states[x] for x in seeds))
     first, (index, *_) = every[0]
     return env, first.runs[index].algorithm, seeds, stacked
-
-
-def _checkpoint(
-    folder: pathlib.Path, root: pathlib.Path, which: str
-) -> checkpoint.Checkpoint:
-    """Return the last or the best checkpoint in the folder of a run's checkpoints."""
-    chosen, errors = checkpoint.latest(root)
-    for error in errors:
-        print(f"warning: {error}", file=sys.stderr)
-    if which == "best":
-        chosen = checkpoint.best(root)
-    if chosen is None:
-        scored = " with a score" if which == "best" else ""
-        raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    return chosen
 
 
 class Policies(NamedTuple):
@@ -174,8 +166,9 @@ def load_policies(
     """Return the policies of a run, or one that comes with the package.
 
     Args:
-      folder: folder of the run or sweep, or zoo:NAME.
-      which: see `load`; a policy of the zoo has no checkpoints.
+      folder: folder of the run or sweep, or zoo:NAME, which has no points and no
+        checkpoints.
+      which: see `load`.
       point: see `load`.
       seed: see `load`.
 

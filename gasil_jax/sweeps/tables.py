@@ -18,11 +18,12 @@ from gasil_jax.host import (
     policy_file,
     run_folder,
 )
+from gasil_jax.host.metrics_files import Columns
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
 from gasil_jax.sweeps import run_results, saved_states
 from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
-from gasil_jax.sweeps.programs import Columns, Program
+from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
 
 
@@ -96,22 +97,13 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
                 )
         scores |= dict(zip(each.runs, own_scores))
 
-    def by_point(tables: Mapping[Run, Columns], name: str, final: Any) -> np.ndarray:
-        values = [final(tables[run][name]) for run in plan.runs.values()]
-        return np.reshape(values, (-1, len(plan.seeds)))
-
-    def last_tenth(column: np.ndarray) -> float:
-        return metrics_files.final_returns(column[None])[0]
-
-    curves = _curves(plan, metrics)
-    finals = {
-        f"final_{name}": by_point(metrics, f"episode_{name}", last_tenth)
-        for name in ("return", "length")
-    }
+    curves, every = _curves(plan, metrics), plan.runs.values()
     if scores:
         of_scores = _curves(plan, scores)
         curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
-        finals["final_evaluation"] = by_point(scores, "mean", lambda column: column[-1])
+    last = [metrics_files.finals(metrics[run], scores.get(run, {})) for run in every]
+    shape = (-1, len(plan.seeds))
+    finals = {name: np.reshape([x[name] for x in last], shape) for name in last[0]}
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
     trainings = {each.name: each.training for each in trained}
