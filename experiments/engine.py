@@ -180,10 +180,8 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
 
 def records(stored: Program) -> dict[Run, Record]:
     """Return the records of a program that is trained to its end."""
-    metrics, evaluations = stored.tables()
-    provenance = _provenance(stored)
-    every = zip(stored.runs, metrics, evaluations or [{}] * len(metrics))
-    return {run: record(own, scores, provenance) for run, own, scores in every}
+    provenance, every = _provenance(stored), zip(stored.runs, stored.tables())
+    return {run: record(*own, provenance) for run, own in every}
 
 
 def _add_session(stored: Program, setup: Setup) -> None:

@@ -169,17 +169,15 @@ class _Tables:
         self._returns = [np.empty(0, np.float32)]
         self.score: float | None = None
         path = folder / "metrics.csv"
-        size = _recorded_size(path, record)
-        self._metrics = metrics_files.MetricsWriter(path, labels, size)
+        self._metrics = metrics_files.MetricsWriter(path, labels, record)
         self.evaluation = None
         if evaluation_schedule is not None:
-            path = folder / "evaluations.csv"
             self.evaluation = PeriodicEvaluation(
                 members,
                 evaluation_schedule,
-                path,
+                folder / "evaluations.csv",
                 labels=labels,
-                size=_recorded_size(path, record),
+                checkpoint=record,
                 trackers=trackers,
             )
 
@@ -278,19 +276,6 @@ def _restored(
         with command_line.input_checked():
             states = newest.restore(members.shapes())
     return _Training(members, states, newest.iteration), newest.record
-
-
-def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Return the size in bytes to cut a table to; None if there is no table yet.
-
-    Raises:
-      InputError: if rows before that have changed since they were written.
-    """
-    if record is not None:
-        # Too few are refused where the table is cut.
-        metrics_files.has_recorded_rows(path, record)
-        return record[f"{path.stem}_size"]
-    return 0 if path.exists() else None
 
 
 def _save(

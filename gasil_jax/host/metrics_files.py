@@ -103,37 +103,37 @@ class MetricsWriter:
     Args:
       path: the file.
       labels: columns that identify the members, (members,) each: "seed" and others.
-      size: number of bytes to keep of an existing file; the rest is moved to a new
-        file beside it. None creates a new file.
+      checkpoint: the record of the checkpoint that training continues from; None at its
+        beginning. What an existing file has more is moved to a new file beside it.
       columns: metrics to write first, in this order; others follow.
 
     Raises:
-      FileExistsError: if a new file would replace an existing one.
-      ValueError: if the existing file is missing or shorter than `size`.
+      ValueError: if rows that the checkpoint has seen are missing or have changed.
     """
 
     def __init__(
         self,
         path: pathlib.Path,
         labels: Mapping[str, Sequence[Any]],
-        size: int | None = None,
+        checkpoint: Mapping[str, Any] | None = None,
         *,
         columns: Sequence[str] = COLUMNS,
     ):
         self._first = tuple(columns)
-        self._columns: tuple[str, ...] | None = None
         self._labels, self._path = labels, path
-        if size is None:
-            self._file = path.open("x", newline="")
-        else:
-            if not path.is_file() or path.stat().st_size < size:
+        if checkpoint is not None:
+            size = checkpoint[f"{path.stem}_size"]
+            whole = has_recorded_rows(path, checkpoint) and path.is_file()
+            if not whole or path.stat().st_size < size:
                 raise ValueError(f"{path} lacks rows that the checkpoint has seen")
             _cut(path, size)
-            with path.open(newline="") as file:
-                self._columns = tuple(next(csv.reader(file), ())) or None
-            self._file = path.open("a", newline="")
+        elif path.exists():
+            _cut(path, 0)
+        self._file = path.open("a", newline="")
         # Those of all lines so far.
         self._rows, self._digest = _rows_and_digest(path)
+        with path.open(newline="") as file:
+            self._columns = tuple(next(csv.reader(file), ())) or None
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
         """Write arrays (members, iterations), one for each metric.
@@ -282,18 +282,16 @@ def _cell(value: Any) -> str:
 
 def read_metrics(
     path: pathlib.Path,
-    labels: Sequence[str],
-    num_members: int,
+    labels: Mapping[str, Sequence[int]],
     required: Sequence[str] = (),
     *,
     unfinished: bool = False,
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Return every metric of a `MetricsWriter`'s file, (members, iterations) each.
 
     Args:
       path: the file; an empty cell becomes NaN.
-      labels: names of the first columns, which are not metrics.
-      num_members: number of rows per iteration.
+      labels: columns that identify the members, (members,) each: "seed" and others.
       required: columns that it must have besides "env_steps".
       unfinished: leave out a last iteration that is incomplete, because training may be
         writing it. The result is empty if no iteration is complete yet.
@@ -302,7 +300,7 @@ def read_metrics(
       InputError: if the file is damaged, has no rows or lacks a column.
       OSError: if there is no such file.
     """
-    first = len(labels)
+    num_members = len(labels["seed"])
     try:
         with path.open(newline="") as file:
             header: list[str] = []
@@ -314,24 +312,27 @@ def read_metrics(
                 if len(row) != len(header):
                     raise ValueError(f"row {number} has {len(row)} cells")
                 if number:
-                    cells.extend(float(x) if x else math.nan for x in row[first:])
-        width = num_members * (len(header) - first)
+                    cells.extend(float(x) if x else math.nan for x in row)
+        width = num_members * len(header)
         if unfinished and width > 0:
             del cells[len(cells) // width * width :]
         if unfinished and not cells:
             return {}
         if not cells:
             raise ValueError("it has no rows")
-        values = np.array(cells).reshape(-1, num_members, len(header) - first)
+        values = np.array(cells).reshape(-1, num_members, len(header))
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-    metrics = {name: values[:, :, i].T for i, name in enumerate(header[first:])}
-    for name in ("env_steps", *required):
+    metrics = {name: values[:, :, i].T for i, name in enumerate(header)}
+    for name in ("env_steps", *labels, *required):
         if name not in metrics:
             raise InputError(f"{path} is damaged: it has no column {name}")
     steps = metrics["env_steps"]
     if not (steps == steps[0]).all() or not (np.diff(steps[0]) > 0).all():
         raise InputError(f"{path} is damaged: its env_steps are not in order")
+    for label, members in labels.items():
+        if (metrics.pop(label) != np.array(members)[:, None]).any():
+            raise InputError(f"{path} is damaged: its rows are not in order")
     return metrics
 
 

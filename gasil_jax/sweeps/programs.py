@@ -16,9 +16,7 @@ import os
 import pathlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import Any
-
-import numpy as np
+from typing import Any, TypedDict
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, NotImportable
@@ -29,6 +27,14 @@ from gasil_jax.sweeps.runs import Run, read_run
 _PROGRAM, _TRAINING = "program.json", "training.json"
 #: Stands for a folder that is not made yet; nothing is stored in it.
 NOWHERE = pathlib.Path(os.devnull)
+
+
+class _Listed(TypedDict):
+    """The content of program.json; each run is an experiment's index and a seed."""
+
+    experiments: tuple[dict[str, Any], ...]
+    runs: tuple[tuple[int, int], ...]
+    labels: dict[str, tuple[int, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -115,8 +121,8 @@ class Program:
             return {}
         return content if self._length.items() <= content.items() else {}
 
-    def tables(self) -> tuple[list[Columns], list[Columns]]:
-        """Return the metrics of each run, (rows,), and its scores; [] without any.
+    def tables(self) -> list[tuple[Columns, Columns]]:
+        """Return the metrics and the scores of each run, (rows,); {} without scores.
 
         Raises:
           InputError: if a table is damaged.
@@ -124,22 +130,19 @@ class Program:
         metrics = self._table("metrics.csv", metrics_files.SUMMARIZED)
         if len(metrics[0]["env_steps"]) != self.algorithm.config.num_iterations:
             raise InputError(f"{self.path}/metrics.csv is damaged: it lacks iterations")
-        evaluated = self.training.get("evaluation_seconds") is not None
-        return metrics, self._table("evaluations.csv", ("mean",)) if evaluated else []
+        if self.training.get("evaluation_seconds") is None:
+            return [(columns, {}) for columns in metrics]
+        return list(zip(metrics, self._table("evaluations.csv", ("mean",))))
 
     def _table(self, name: str, required: Sequence[str]) -> list[Columns]:
-        """Return a table by run, after checking its labels, columns and last row."""
+        """Return a table by run, after checking its columns and its last row."""
         path, config, count = self.path / name, self.algorithm.config, len(self.runs)
         record = checkpoint.newest_record(self.path / "checkpoints")
         try:
             whole = metrics_files.has_recorded_rows(path, record)
-            names = (*self.labels, *required)
-            columns = metrics_files.read_metrics(path, (), count, names)
+            columns = metrics_files.read_metrics(path, self.labels, required)
         except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
-        for label, values in self.labels.items():
-            if (columns.pop(label) != np.array(values)[:, None]).any():
-                raise InputError(f"{path} is damaged: its rows are not in order")
         last = columns["env_steps"][0, -1]
         if not whole or last != config.num_iterations * config.batch_steps:
             raise InputError(f"{path} is damaged: it lacks iterations")
@@ -180,13 +183,15 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
     """
     begun = []
     for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
-        listed = json_reader.read(path, dict[str, Any])
+        listed = json_reader.read(path, _Listed)
+        every, labels = listed["experiments"], listed["labels"]
         try:
-            every, labels = listed["experiments"], dict(listed["labels"])
             runs = [
                 read_run(every[index], seed, total_steps)
                 for index, seed in listed["runs"]
             ]
+            if {len(x) for x in (labels["seed"], *labels.values())} != {len(runs)}:
+                raise ValueError("its labels are not those of its runs")
         except NotImportable:
             raise
         except (ValueError, KeyError, IndexError, TypeError) as error:

@@ -24,9 +24,7 @@ def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
     """
 
     def table(path: pathlib.Path, *required: str) -> Columns:
-        return metrics_files.read_metrics(
-            path, ("seed",), members.num_members, required
-        )
+        return metrics_files.read_metrics(path, {"seed": members.seeds}, required)
 
     metrics, scores = folder / "metrics.csv", folder / "evaluations.csv"
     evaluated = scores.exists() and scores.stat().st_size > 0

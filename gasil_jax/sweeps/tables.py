@@ -85,24 +85,20 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
             f"{point} and seed {seed}: train them with python -m gasil_jax.sweep "
             "--resume"
         )
-    metrics: dict[Run, Columns] = {}
-    scores: dict[Run, Columns] = {}
+    stored: dict[Run, tuple[Columns, Columns]] = {}
     for each in trained:
-        own_metrics, own_scores = each.tables()
-        for run, columns in zip(each.runs, own_metrics, strict=True):
-            if not _equal(metrics.setdefault(run, columns), columns):
+        for run, own in zip(each.runs, each.tables(), strict=True):
+            if not _equal(stored.setdefault(run, own)[0], own[0]):
                 raise InputError(
                     f"{each.path} has another result than another program for seed "
                     f"{run.seed} of {run.experiment}"
                 )
-        scores |= dict(zip(each.runs, own_scores))
-
-    curves, every = _curves(plan, metrics), plan.runs.values()
-    if scores:
-        of_scores = _curves(plan, scores)
-        curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
-    last = [metrics_files.finals(metrics[run], scores.get(run, {})) for run in every]
-    shape = (-1, len(plan.seeds))
+    every = [stored[run] for run in plan.runs.values()]
+    curves = _curves(plan, [metrics for metrics, _ in every])
+    for name, values in _curves(plan, [scores for _, scores in every]).items():
+        curves[f"evaluation_{name}"] = values
+    last = [metrics_files.finals(*own) for own in every]
+    shape = len(plan.points), len(plan.seeds)
     finals = {name: np.reshape([x[name] for x in last], shape) for name in last[0]}
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
@@ -116,28 +112,27 @@ def _equal(first: Columns, second: Columns) -> bool:
     )
 
 
-def _curves(plan: Plan, tables: Mapping[Run, Columns]) -> Columns:
-    """Return every metric, (points, seeds, iterations); NaN after a run's last.
+def _curves(plan: Plan, every: Sequence[Columns]) -> Columns:
+    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row.
 
     Raises:
-      InputError: if runs have other metrics than the first one.
+      InputError: if runs have other columns than the first one.
     """
-    every = {member: tables[run] for member, run in plan.runs.items()}
-    (first, columns), *_ = every.items()
-    for (point, seed), metrics in every.items():
-        if differing := ", ".join(sorted(columns.keys() ^ metrics.keys())):
+    (first, *_), columns = plan.runs, every[0]
+    for (point, seed), own in zip(plan.runs, every, strict=True):
+        if differing := ", ".join(sorted(columns.keys() ^ own.keys())):
             raise InputError(
                 f"point {point}, seed {seed} was trained with other metrics than point "
                 f"{first[0]}, seed {first[1]}: {differing}"
             )
-    # Points may differ in batch_steps, and so in iterations.
-    length = max(len(metrics["env_steps"]) for metrics in every.values())
-    curves = {name: np.full((len(every), length), np.nan) for name in columns}
-    for index, metrics in enumerate(every.values()):
-        for name, values in metrics.items():
-            curves[name][index, : len(values)] = values
-    shape = (-1, len(plan.seeds), length)
-    return {name: values.reshape(shape) for name, values in curves.items()}
+    curves = {}
+    for name in columns:
+        # Points may differ in batch_steps, and so in iterations.
+        values = np.full((len(every), max(len(own[name]) for own in every)), np.nan)
+        for row, own in zip(values, every, strict=True):
+            row[: len(own[name])] = own[name]
+        curves[name] = values.reshape(len(plan.points), len(plan.seeds), -1)
+    return curves
 
 
 def finish(folder: pathlib.Path, results: Results) -> None:

@@ -57,7 +57,7 @@ def same(result, folder):
         (result.metrics, "metrics.csv"),
         (result.evaluations, "evaluations.csv"),
     ):
-        expected = metrics_files.read_metrics(folder / name, ("seed",), 2)
+        expected = metrics_files.read_metrics(folder / name, {"seed": [0, 1]})
         assert set(found) == set(expected)
         for column in expected:
             np.testing.assert_array_equal(found[column], expected[column])

@@ -220,7 +220,13 @@ def test_different_sweeps_are_not_merged(tmp_path, capsys):
     metrics.write_bytes(b"".join(rows))
     listed = folder / "program.json"
     kept = listed.read_text()
-    for text in ("{", '{"experiments": [], "runs": []}', kept.replace("0.99", "0.98")):
+    content = json.loads(kept)
+    del content["sha256"]
+    content["labels"]["seed"].pop()
+    for text in (
+        *("{", '{"experiments": [], "runs": []}', kept.replace("0.99", "0.98")),
+        *(json.dumps(content), json.dumps(content | {"labels": {}})),
+    ):
         listed.write_text(text)
         assert "program.json is damaged" in refused(capsys, *both)
     listed.write_text(kept)
