@@ -154,11 +154,6 @@ def description(options: Options) -> dict[str, Any]:
         }
 
 
-def described(options: Options, algorithm: Algorithm) -> dict[str, Any]:
-    """Return every option by its own name, with the settings of an algorithm."""
-    return run_folder.flat({**description(options), "algorithm": algorithm})
-
-
 T = TypeVar("T", bound=Options)
 
 

@@ -48,23 +48,22 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
       InputError: if a name can't vary or is given twice, or if a value is not a number.
     """
     values: dict[str, tuple[Any, ...]] = {}
+    kinds = _kinds(algorithm)
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
-        kind = _kinds(algorithm).get(name)
-        if kind is None:
+        if name not in kinds:
             raise InputError(f"grid: {_why_not(name, algorithm)}")
-        read = float if kind is float else whole_number
+        read = whole_number if kinds[name] is int else float
         try:
             values[name] = tuple(dict.fromkeys(map(read, listed.split(","))))
         except ValueError:
-            like = "numbers, like {}=0.1,0.2"
-            like = like if kind is float else "whole numbers, like {}=10,20"
-            raise InputError(
-                f"grid has {entry!r}: it must be {like.format(name)}"
-            ) from None
+            like = f"numbers, like {name}=0.1,0.2"
+            if read is whole_number:
+                like = f"whole numbers, like {name}=10,20"
+            raise InputError(f"grid has {entry!r}: it must be {like}") from None
     return values
 
 
