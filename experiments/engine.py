@@ -24,8 +24,7 @@ import numpy as np
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Store
 from gasil_jax.errors import InputError
-from gasil_jax.host import metrics_files, run_folder, run_options
-from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host import interruption, metrics_files, run_folder, run_options
 from gasil_jax.sweeps import assembly, programs
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
@@ -170,11 +169,8 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     )
     env = assembly.prepare(options, [stored])
     _add_session(stored, setup)
-    try:
+    with interruption.noted("continue with: the same command and --resume"):
         assembly.train(options, env, [stored], title=title(stored))
-    except Interrupted as interrupted:
-        interrupted.add_note("continue with: the same command and --resume")
-        raise
     return records(stored)
 
 

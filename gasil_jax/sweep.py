@@ -19,8 +19,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, run_folder, run_options
-from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host import command_line, interruption, run_folder, run_options
 from gasil_jax.sweeps import assembly, launch, points, run_results, shards, tables
 from gasil_jax.sweeps.plan import Plan, stored_plan
 from gasil_jax.sweeps.programs import NOWHERE
@@ -172,11 +171,8 @@ def _launch(options: Options, plan: Plan, arguments: Sequence[str] | None) -> No
     others += ["--resume", "--out", str(options.out.absolute()), "--shard"]
     every = [f"{number}/{count}" for number in range(1, count + 1)]
     jobs = {f"shard {shard}": [*others, shard] for shard in every}
-    try:
+    with interruption.noted("continue with the same command and --resume"):
         launch.run_on_ray(_PROGRAM, jobs, options.devices)
-    except Interrupted as interrupted:
-        interrupted.add_note("continue with the same command and --resume")
-        raise
     tables.finish(options.out, tables.read(plan, plan.trained(options.out)))
 
 

@@ -18,7 +18,7 @@ import jax
 
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable, refusal
+from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     command_line,
     descriptions,
@@ -305,16 +305,10 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         description = json_reader.read(path, _Description)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}{_why_no_run(folder)}") from None
-    try:
+    with json_reader.blamed(path):
         algorithm = descriptions.read(description["algorithm"])
         algorithms.check(algorithm)
         check_seeds(description["seeds"], description["first_seed"])
-    except NotImportable:
-        raise
-    except ValueError as error:
-        raise InputError(
-            f"{path} is damaged, or another program wrote it: {error}"
-        ) from None
     return {**description, "algorithm": algorithm, "out": folder}
 
 

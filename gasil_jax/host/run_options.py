@@ -24,12 +24,12 @@ from gasil_jax.host import (
     descriptions,
     devices,
     environments,
+    interruption,
     output_file,
     run_folder,
     trackers,
 )
 from gasil_jax.host.environments import Settings
-from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
 from gasil_jax.imitation import PPOGASIL, Agent
@@ -507,10 +507,8 @@ def told_how_to_continue(folder: pathlib.Path, program: str) -> Iterator[None]:
     quoted = shlex.quote(str(folder))
     how = f"continue with: python -m {program} --resume --out {quoted}"
     try:
-        yield
-    except Interrupted as interrupted:
-        interrupted.add_note(how)
-        raise
+        with interruption.noted(how):
+            yield
     except output_file.WriteError as error:
         # A run that has results may be without checkpoints.
         if not run_folder.has_run(folder) or run_folder.has_results(folder):

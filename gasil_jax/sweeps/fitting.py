@@ -4,7 +4,7 @@ import contextlib
 import json
 import pathlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -23,7 +23,7 @@ from gasil_jax.host import (
     run_options,
 )
 from gasil_jax.host.driver import Callback, FitProgress
-from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.interruption import Interruption, noted
 from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
@@ -159,7 +159,11 @@ def fit(
                 evaluate_every=evaluate_every,
                 evaluate_episodes=evaluate_episodes if evaluate_every else None,
             )
-            stack.enter_context(_opened(path, *described, resume=resume))
+            run_folder.create(path, option="folder")
+            stack.enter_context(run_folder.lock(path, option="folder"))
+            _begin(path, *described, resume=resume)
+            how_to_continue = "continue with the same arguments and resume=True"
+            stack.enter_context(noted(how_to_continue))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
@@ -254,42 +258,28 @@ def _describe(members: Members, **arguments: Any) -> tuple[dict[str, Any], str]:
     return run_options.description(options), run_folder.CONFIG
 
 
-@contextlib.contextmanager
-def _opened(
+def _begin(
     folder: pathlib.Path, description: Mapping[str, Any], name: str, *, resume: bool
-) -> Iterator[None]:
-    """Create and lock a folder of `fit`, and describe training that begins in it.
-
-    Args:
-      folder: the folder.
-      description: what is trained, as from `_describe`.
-      name: name of the file that says it.
-      resume: whether training in the folder is continued.
+) -> None:
+    """Write what is trained to a new folder, or compare it with what the folder says.
 
     Raises:
-      ValueError: if the folder can't be written, is in use, or holds other files.
+      ValueError: if the folder holds other files, or training that is not the same.
     """
-    run_folder.create(folder, option="folder")
-    with run_folder.lock(folder, option="folder"):
-        if not (folder / name).is_file():
-            run_folder.refuse_used(folder, option="folder")
-            run_folder.write_description(folder, description, name)
-        elif not resume:
+    if not (folder / name).is_file():
+        run_folder.refuse_used(folder, option="folder")
+        run_folder.write_description(folder, description, name)
+    elif not resume:
+        raise ValueError(
+            f"folder is {folder}, where training has begun: give resume=True or "
+            "another folder"
+        )
+    else:
+        is_run = name == run_folder.CONFIG
+        before = (run_folder.read if is_run else run_folder.read_fit)(folder)
+        if changes := run_folder.differences(before, description):
             raise ValueError(
-                f"folder is {folder}, where training has begun: give resume=True or "
-                "another folder"
+                f"resume continues with {folder}, where {'; '.join(changes)}: "
+                "only total_steps may differ, and grow"
             )
-        else:
-            is_run = name == run_folder.CONFIG
-            before = (run_folder.read if is_run else run_folder.read_fit)(folder)
-            if changes := run_folder.differences(before, description):
-                raise ValueError(
-                    f"resume continues with {folder}, where {'; '.join(changes)}: "
-                    "only total_steps may differ, and grow"
-                )
-            run_folder.refuse_other_expert(before, run_folder.flat(description), folder)
-        try:
-            yield
-        except Interrupted as interrupted:
-            interrupted.add_note("continue with the same arguments and resume=True")
-            raise
+        run_folder.refuse_other_expert(before, run_folder.flat(description), folder)

@@ -12,7 +12,7 @@ from typing import Any
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
-from gasil_jax.host import run_folder
+from gasil_jax.host import json_reader, run_folder
 from gasil_jax.host.environments import Settings
 from gasil_jax.sweeps import points, programs
 from gasil_jax.sweeps.points import Point
@@ -125,9 +125,8 @@ def stored_plan(description: Mapping[str, Any]) -> Plan:
       InputError: if its points can't be trained.
     """
     algorithm, of_sweep = description["algorithm"], description.get("points", ({},))
-    path = description["out"] / run_folder.CONFIG
-    source = f"{path} is damaged, or another program wrote it: points: "
-    points.check(of_sweep, algorithm, source)
+    with json_reader.blamed(description["out"] / run_folder.CONFIG):
+        points.check(of_sweep, algorithm, "points: ")
     return Plan(
         description["env"],
         description["settings"],

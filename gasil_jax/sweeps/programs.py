@@ -19,7 +19,7 @@ from collections.abc import Set as AbstractSet
 from typing import Any, TypedDict
 
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, json_reader, metrics_files, run_folder
 from gasil_jax.host.metrics_files import Columns
 from gasil_jax.sweeps.runs import Run, read_run
@@ -185,17 +185,13 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
     for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
         listed = json_reader.read(path, _Listed)
         every, labels = listed["experiments"], listed["labels"]
-        try:
+        with json_reader.blamed(path):
             runs = [
                 read_run(every[index], seed, total_steps)
                 for index, seed in listed["runs"]
             ]
             if {len(x) for x in (labels["seed"], *labels.values())} != {len(runs)}:
                 raise ValueError("its labels are not those of its runs")
-        except NotImportable:
-            raise
-        except (ValueError, KeyError, IndexError, TypeError) as error:
-            raise InputError(f"{path} is damaged: {error}") from None
         begun.append(Program(tuple(runs), path.parent, labels))
     return begun
 
