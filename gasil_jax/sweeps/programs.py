@@ -7,7 +7,6 @@ training.json. Its name is a hash of its runs, so two programs never share a fol
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import itertools
 import json
@@ -67,17 +66,13 @@ class Program:
         """The traced numbers of each run, by name."""
         return tuple(run.algorithm.hyperparameters for run in self.runs)
 
-    @functools.cached_property
-    def name(self) -> str:
-        """A hash of its runs, the name of its folder."""
-        keys = " ".join(run.key for run in self.runs)
-        return hashlib.sha256(keys.encode()).hexdigest()[:16]
-
     def below(
         self, parent: pathlib.Path, labels: Mapping[str, Sequence[int]]
     ) -> "Program":
-        """Return the program with its folder below a folder, and with labels."""
-        return dataclasses.replace(self, path=parent / self.name, labels=labels)
+        """Return the program with labels, and a folder that has a hash as its name."""
+        keys = " ".join(run.key for run in self.runs)
+        path = parent / hashlib.sha256(keys.encode()).hexdigest()[:16]
+        return dataclasses.replace(self, path=path, labels=labels)
 
     def trains_any(self, runs: AbstractSet[Run]) -> bool:
         """Return whether some of the runs are its own."""

@@ -102,7 +102,7 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
     finals = {name: np.reshape([x[name] for x in last], shape) for name in last[0]}
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
-    trainings = {each.name: each.training for each in trained}
+    trainings = {each.path.name: each.training for each in trained}
     return Results(plan, list(trainings.values()), curves, finals, diverged)
 
 

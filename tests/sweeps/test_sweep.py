@@ -94,7 +94,7 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
     trained = [
         types.SimpleNamespace(
             runs=program.runs,
-            name=program.name,
+            path=tmp_path / str(value),
             tables=lambda value=value: [(metrics(value), {})],
             training=training,
         )
