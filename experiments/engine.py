@@ -214,11 +214,8 @@ def record(
 ) -> Record:
     """Return a run's record.
 
-    Args:
-      metrics: columns of metrics.csv, (iterations,) each.
-      evaluations: columns of evaluations.csv, (evaluations,) each; empty if there were
-        none.
-      provenance: see `Record`.
+    The metrics and the evaluations are columns of its tables, (rows,) each; there may
+    be no evaluations.
     """
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]

@@ -21,9 +21,8 @@ from gasil_jax.host.run_options import (
     resumed_run,
     write_config,
 )
-from gasil_jax.sweeps import assembly, run_results
-from gasil_jax.sweeps.programs import NOWHERE, Program
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.sweeps import assembly, programs, run_results
+from gasil_jax.sweeps.programs import Program
 
 
 def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
@@ -66,9 +65,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
-    seeds, where = options.seed_numbers, options.out or NOWHERE
-    every = (Run(options.env, options.algorithm, x, options.settings) for x in seeds)
-    job = Program(tuple(every), where, {"seed": seeds})
+    job = programs.of_run(vars(options), options.algorithm)
     env = assembly.prepare(options, [job])
     with open_folder(options, "gasil_jax.run") as folder:
         summary = train(options, env, dataclasses.replace(job, path=folder))

@@ -79,11 +79,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def make_plan(options: Options, stored: Mapping[str, Any] | None = None) -> Plan:
-    """Return the plan of a sweep, checked.
+    """Return the plan of a sweep, checked, from options that are.
 
-    Args:
-      options: the options, which `run_options.check` accepts.
-      stored: config.json of the sweep that is continued, whose points come first.
+    If a sweep is continued, `stored` is its config.json, whose points come first.
 
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
@@ -102,7 +100,8 @@ def make_plan(options: Options, stored: Mapping[str, Any] | None = None) -> Plan
         )
         every += [point for point in named if point not in every]
     points.check(every, algorithm)
-    return Plan(options.env, options.settings, algorithm, every, options.seed_numbers)
+    seeds = run_folder.seeds_of(vars(options))
+    return Plan(options.env, options.settings, algorithm, every, seeds)
 
 
 def _train(options: Options, plan: Plan, shard: tuple[int, int]) -> None:

@@ -326,7 +326,7 @@ def check_seeds(seeds: int, first_seed: int) -> None:
 
 
 def seeds_of(description: Mapping[str, Any]) -> range:
-    """Return the absolute numbers of a run's or sweep's seeds, from its config.json."""
+    """Return the absolute numbers of the seeds, from config.json or options by name."""
     return range(
         description["first_seed"], description["first_seed"] + description["seeds"]
     )

@@ -121,11 +121,6 @@ class Options:
         rewards += [self.normalize] if self.normalize_rewards else []
         return Algorithm(self.own, tuple(rewards), self.config)
 
-    @property
-    def seed_numbers(self) -> range:
-        """The seeds' absolute numbers, the same for every point of a sweep."""
-        return range(self.first_seed, self.first_seed + self.seeds)
-
 
 def algorithm_options(algorithm: Algorithm) -> dict[str, Any]:
     """Return the fields of `Options` that describe an algorithm."""

@@ -213,11 +213,8 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
 def _describe(members: Members, **arguments: Any) -> tuple[dict[str, Any], str]:
     """Return what a folder says of training in it, and the name of the file.
 
-    The file is config.json if a command can train the same, and fit.json otherwise.
-
-    Args:
-      members: the seeds.
-      **arguments: the options of a run that are arguments of `fit`.
+    The file is config.json if a command can train the same, and fit.json otherwise. The
+    options of a run that are arguments of `fit` are `arguments`.
 
     Raises:
       ValueError: if the expert's data can't be read.

@@ -1,8 +1,4 @@
-"""The plan of a sweep: every point with every seed is a run.
-
-A run of one setting is a sweep of one point, whose only program has the run's own
-folder.
-"""
+"""The plan of a sweep: every point with every seed is a run."""
 
 import dataclasses
 import functools
@@ -25,16 +21,14 @@ LABELS = ("point", "seed")
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The points and seeds of a sweep, or the seeds of a run.
+    """The points and seeds of a sweep.
 
     Attributes:
       env: name of the environment.
       settings: settings of the environment.
       algorithm: the algorithm that the points change.
-      points: changed settings, by name. A point that is added later comes last. A run
-        has one, without changes.
+      points: changed settings, by name. A point that is added later comes last.
       seeds: absolute seed numbers.
-      is_run: whether it is a run and no sweep.
     """
 
     env: str
@@ -42,7 +36,6 @@ class Plan:
     algorithm: Algorithm
     points: Sequence[Point]
     seeds: Sequence[int]
-    is_run: bool = False
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
@@ -83,10 +76,7 @@ class Plan:
         return dict(zip(LABELS, zip(*members, strict=True), strict=True))
 
     def stored(self, folder: pathlib.Path) -> list[Program]:
-        """Return the programs that have begun in the folder of the sweep or run."""
-        if self.is_run:
-            runs = tuple(self.runs.values())
-            return [Program(runs, folder, {"seed": self.seeds})]
+        """Return the programs that have begun in the folder of the sweep."""
         return programs.read(programs_of(folder), self.algorithm.config.total_steps)
 
     def trained(self, folder: pathlib.Path) -> list[Program]:
@@ -119,19 +109,17 @@ def programs_of(folder: pathlib.Path) -> pathlib.Path:
 
 
 def stored_plan(description: Mapping[str, Any]) -> Plan:
-    """Return the plan of a stored sweep or run from its `run_folder.read`.
+    """Return the plan of a stored sweep from its `run_folder.read`.
 
     Raises:
       InputError: if its points can't be trained.
     """
-    algorithm, of_sweep = description["algorithm"], description.get("points", ({},))
     with json_reader.blamed(description["out"] / run_folder.CONFIG):
-        points.check(of_sweep, algorithm, "points: ")
+        points.check(description["points"], description["algorithm"], "points: ")
     return Plan(
         description["env"],
         description["settings"],
-        algorithm,
-        of_sweep,
+        description["algorithm"],
+        description["points"],
         run_folder.seeds_of(description),
-        is_run="points" not in description,
     )

@@ -144,6 +144,17 @@ class Program:
         return [{name: x[i] for name, x in columns.items()} for i in range(count)]
 
 
+def of_run(described: Mapping[str, Any], algorithm: Algorithm) -> Program:
+    """Return the program of a run of one setting, in the run's own folder, "out".
+
+    The fields are those of config.json, or the options.
+    """
+    seeds = run_folder.seeds_of(described)
+    env, settings = described["env"], described["settings"]
+    runs = tuple(Run(env, algorithm, seed, settings) for seed in seeds)
+    return Program(runs, described["out"] or NOWHERE, {"seed": seeds})
+
+
 def group(
     runs: Iterable[Run],
     most: int | None = None,
@@ -166,12 +177,10 @@ def group(
 
 
 def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
-    """Return the programs that have begun in the folders of a folder.
+    """Return the programs that have begun in the folders of a folder, if it is there.
 
-    Args:
-      parent: the folder, which may be missing.
-      total_steps: the length of the training, which may have grown since it began;
-        default the one that it began with.
+    The length of their training, `total_steps`, may have grown since; by default it is
+    the one that it began with.
 
     Raises:
       InputError: if a program.json is damaged.

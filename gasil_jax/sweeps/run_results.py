@@ -35,13 +35,7 @@ def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
 def finish(
     folder: pathlib.Path, env_name: str, members: Members, outcome: Outcome
 ) -> tuple[tuple[Columns, Columns], dict[str, Any]]:
-    """Write policy.npz, learning_curve.png and summary.json.
-
-    Args:
-      folder: folder of the run.
-      env_name: name of the environment.
-      members: the run's seeds.
-      outcome: the result of their training.
+    """Write policy.npz, learning_curve.png and summary.json of a run that has ended.
 
     Returns:
       The tables of the run, and the summary.
@@ -117,12 +111,9 @@ def _trained(path: pathlib.Path, measured: Mapping[str, Any]) -> dict[str, Any]:
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the seconds, steps/s and devices of programs trained one after the other.
 
-    For shards, which run in parallel, "env_steps_per_second" is the average speed of
-    one shard; None if no step was taken. "evaluation_seconds" is included if policies
-    were evaluated.
-
-    Args:
-      trainings: `driver.Outcome.measured` of each program.
+    It is told from the `driver.Outcome.measured` of each. For shards, which run in
+    parallel, "env_steps_per_second" is the average speed of one shard; None if no step
+    was taken. "evaluation_seconds" is included if policies were evaluated.
     """
     seconds = [f"{x}_seconds" for x in ("compile", "train", "evaluation")]
     if any(x.get("evaluation_seconds") is None for x in trainings):

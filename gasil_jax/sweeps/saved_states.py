@@ -27,6 +27,7 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.members import member
 from gasil_jax.imitation.adversarial import AdversarialAgent
+from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.plan import stored_plan
 from gasil_jax.sweeps.programs import Program
 
@@ -42,18 +43,22 @@ def find(
 ) -> list[tuple[Program, list[int]]]:
     """Return the programs of a run, or of a sweep's point, with its members in each.
 
-    Args:
-      description: config.json of the run or sweep, from `run_folder.read`.
-      point: see `load`.
+    The run or sweep is described by `run_folder.read`; the point is as in `load`.
 
     Raises:
       InputError: if the folder has no such point.
     """
-    folder, plan = description["out"], stored_plan(description)
+    folder = description["out"]
+    if "points" not in description:
+        if point is not None:
+            raise InputError(
+                f"point is {point}: {folder} is a run, which has no points"
+            )
+        run = programs.of_run(description, description["algorithm"])
+        return [(run, list(range(len(run.runs))))]
+    plan = stored_plan(description)
     last = len(plan.points) - 1
-    if plan.is_run and point is not None:
-        raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    if point is None and not plan.is_run:
+    if point is None:
         with contextlib.suppress(FileNotFoundError):
             point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
         if point is None:
@@ -61,7 +66,6 @@ def find(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"
             )
-    point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
     requested, saved = {plan.runs[point, seed] for seed in plan.seeds}, []

@@ -244,24 +244,18 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
         seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
     lines = [f"{run_results.speed_in_words(summary)} ({seconds})"]
     for title in ("best_by_mean", "best_by_worst_seed"):
-        best = summary[title]
-        if best is None:
-            lines.append(
-                f"{title}: none, because every point has a seed that diverged or in "
-                "which no episode ended"
-            )
-            continue
-        scores = summary["points"][best]
-        told = Estimate(scores["interquartile_mean"], scores["interval"])
-        lines.append(
-            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
-            f"interquartile mean {told}, worst seed {scores['worst_seed']:.1f})"
-        )
+        told = "none, because every point has a seed that diverged or in which no "
+        told += "episode ended"
+        if (best := summary[title]) is not None:
+            scores = summary["points"][best]
+            middle = Estimate(scores["interquartile_mean"], scores["interval"])
+            told = f"{_label(points[best])} (mean {scores['mean']:.1f}, interquartile "
+            told += f"mean {middle}, worst seed {scores['worst_seed']:.1f})"
+        lines.append(f"{title}: {told}")
     shares = summary["importance"].items()
     shown = [f"{name} {share:.0%}" for name, share in shares if share is not None]
-    uncertain = ""
-    if len(points) < FEW_POINTS:
-        uncertain = f" (uncertain with {len(points)} points)"
+    few = len(points) < FEW_POINTS
+    uncertain = f" (uncertain with {len(points)} points)" if few else ""
     return lines + ([f"importance: {', '.join(shown)}{uncertain}"] if shown else [])
 
 
