@@ -15,7 +15,7 @@ import os
 import pathlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from typing import Any, TypedDict
+from typing import Any
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
@@ -26,14 +26,6 @@ from gasil_jax.sweeps.runs import Run, read_run
 _PROGRAM, _TRAINING = "program.json", "training.json"
 #: Stands for a folder that is not made yet; nothing is stored in it.
 NOWHERE = pathlib.Path(os.devnull)
-
-
-class _Listed(TypedDict):
-    """The content of program.json; each run is an experiment's index and a seed."""
-
-    experiments: tuple[dict[str, Any], ...]
-    runs: tuple[tuple[int, int], ...]
-    labels: dict[str, tuple[int, ...]]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,9 +179,9 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
     """
     begun = []
     for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
-        listed = json_reader.read(path, _Listed)
-        every, labels = listed["experiments"], listed["labels"]
+        listed = json_reader.read(path, dict[str, Any])
         with json_reader.blamed(path):
+            every, labels = listed["experiments"], dict(listed["labels"])
             runs = [
                 read_run(every[index], seed, total_steps)
                 for index, seed in listed["runs"]

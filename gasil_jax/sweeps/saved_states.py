@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
 import pathlib
 import sys
@@ -110,8 +111,7 @@ def load(
         env = environments.make_env(description["env"], **settings)
     states: dict[int, train.TrainState] = {}
     for program, indices in every:
-        count, algorithm = len(program.runs), program.algorithm
-        if which == "best" and len(indices) < count:
+        if which == "best" and len(indices) < len(program.runs):
             raise InputError(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
@@ -125,14 +125,11 @@ def load(
         if chosen is None:
             scored = " with a score" if which == "best" else ""
             raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-
-        # The leaves of all members have the same shapes.
-        def init(seed: Any, algorithm: Algorithm = algorithm) -> Any:
-            return train.first_state(env, algorithm, jax.random.key(seed))
-
+        init = functools.partial(train.first_state, env, program.algorithm)
+        keys = jax.random.split(jax.random.key(0), len(program.runs))
         with command_line.input_checked():
-            like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-            restored = chosen.restore(like)
+            # The leaves of all members have the same shapes.
+            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
         states |= {program.seeds[i]: member(restored, i) for i in indices}
     seeds = sorted(states)
     if seed is not None:
