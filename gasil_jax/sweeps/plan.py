@@ -82,11 +82,7 @@ class Plan:
     def trained(self, folder: pathlib.Path) -> list[Program]:
         """Return the programs that are trained to their end, of runs of this plan."""
         own = set(self.runs.values())
-        return [
-            each
-            for each in self.stored(folder)
-            if each.training and each.trains_any(own)
-        ]
+        return [x for x in self.stored(folder) if x.training and x.trains_any(own)]
 
     def missing(self, trained: Iterable[Program]) -> list[tuple[int, int]]:
         """Return the (index of the point, seed) of each run that no program has."""

@@ -11,7 +11,7 @@ from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
-from gasil_jax.host.metrics_files import Columns
+from gasil_jax.host.metrics_files import SUMMARIZED, Columns
 
 
 def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
@@ -22,14 +22,12 @@ def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
     Raises:
       InputError: if a table is damaged.
     """
-
-    def table(path: pathlib.Path, *required: str) -> Columns:
-        return metrics_files.read_metrics(path, {"seed": members.seeds}, required)
-
-    metrics, scores = folder / "metrics.csv", folder / "evaluations.csv"
-    evaluated = scores.exists() and scores.stat().st_size > 0
-    required = (*metrics_files.SUMMARIZED, "faulty_steps")
-    return table(metrics, *required), table(scores, "mean") if evaluated else {}
+    labels, required = {"seed": members.seeds}, (*SUMMARIZED, "faulty_steps")
+    metrics = metrics_files.read_metrics(folder / "metrics.csv", labels, required)
+    path = folder / "evaluations.csv"
+    if not path.exists() or path.stat().st_size == 0:
+        return metrics, {}
+    return metrics, metrics_files.read_metrics(path, labels, ("mean",))
 
 
 def finish(
