@@ -103,10 +103,6 @@ def title(program: Program) -> str:
     return ", ".join(words)
 
 
-def _is_of_search(run: Run) -> bool:
-    return run.seed in FINALIST_SEEDS
-
-
 def _scratch(setup: Setup) -> pathlib.Path:
     """Return the folder of the programs in training.
 
@@ -129,9 +125,10 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     ordered = sorted(rank, key=lambda run: run.key)
     begun, others = programs.unfinished(ordered, programs.read(scratch))
     # Runs of a search are not evaluated.
+    groups = programs.group(others, setup.members, lambda x: x.seed in FINALIST_SEEDS)
     new = [
         x.below(scratch, {"member": range(len(x.runs)), "seed": x.seeds})
-        for x in programs.group(others, setup.members, _is_of_search)
+        for x in groups
     ]
     for each in (begun, new):
         each.sort(key=lambda program: min(rank.get(run, 0) for run in program.runs))
@@ -155,7 +152,8 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     run = stored.runs[0]
-    episodes = None if _is_of_search(run) else setup.evaluate_episodes or None
+    of_search = run.seed in FINALIST_SEEDS
+    episodes = None if of_search else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
     options = run_options.Options(
         env=run.env,
@@ -246,7 +244,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
     """
     asked = set(missing)
     begun = programs.read(_scratch(setup))
-    used = [x for x in begun if x.trains_any(asked)]
+    used = [x for x in begun if not asked.isdisjoint(x.runs)]
     if used and not setup.resume:
         raise InputError(
             f"runs is {setup.runs}, which holds training of these runs in "

@@ -139,8 +139,9 @@ def _train(options: Options, plan: Plan, shard: tuple[int, int]) -> None:
         trained = plan.trained(folder)
         missing = plan.missing(trained)
         if name is not None:
-            own = [x.training for x in trained if x.trains_any(set(requested))]
-            told = run_results.speed_in_words(run_results.speed(own))
+            own = [x for x in trained if not set(requested).isdisjoint(x.runs)]
+            speed = run_results.speed([x.training for x in own])
+            told = run_results.speed_in_words(speed)
             print(f"shard {name} is done, {told}, in {folder}")
             if missing:
                 total = len(plan.runs)

@@ -130,17 +130,14 @@ class _Training:
         done, env_steps = self.done, self.done * self.members.config.batch_steps
 
         def copy_states() -> TrainState:
-            return self._copy_states(done)
+            if done != self.done:
+                raise RuntimeError(
+                    f"the states of iteration {done} are gone: read FitProgress.states "
+                    "in the callback"
+                )
+            return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
 
         return FitProgress(done, env_steps, metrics, evaluation, copy_states)
-
-    def _copy_states(self, iteration: int) -> TrainState:
-        if iteration != self.done:
-            raise RuntimeError(
-                f"the states of iteration {iteration} are gone: read "
-                "FitProgress.states in the callback"
-            )
-        return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
 
 
 class _Tables:

@@ -82,7 +82,8 @@ class Plan:
     def trained(self, folder: pathlib.Path) -> list[Program]:
         """Return the programs that are trained to their end, of runs of this plan."""
         own = set(self.runs.values())
-        return [x for x in self.stored(folder) if x.training and x.trains_any(own)]
+        stored = [x for x in self.stored(folder) if not own.isdisjoint(x.runs)]
+        return [x for x in stored if x.training]
 
     def missing(self, trained: Iterable[Program]) -> list[tuple[int, int]]:
         """Return the (index of the point, seed) of each run that no program has."""

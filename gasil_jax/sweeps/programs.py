@@ -14,7 +14,6 @@ import math
 import os
 import pathlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from typing import Any
 
 from gasil_jax.algorithms import Algorithm
@@ -65,10 +64,6 @@ class Program:
         keys = " ".join(run.key for run in self.runs)
         path = parent / hashlib.sha256(keys.encode()).hexdigest()[:16]
         return dataclasses.replace(self, path=path, labels=labels)
-
-    def trains_any(self, runs: AbstractSet[Run]) -> bool:
-        """Return whether some of the runs are its own."""
-        return not runs.isdisjoint(self.runs)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
@@ -201,6 +196,6 @@ def unfinished(
     The stored ones may be trained already.
     """
     asked = set(requested)
-    begun = [x for x in stored if not x.training and x.trains_any(asked)]
+    begun = [x for x in stored if not x.training and not asked.isdisjoint(x.runs)]
     asked.difference_update(*(x.runs for x in stored))
     return begun, [run for run in requested if run in asked]
