@@ -288,6 +288,17 @@ def test_a_row_that_is_changed_during_training_is_told_when_it_continues(tmp_pat
     writer.close()
 
 
+def test_a_table_of_other_seeds_is_refused(tmp_path):
+    path = tmp_path / "metrics.csv"
+    writer = metrics_files.MetricsWriter(path, {"seed": [3, 4]}, columns=("env_steps",))
+    writer.write({"env_steps": np.full((2, 1), 7.0)})
+    writer.close()
+    (first, _) = metrics_files.read_metrics(path, {"seed": [3, 4]})["env_steps"]
+    assert first.tolist() == [7.0]
+    with pytest.raises(ValueError, match="its rows are not in order"):
+        metrics_files.read_metrics(path, {"seed": [4, 3]})
+
+
 def test_windows_is_refused_in_a_line():
     program = "import sys; sys.platform = 'win32'; import gasil_jax"
     ended = subprocess.run(
