@@ -73,7 +73,8 @@ def _united(folders: Sequence[pathlib.Path]) -> dict[str, Any]:
             raise InputError(f"folder is {other['out']}, a run: it must be of a sweep")
         same = {**other, "seeds": first["seeds"], "first_seed": first["first_seed"]}
         changed = run_folder.differences(first, same, grows=())
-        if changed := changed or run_folder.differences(same, first, grows=()):
+        changed = changed or run_folder.differences(same, first, grows=())
+        if changed:
             raise InputError(
                 f"{other['out']} is of another sweep than {first['out']}: "
                 f"{'; '.join(changed)}"
