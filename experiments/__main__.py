@@ -141,7 +141,7 @@ def _train(name: str, options: Options) -> None:
         """Return the store of the figure's runs, and the runs that it lacks."""
         stored, searched = stores()
         requested = chosen.requested(searched)
-        return stored, stored.missing(engine.select_by_key(requested, shard))
+        return stored, stored.missing(engine.select_by_key(requested, *shard))
 
     while True:
         stored, missing = lacking()

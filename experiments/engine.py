@@ -24,12 +24,10 @@ import numpy as np
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Store
 from gasil_jax.errors import InputError
-from gasil_jax.host import metrics_files, run_folder, run_options
-from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host import interruption, metrics_files, run_folder, run_options
 from gasil_jax.sweeps import assembly, programs
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
-from gasil_jax.sweeps.shards import Shard
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -76,24 +74,21 @@ class Setup:
 def source(commit: str | None) -> dict[str, Any]:
     """Return the checkout's commit, and whether its files are unchanged.
 
-    Files that experiments write do not count as changed.
-
-    Args:
-      commit: the commit to return if there is no repository.
+    Files that experiments write do not count as changed. Without a repository the
+    commit is the one that is given, and nobody knows what has changed.
     """
 
-    def git(*arguments: str) -> str | None:
+    def git(*arguments: str) -> str:
         command = ("git", "-C", str(pathlib.Path(__file__).parent.parent), *arguments)
-        try:
-            answer = subprocess.run(command, capture_output=True, text=True)
-        except OSError:
-            return None
-        return answer.stdout.strip() if answer.returncode == 0 else None
+        return subprocess.check_output(command, stderr=subprocess.DEVNULL, text=True)
 
     written = [f":!{path}" for path in _WRITTEN]
-    changed = git("status", "--porcelain", "--", ".", *written)
-    clean = None if changed is None else not changed
-    return {"commit": git("rev-parse", "--short=12", "HEAD") or commit, "clean": clean}
+    try:
+        changed = git("status", "--porcelain", "--", ".", *written)
+        newest = git("rev-parse", "--short=12", "HEAD").strip()
+    except (OSError, subprocess.CalledProcessError):
+        return {"commit": commit, "clean": None}
+    return {"commit": newest, "clean": not changed}
 
 
 def title(program: Program) -> str:
@@ -110,10 +105,6 @@ def title(program: Program) -> str:
     return ", ".join(words)
 
 
-def _is_of_search(run: Run) -> bool:
-    return run.seed in FINALIST_SEEDS
-
-
 def _scratch(setup: Setup) -> pathlib.Path:
     """Return the folder of the programs in training.
 
@@ -126,9 +117,7 @@ def _scratch(setup: Setup) -> pathlib.Path:
 def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     """Return the programs to train: those that have begun, then the most important.
 
-    Args:
-      missing: the runs that are not stored, the most important first.
-      setup: how they are trained.
+    The first of the missing runs is the most important one.
 
     Raises:
       InputError: if a program.json in the scratch folder is damaged.
@@ -137,28 +126,27 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
     begun, others = programs.unfinished(ordered, programs.read(scratch))
-
-    def importance(x: Program) -> int:
-        return min(rank.get(run, 0) for run in x.runs)
-
     # Runs of a search are not evaluated.
+    groups = programs.group(others, setup.members, lambda x: x.seed in FINALIST_SEEDS)
     new = [
         x.below(scratch, {"member": range(len(x.runs)), "seed": x.seeds})
-        for x in programs.group(others, setup.members, _is_of_search)
+        for x in groups
     ]
-    return sorted(begun, key=importance) + sorted(new, key=importance)
+    for each in (begun, new):
+        each.sort(key=lambda program: min(rank.get(run, 0) for run in program.runs))
+    return [*begun, *new]
 
 
-def select_by_key(runs: Iterable[Run], shard: Shard) -> list[Run]:
-    """Return the runs of a shard, the same on each machine.
+def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
+    """Return the runs of one of `count` shards, the same on each machine.
 
     A run's shard depends on its key alone, not on which other runs are missing.
     """
-    return [x for x in runs if int(x.key, 16) % shard.count == shard.number - 1]
+    return [x for x in runs if int(x.key, 16) % count == number - 1]
 
 
 def train(stored: Program, setup: Setup) -> dict[Run, Record]:
-    """Train a program, or continue its training.
+    """Train a program, or continue its training, and return its runs' records.
 
     Raises:
       InputError: if it does not fit into memory or on the disk, or if another process
@@ -166,7 +154,8 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
       Interrupted: if a signal was received; a checkpoint was written first.
     """
     run = stored.runs[0]
-    episodes = None if _is_of_search(run) else setup.evaluate_episodes or None
+    of_search = run.seed in FINALIST_SEEDS
+    episodes = None if of_search else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
     options = run_options.Options(
         env=run.env,
@@ -180,24 +169,15 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     )
     env = assembly.prepare(options, [stored])
     _add_session(stored, setup)
-    try:
+    with interruption.noted("continue with: the same command and --resume"):
         assembly.train(options, env, [stored], title=title(stored))
-    except Interrupted as interrupted:
-        interrupted.add_note("continue with: the same command and --resume")
-        raise
     return records(stored)
 
 
 def records(stored: Program) -> dict[Run, Record]:
     """Return the records of a program that is trained to its end."""
-    metrics, evaluations = stored.tables()
-    provenance = _provenance(stored)
-    return {
-        run: record(own, scores, provenance)
-        for run, own, scores in zip(
-            stored.runs, metrics, evaluations or [{}] * len(metrics)
-        )
-    }
+    provenance, every = _provenance(stored), zip(stored.runs, stored.tables())
+    return {run: record(*own, provenance) for run, own in every}
 
 
 def _add_session(stored: Program, setup: Setup) -> None:
@@ -218,16 +198,13 @@ def _add_session(stored: Program, setup: Setup) -> None:
 def _provenance(stored: Program) -> dict[str, Any]:
     """Return how a program was trained, over all sessions of interrupted training."""
     sessions = json.loads((stored.path / _SESSIONS).read_text())["sessions"]
-
-    def every(name: str) -> str | None:
-        return (
-            ", then ".join(dict.fromkeys(x[name] for x in sessions if x[name])) or None
-        )
-
+    joined = dict(sessions[-1])
+    for name in ("device", "commit"):
+        different = dict.fromkeys(x[name] for x in sessions if x[name])
+        joined[name] = ", then ".join(different) or None
     # False if any session had a changed checkout; otherwise None if any is unknown.
-    clean = min((x["clean"] for x in sessions), key=[False, None, True].index)
-    joined = {name: every(name) for name in ("device", "commit")}
-    return {**sessions[-1], **joined, "clean": clean}
+    joined["clean"] = min((x["clean"] for x in sessions), key=[False, None, True].index)
+    return joined
 
 
 def record(
@@ -237,18 +214,15 @@ def record(
 ) -> Record:
     """Return a run's record.
 
-    Args:
-      metrics: columns of metrics.csv, (iterations,) each.
-      evaluations: columns of evaluations.csv, (evaluations,) each; empty if there were
-        none.
-      provenance: how the run was trained, see `Record`.
+    The metrics and the evaluations are columns of its tables, (rows,) each; there may
+    be no evaluations.
     """
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
 
     def means(name: str) -> np.ndarray:
-        finite = [metrics[name][part] for part in parts]
-        finite = [values[np.isfinite(values)] for values in finite]
+        every = [metrics[name][part] for part in parts]
+        finite = [values[np.isfinite(values)] for values in every]
         return np.array([x.mean() if len(x) else np.nan for x in finite])
 
     # That of the untrained policy is not stored.
@@ -272,7 +246,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
     """
     asked = set(missing)
     begun = programs.read(_scratch(setup))
-    used = [x for x in begun if x.trains_any(asked)]
+    used = [x for x in begun if not asked.isdisjoint(x.runs)]
     if used and not setup.resume:
         raise InputError(
             f"runs is {setup.runs}, which holds training of these runs in "
@@ -300,13 +274,13 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
             store.add(train(stored, setup))
 
 
-def _train_on_core(stored: Program, setup: Setup, store: Store, *, core: int) -> None:
+def _train_on_core(core: int, stored: Program, setup: Setup, folder: Any) -> None:
     """Train a program on one core; what this process prints goes to a log file."""
     os.sched_setaffinity(0, {core})
     with open(f"{stored.path}.log", "a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
-        store.add(train(stored, setup))
+        Store(folder).add(train(stored, setup))
 
 
 def train_in_processes(
@@ -339,11 +313,11 @@ def train_in_processes(
         begun_here = {run for each in begun for run in each.runs}
         waiting = [run for run in missing() if run not in begun_here]
         for stored in _requested(waiting, store, setup)[: len(free)]:
-            given = {"core": free.pop()}
-            new = (stored, setup, Store(store.folder))
-            process = SpawnProcess(target=_train_on_core, args=new, kwargs=given)
+            core = free.pop()
+            arguments = (core, stored, setup, store.folder)
+            process = SpawnProcess(target=_train_on_core, args=arguments)
             process.start()
-            running[process.sentinel] = process, stored, given["core"]
+            running[process.sentinel] = process, stored, core
         if not running:
             break
         for sentinel in multiprocessing.connection.wait(list(running)):

@@ -23,6 +23,7 @@ from experiments.store import Store
 from gasil_jax import statistics
 from gasil_jax.algorithms import Algorithm, algorithm
 from gasil_jax.host.environments import Settings, make_env
+from gasil_jax.sweeps.points import PAPER_RANGES
 from gasil_jax.sweeps.runs import Run
 
 Point = Mapping[str, Any]
@@ -231,35 +232,17 @@ class Search:
         best = self.best(store)
         return None if best is None else best[0]
 
-    def leading(self, store: Store) -> Point | None:
-        """Return the chosen point or, until it is known, the best by the first seeds.
-
-        It is None if runs of the drawn points are missing.
-        """
-        if (chosen := self.chosen(store)) is not None:
-            return chosen
-        if finalists := self.finalists(store):
-            return finalists[0]
-        drawn = draw(self.agent)
-        scores = self.scores(drawn, store)
-        return None if scores is None else drawn[int(scores.mean(axis=1).argmax())]
-
 
 #: The values of the paper's appendix, and for PPO+BC and PPO+SIL, of which it gives
 #: none, those around what the authors of SIL used.
-_PAPER_RATES: Space = {"learning_rate": (3e-5, 5e-5, 1e-4, 3e-4)}
+_PAPER: Space = {name: tuple(sorted(x)) for name, x in PAPER_RANGES.items()}
+_PAPER_RATES: Space = {"learning_rate": _PAPER["learning_rate"]}
 _COEFFICIENTS = (0.01, 0.1, 0.3, 1.0)
 PAPER_SPACES: Mapping[str, Space] = {
     "ppo": _PAPER_RATES,
     "ppo+bc": {**_PAPER_RATES, "behavior_cloning_coefficient": _COEFFICIENTS},
     "ppo+sil": {**_PAPER_RATES, "sil_coefficient": _COEFFICIENTS},
-    "ppo+gasil": {
-        **_PAPER_RATES,
-        "discriminator_updates": (1, 5, 10, 20),
-        "discriminator_learning_rate": (1e-5, 2e-5, 1e-4, 3e-4),
-        "buffer_steps": (1000, 10_000),
-        "alpha": (0.02, 0.1, 0.2, 1.0),
-    },
+    "ppo+gasil": _PAPER,
 }
 #: The largest number of points that are tried; of more, as many are drawn.
 _PAPER_POINTS = 32

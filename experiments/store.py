@@ -200,9 +200,8 @@ class Store:
 def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
     """Add the runs of another store; return how many are new, and how many it has.
 
-    Args:
-      source: folder of the other store, or the folder of results that contains it.
-      target: the store that the runs are added to; its own runs are not changed.
+    The source is the folder of that store, or of the results that contain it. A run
+    that the target has is not changed.
 
     Raises:
       InputError: if there are no runs in the folder.

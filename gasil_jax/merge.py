@@ -19,8 +19,6 @@ from gasil_jax.host import command_line, run_folder
 from gasil_jax.sweeps import tables
 from gasil_jax.sweeps.plan import programs_of, stored_plan
 
-_ADDED = ("points", "seeds", "first_seed")
-
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -42,16 +40,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = command_line.parse(Options, arguments, "gasil_jax.merge")
     if not options.folders:
         raise InputError("folders is empty: name those of the sweeps")
-    out = options.out
-    if out is None:
-        if len(options.folders) > 1:
-            raise InputError("out is missing: several folders need --out")
-        out = options.folders[0]
-    every = list(dict.fromkeys(options.folders))
-    if run_folder.has_run(out):
-        every = list(dict.fromkeys([out, *every]))
+    if options.out is None and len(options.folders) > 1:
+        raise InputError("out is missing: several folders need --out")
+    out = options.out or options.folders[0]
+    present = [out] if run_folder.has_run(out) else []
+    every = list(dict.fromkeys([*present, *options.folders]))
     united = _united(every)
-    plan = stored_plan(every[0], united)
+    plan = stored_plan(united)
     trained = [each for folder in every for each in plan.trained(folder)]
     # Nothing has been written if a run is missing or has two different results.
     results = tables.read(plan, trained)
@@ -61,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             run_folder.refuse_used(out)
         for each in trained:
             _copy(each.path, programs_of(out))
-        run_folder.write_description(out, {**united, "out": str(out)})
+        run_folder.write_description(out, united)
     tables.finish(out, results)
     return 0
 
@@ -72,29 +67,25 @@ def _united(folders: Sequence[pathlib.Path]) -> dict[str, Any]:
     Raises:
       InputError: if they differ in something else, or if one is a run.
     """
-    every = [run_folder.read(folder) for folder in folders]
-    first, settings = folders[0], _settings(every[0])
-    for folder, description in zip(folders, every, strict=True):
-        if "points" not in description:
-            raise InputError(f"folder is {folder}, a run: it must be of a sweep")
-        own = _settings(description)
-        changed = run_folder.differences(settings, own, grows=())
-        changed = changed or run_folder.differences(own, settings, grows=())
+    first, *_ = every = [run_folder.read(folder) for folder in folders]
+    for other in every:
+        if "points" not in other:
+            raise InputError(f"folder is {other['out']}, a run: it must be of a sweep")
+        same = {**other, "seeds": first["seeds"], "first_seed": first["first_seed"]}
+        changed = run_folder.differences(first, same, grows=())
+        changed = changed or run_folder.differences(same, first, grows=())
         if changed:
             raise InputError(
-                f"{folder} is of another sweep than {first}: {'; '.join(changed)}"
+                f"{other['out']} is of another sweep than {first['out']}: "
+                f"{'; '.join(changed)}"
             )
-        run_folder.refuse_other_expert(every[0], run_folder.flat(description), first)
+        run_folder.refuse_other_expert(first, run_folder.flat(other), first["out"])
     points = [point for description in every for point in description["points"]]
     seeds = [run_folder.seeds_of(description) for description in every]
     low, high = min(x.start for x in seeds), max(x.stop for x in seeds)
     distinct = [x for i, x in enumerate(points) if x not in points[:i]]
     united = {"points": distinct, "first_seed": low, "seeds": high - low}
-    return {**every[0], **united}
-
-
-def _settings(description: dict[str, Any]) -> dict[str, Any]:
-    return {name: x for name, x in description.items() if name not in _ADDED}
+    return {**first, **united}
 
 
 def _copy(program: pathlib.Path, parent: pathlib.Path) -> None:

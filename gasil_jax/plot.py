@@ -20,6 +20,7 @@ from gasil_jax.host import (
     output_file,
     run_folder,
 )
+from gasil_jax.host.metrics_files import Columns
 from gasil_jax.sweeps import saved_states
 
 _STYLES = ("-", "--", "-.", ":")
@@ -95,8 +96,8 @@ def read(
     )
 
 
-#: A folder with tables, the number of members in them, and the members to draw.
-_Members = tuple[pathlib.Path, int, Sequence[int]]
+#: A folder with tables, the labels of the members in them, and the members to draw.
+_Members = tuple[pathlib.Path, Mapping[str, Sequence[int]], Sequence[int]]
 
 
 def _saved(
@@ -105,12 +106,13 @@ def _saved(
     """Return the environment's and the agent's name, and where the tables are."""
     if (folder / run_folder.FIT).is_file():
         fit = run_folder.read_fit(folder)
-        count = len(fit["seeds"])
-        return fit["env"], fit["agent"], [(folder, count, range(count))]
+        seeds = fit["seeds"]
+        members = folder, {"seed": seeds}, range(len(seeds))
+        return fit["env"], fit["agent"], [members]
     run = run_folder.read(folder)
     saved = [
-        (stored.path, len(stored.runs), indices)
-        for stored, indices in saved_states.find(folder, run, point)
+        (stored.path, stored.labels, indices)
+        for stored, indices in saved_states.find(run, point)
     ]
     return run["env"], run["algorithm"].agent.name, saved
 
@@ -130,12 +132,12 @@ def _read_tables(
     if not all((folder / name).is_file() for folder, _, _ in saved):
         return {}
 
-    def read(folder: pathlib.Path, count: int) -> dict[str, np.ndarray]:
+    def read(folder: pathlib.Path, labels: Mapping[str, Sequence[int]]) -> Columns:
         return metrics_files.read_metrics(
-            folder / name, (), count, (column,), unfinished=True
+            folder / name, labels, (column,), unfinished=True
         )
 
-    every = [(read(folder, count), indices) for folder, count, indices in saved]
+    every = [(read(folder, labels), indices) for folder, labels, indices in saved]
     if not all(columns for columns, _ in every):
         return {}
     length = min(len(columns["env_steps"][0]) for columns, _ in every)

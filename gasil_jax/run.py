@@ -1,5 +1,6 @@
 """Train an agent: ``python -m gasil_jax.run --env walker2d --seeds 10``."""
 
+import dataclasses
 import pathlib
 import shlex
 import sys
@@ -18,12 +19,10 @@ from gasil_jax.host.run_options import (
     open_folder,
     parse,
     resumed_run,
-    seeds_of,
     write_config,
 )
-from gasil_jax.sweeps import assembly, run_results
-from gasil_jax.sweeps.plan import Plan
-from gasil_jax.sweeps.programs import NOWHERE, Program
+from gasil_jax.sweeps import assembly, programs, run_results
+from gasil_jax.sweeps.programs import Program
 
 
 def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
@@ -48,13 +47,7 @@ def train(options: Options, env: Any, job: Program) -> dict[str, Any]:
     )
     # Only now, when the progress display has ended.
     with announced(title, "writing the curve, the policies and the summary"):
-        tables = run_results.read(folder, options.seeds)
-        summary = run_results.write(
-            folder, options.env, members=members, outcome=outcome, tables=tables
-        )
-    if outcome.unsaved is not None:
-        raise outcome.unsaved
-    return summary
+        return run_results.finish(folder, options.env, members, outcome)[1]
 
 
 def _print_next(env: Any, folder: pathlib.Path) -> None:
@@ -72,14 +65,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parse(Options, arguments, "gasil_jax.run", resumed_run(arguments))
     check(options)
     check_out(options)
-    seeds = seeds_of(options)
-    plan = Plan(
-        options.env, options.settings, options.algorithm, [{}], seeds, is_run=True
-    )
-    env = assembly.prepare(options, plan.stored(options.out or NOWHERE))
+    job = programs.of_run(vars(options), options.algorithm)
+    env = assembly.prepare(options, [job])
     with open_folder(options, "gasil_jax.run") as folder:
-        (job,) = plan.stored(folder)
-        summary = train(options, env, job)
+        summary = train(options, env, dataclasses.replace(job, path=folder))
     scores = {
         name.replace("_", " "): np.array(list(summary[name].values()), float)
         for name in ("final_return", "final_evaluation")

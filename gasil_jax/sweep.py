@@ -2,15 +2,9 @@
 
 Points that differ only in traced numbers run in one compiled program, with seeds x
 points vmapped and sharded. Points that differ in a count (such as buffer size or
-discriminator updates) are grouped, and each group compiles once.
-
-The sweep's folder holds config.json, results.csv (a row for each point and seed),
-curves.npz (every metric, (points, seeds, iterations)), summary.json, sweep.png (the
-final returns of each point) and hyperparameters.png (the same over each hyperparameter
-that varies). Each program has a folder under programs/ with its metrics.csv and
-checkpoints. With --evaluate-every there is an evaluations.csv beside each metrics.csv,
-and curves.npz also holds its columns, (points, seeds, evaluations), as evaluation_mean
-and so on.
+discriminator updates) are grouped, and each group compiles once: it is a program, with
+a folder under programs/ for its metrics.csv, evaluations.csv and checkpoints. The
+sweep's tables and plots are made of these.
 
 A run that is there is never trained again. So --resume continues a sweep, and may add
 points and seeds to it. With --shard 3/8 an eighth of all points and seeds is trained in
@@ -21,17 +15,14 @@ import argparse
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Sequence
-from typing import Literal
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, run_folder, run_options
-from gasil_jax.host.interruption import Interrupted
-from gasil_jax.host.run_folder import StoredRun
+from gasil_jax.host import command_line, interruption, run_folder, run_options
 from gasil_jax.sweeps import assembly, launch, points, run_results, shards, tables
 from gasil_jax.sweeps.plan import Plan, stored_plan
 from gasil_jax.sweeps.programs import NOWHERE
-from gasil_jax.sweeps.shards import Shard
 
 _PROGRAM = "gasil_jax.sweep"
 
@@ -69,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     stored = run_options.resumed_run(arguments)
     options = run_options.parse(Options, arguments, _PROGRAM, stored)
     run_options.check(options)
-    shard = None if options.shard is None else shards.parse(options.shard)
+    shard = shards.parse("1/1" if options.shard is None else options.shard)
     if options.launcher is not None:
         _launch(options, make_plan(options, stored), arguments)
         return 0
@@ -77,7 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise InputError(
             f"shards is {options.shards}: it needs --launcher (one part is --shard)"
         )
-    if shard is None:
+    if options.shard is None:
         run_options.check_out(options)
     elif options.out is None:
         raise InputError("shard needs --out and the folder of the whole sweep")
@@ -87,20 +78,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def make_plan(options: Options, stored: StoredRun | None = None) -> Plan:
-    """Return the plan of a sweep, checked.
+def make_plan(options: Options, stored: Mapping[str, Any] | None = None) -> Plan:
+    """Return the plan of a sweep, checked, from options that are.
 
-    Args:
-      options: the options, which `run_options.check` accepts.
-      stored: the sweep that is continued, whose points come first.
+    If a sweep is continued, `stored` is its config.json, whose points come first.
 
     Raises:
       InputError: if a value is not allowed; the message names the value and the range.
     """
     algorithm, file = options.algorithm, options.points_file
-    every = [] if stored is None else [*stored_plan(*stored).points]
+    every = [] if stored is None else [*stored_plan(stored).points]
     # A sweep that has begun has its points in config.json; their file may be gone.
-    own_file = stored is not None and file == stored.description.get("points_file")
+    own_file = stored is not None and file == stored.get("points_file")
     if file is None or not own_file or pathlib.Path(file).exists():
         named = points.make_points(
             options.grid,
@@ -111,33 +100,28 @@ def make_plan(options: Options, stored: StoredRun | None = None) -> Plan:
         )
         every += [point for point in named if point not in every]
     points.check(every, algorithm)
-    seeds = run_options.seeds_of(options)
+    seeds = run_folder.seeds_of(vars(options))
     return Plan(options.env, options.settings, algorithm, every, seeds)
 
 
-def _train(options: Options, plan: Plan, shard: Shard | None) -> None:
-    """Train what is missing of a sweep, or of a shard if one is given.
+def _train(options: Options, plan: Plan, shard: tuple[int, int]) -> None:
+    """Train what is missing of a shard; the whole sweep is shard 1 of 1.
 
-    The tables are written if no run is missing at the end.
-
-    Raises:
-      InputError: if it can't be trained, or if a shard is to be continued without
-        `options.resume`.
-      Interrupted: if a signal was received.
-      OSError: if the folder can no longer be written.
+    The tables are written if no run of the sweep is missing at the end.
     """
-    jobs = plan.unfinished(options.out or NOWHERE, plan.part(shard))
+    name = options.shard
+    jobs = plan.unfinished(options.out or NOWHERE, plan.part(*shard))
     for job in jobs:
         if job.path.exists() and not options.resume:
             raise InputError(
-                f"shard is {shard}, whose training has begun in {job.path}: continue "
+                f"shard is {name}, whose training has begun in {job.path}: continue "
                 "it with --resume"
             )
         run_folder.refuse_without_checkpoints(job.path)
     env = assembly.prepare(options, jobs) if jobs else None
     folder = run_options.make_folder(options)
     with run_folder.wait_for_lock(folder):
-        if (options.resume or shard) and (stored := run_options.begun(options, folder)):
+        if (options.resume or name) and (stored := run_options.begun(options, folder)):
             # Another shard may have begun, or added points, since.
             plan = make_plan(options, stored)
         else:
@@ -145,23 +129,23 @@ def _train(options: Options, plan: Plan, shard: Shard | None) -> None:
         # It does not say how the sweep is divided.
         whole = dataclasses.replace(options, shard=None)
         run_options.write_config(whole, folder, points=plan.points)
-    command = _PROGRAM if shard is None else f"{_PROGRAM} --shard {shard}"
+    command = _PROGRAM if name is None else f"{_PROGRAM} --shard {name}"
     with run_options.told_how_to_continue(folder, command):
-        requested = plan.part(shard)
+        requested = plan.part(*shard)
         if jobs := plan.unfinished(folder, requested):
             title = f"{options.env} {options.agent} sweep"
             env = env or assembly.prepare(options, jobs)
             assembly.train(options, env, jobs, title=title)
         trained = plan.trained(folder)
-        if shard is not None:
-            own = [x for x in trained if x.trains_any(set(requested))]
+        missing = plan.missing(trained)
+        if name is not None:
+            own = [x for x in trained if not set(requested).isdisjoint(x.runs)]
             speed = run_results.speed([x.training for x in own])
             told = run_results.speed_in_words(speed)
-            print(f"shard {shard} is done, {told}, in {folder}")
-            if missing := plan.missing(trained):
-                print(
-                    f"{len(missing)} of {len(plan.runs)} runs of the sweep are missing"
-                )
+            print(f"shard {name} is done, {told}, in {folder}")
+            if missing:
+                total = len(plan.runs)
+                print(f"{len(missing)} of {total} runs of the sweep are missing")
                 return
         tables.finish(folder, tables.read(plan, trained))
 
@@ -175,7 +159,7 @@ def _launch(options: Options, plan: Plan, arguments: Sequence[str] | None) -> No
         raise InputError(f"shards is {count}: --launcher needs --shards, 1 or more")
     if options.out is None:
         raise InputError("launcher needs --out and a folder that all hosts share")
-    plan.part(Shard(count, count))  # Refuses more shards than runs.
+    plan.part(count, count)  # Refuses more shards than runs.
     run_options.check_out(options)
     # The rest of the command line is that of each shard. With --resume a job that is
     # run again continues from its checkpoint.
@@ -187,11 +171,8 @@ def _launch(options: Options, plan: Plan, arguments: Sequence[str] | None) -> No
     others += ["--resume", "--out", str(options.out.absolute()), "--shard"]
     every = [f"{number}/{count}" for number in range(1, count + 1)]
     jobs = {f"shard {shard}": [*others, shard] for shard in every}
-    try:
+    with interruption.noted("continue with the same command and --resume"):
         launch.run_on_ray(_PROGRAM, jobs, options.devices)
-    except Interrupted as interrupted:
-        interrupted.add_note("continue with the same command and --resume")
-        raise
     tables.finish(options.out, tables.read(plan, plan.trained(options.out)))
 
 

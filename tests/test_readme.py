@@ -386,7 +386,7 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     both = ["--env", "my_tasks:Line", "--agent", "my_tasks:Scaled", *small.split()]
     arguments = ["--reward-factor", "0.3", "--first-seed", "5", "--out", str(out)]
     assert run.main([*both, *arguments]) == 0
-    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
+    metrics = metrics_files.read_metrics(out / "metrics.csv", {"seed": [5]})
     assert (metrics["scaled_reward"] < 0).all()
     # At most 20 steps of at most 0.1.
     assert (metrics["episode_length"] <= 20).all()
@@ -402,7 +402,7 @@ def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
     env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
     out = tmp_path / "run"
     assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
-    metrics = metrics_files.read_metrics(out / "metrics.csv", ("seed",), 1)
+    metrics = metrics_files.read_metrics(out / "metrics.csv", {"seed": [0]})
     assert (metrics["faulty_steps"] == 0).all()
     page = tmp_path / "walk.html"
     assert render.main([str(out), "--steps", "2", "--out", str(page)]) == 0

@@ -343,10 +343,8 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 def newest_record(root: pathlib.Path) -> Record:
     """Return the record of the newest checkpoint; nothing without one that is read."""
-    for folder in reversed(_folders(root)):
-        with contextlib.suppress(*_DAMAGE_ERRORS):
-            return json_reader.read(folder / _MANIFEST, _Manifest)["record"]
-    return {}
+    records = map(_record, reversed(_folders(root)))
+    return next(filter(None, records), Record())
 
 
 def best(root: pathlib.Path) -> Checkpoint | None:
@@ -365,13 +363,15 @@ def best_score(root: pathlib.Path) -> float:
 
 def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
     """Return the scores of the checkpoints that have one."""
-    scores = {}
-    for folder in folders:
-        with contextlib.suppress(*_DAMAGE_ERRORS):
-            record = json_reader.read(folder / _MANIFEST, _Manifest)["record"]
-            if record.get("score") is not None:
-                scores[folder] = record["score"]
-    return scores
+    scores = {folder: _record(folder).get("score") for folder in folders}
+    return {folder: score for folder, score in scores.items() if score is not None}
+
+
+def _record(folder: pathlib.Path) -> Record:
+    """Return the record of a checkpoint; nothing if it can't be read."""
+    with contextlib.suppress(*_DAMAGE_ERRORS):
+        return json_reader.read(folder / _MANIFEST, _Manifest)["record"]
+    return {}
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:

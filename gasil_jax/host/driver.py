@@ -77,20 +77,15 @@ class Outcome:
 
     Attributes:
       states: the members' states after the last iteration.
-      new_steps: environment steps that this process took, over all members.
-      compile_seconds: time that this process spent on compiling the training.
-      train_seconds: time that this process spent on training, without evaluations.
-      evaluation_seconds: time that this process spent on evaluations, including
-        compilation; None without evaluations.
+      measured: how this process trained, for a JSON file: "env_steps" over all members,
+        the seconds of compiling, of training without evaluations and of evaluations
+        (None without any), devices and versions.
       unsaved: why the last checkpoint could not be written, to raise once the results
         are written; None if it was.
     """
 
     states: Any
-    new_steps: int
-    compile_seconds: float
-    train_seconds: float
-    evaluation_seconds: float | None
+    measured: Mapping[str, Any]
     unsaved: checkpoint.WriteError | None
 
 
@@ -135,17 +130,14 @@ class _Training:
         done, env_steps = self.done, self.done * self.members.config.batch_steps
 
         def copy_states() -> TrainState:
-            return self._copy_states(done)
+            if done != self.done:
+                raise RuntimeError(
+                    f"the states of iteration {done} are gone: read FitProgress.states "
+                    "in the callback"
+                )
+            return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
 
         return FitProgress(done, env_steps, metrics, evaluation, copy_states)
-
-    def _copy_states(self, iteration: int) -> TrainState:
-        if iteration != self.done:
-            raise RuntimeError(
-                f"the states of iteration {iteration} are gone: read "
-                "FitProgress.states in the callback"
-            )
-        return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
 
 
 class _Tables:
@@ -174,17 +166,15 @@ class _Tables:
         self._returns = [np.empty(0, np.float32)]
         self.score: float | None = None
         path = folder / "metrics.csv"
-        size = _recorded_size(path, record)
-        self._metrics = metrics_files.MetricsWriter(path, labels, size)
+        self._metrics = metrics_files.MetricsWriter(path, labels, record)
         self.evaluation = None
         if evaluation_schedule is not None:
-            path = folder / "evaluations.csv"
             self.evaluation = PeriodicEvaluation(
                 members,
                 evaluation_schedule,
-                path,
+                folder / "evaluations.csv",
                 labels=labels,
-                size=_recorded_size(path, record),
+                checkpoint=record,
                 trackers=trackers,
             )
 
@@ -283,19 +273,6 @@ def _restored(
         with command_line.input_checked():
             states = newest.restore(members.shapes())
     return _Training(members, states, newest.iteration), newest.record
-
-
-def _recorded_size(path: pathlib.Path, record: Mapping[str, Any] | None) -> int | None:
-    """Return the size in bytes to cut a table to; None if there is no table yet.
-
-    Raises:
-      InputError: if rows before that have changed since they were written.
-    """
-    if record is not None:
-        # Too few are refused where the table is cut.
-        metrics_files.has_recorded_rows(path, record)
-        return record[f"{path.stem}_size"]
-    return 0 if path.exists() else None
 
 
 def _save(
@@ -416,9 +393,14 @@ def drive(
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
         states=members.trim(training.states),
-        new_steps=members.env_steps(training.done - first),
-        compile_seconds=compile_seconds,
-        train_seconds=train_seconds - (evaluation_seconds or 0.0),
-        evaluation_seconds=evaluation_seconds,
+        measured={
+            "env_steps": members.env_steps(training.done - first),
+            "compile_seconds": compile_seconds,
+            "train_seconds": train_seconds - (evaluation_seconds or 0.0),
+            "evaluation_seconds": evaluation_seconds,
+            "device": members.device_kind,
+            "device_count": len(members.devices),
+            "versions": metrics_files.versions(),
+        },
         unsaved=unsaved,
     )

@@ -48,6 +48,16 @@ class Interrupted(Exception):
         self.signal = number
 
 
+@contextlib.contextmanager
+def noted(how_to_continue: str) -> Iterator[None]:
+    """Add to an `Interrupted` from the `with` block how to continue."""
+    try:
+        yield
+    except Interrupted as interrupted:
+        interrupted.add_note(how_to_continue)
+        raise
+
+
 class Interruption:
     """Records the first signal in the `with` block; a second one ends the process.
 

@@ -1,5 +1,6 @@
 """Read the JSON files of a run folder, and check their content against a type."""
 
+import contextlib
 import dataclasses
 import hashlib
 import json
@@ -7,7 +8,7 @@ import math
 import pathlib
 import types
 import typing
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, get_args, get_origin, get_type_hints
 
 from gasil_jax.errors import InputError, NotImportable
@@ -29,6 +30,23 @@ def digest(content: Any) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+@contextlib.contextmanager
+def blamed(path: pathlib.Path) -> Iterator[None]:
+    """Turn what content that can't be used raises into an `InputError` with its file.
+
+    `NotImportable` is raised as it is: the file may be used elsewhere.
+    """
+    try:
+        yield
+    except NotImportable:
+        raise
+    # Deeply nested brackets cause a RecursionError.
+    except (ValueError, RecursionError, LookupError, TypeError) as error:
+        raise InputError(
+            f"{path} is damaged, or another program wrote it: {error}"
+        ) from None
+
+
 def read(path: pathlib.Path, kind: Any) -> Any:
     """Return the content of a JSON file, checked against a type and its own hash.
 
@@ -45,20 +63,13 @@ def read(path: pathlib.Path, kind: Any) -> Any:
       NotImportable: if it names an agent that can't be imported here.
       OSError: if there is no such file.
     """
-    try:
+    with blamed(path):
         content = json.loads(path.read_text())
         written = content.pop(HASH, None) if isinstance(content, dict) else None
         value = as_type(kind, content, "")
         if written not in (None, digest(content)):
             raise ValueError(f"it was changed: to use it as it is, delete its {HASH}")
         return value
-    except NotImportable:
-        raise
-    # Deeply nested brackets cause a RecursionError.
-    except (ValueError, RecursionError) as error:
-        raise InputError(
-            f"{path} is damaged, or another program wrote it: {error}"
-        ) from None
 
 
 def as_type(kind: Any, value: Any, name: str) -> Any:

@@ -56,16 +56,6 @@ def _in_thread(function: Callable[[], T]) -> futures.Future[T]:
     return future
 
 
-def init_member(
-    env: Any,
-    algorithm: Algorithm,
-    seed: jax.Array,
-    hyperparameters: Mapping[str, jax.Array],
-) -> train.TrainState:
-    """Return the first state of a member, whose key comes from its seed alone."""
-    return train.init(env, algorithm, jax.random.key(seed), hyperparameters)
-
-
 def advance_members(
     env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
@@ -174,10 +164,14 @@ class Members:
 
     @functools.cached_property
     def first_states(self) -> Any:
-        """The jitted function of seeds and hyperparameters, (padded,), for `init`."""
+        """The jitted function of seeds and hyperparameters, (padded,), for `init`.
+
+        A member's key comes from its seed alone.
+        """
 
         def init_one(seed: Any, hyperparameters: Any) -> Any:
-            return init_member(self.env, self.algorithm, seed, hyperparameters)
+            key = jax.random.key(seed)
+            return train.init(self.env, self.algorithm, key, hyperparameters)
 
         return jax.jit(
             self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding

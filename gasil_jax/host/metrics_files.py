@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import hashlib
 import importlib.metadata
+import io
 import itertools
 import json
 import math
@@ -20,6 +21,9 @@ import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import json_reader, output_file
+
+#: The columns of a table by name.
+Columns = dict[str, np.ndarray]
 
 #: Metrics that every metrics.csv has, in this order; the agent's own metrics follow.
 COLUMNS = (
@@ -99,36 +103,37 @@ class MetricsWriter:
     Args:
       path: the file.
       labels: columns that identify the members, (members,) each: "seed" and others.
-      size: number of bytes to keep of an existing file; the rest is moved to a new
-        file beside it. None creates a new file.
+      checkpoint: the record of the checkpoint that training continues from; None at its
+        beginning. What an existing file has more is moved to a new file beside it.
       columns: metrics to write first, in this order; others follow.
 
     Raises:
-      FileExistsError: if a new file would replace an existing one.
-      ValueError: if the existing file is missing or shorter than `size`.
+      ValueError: if rows that the checkpoint has seen are missing or have changed.
     """
 
     def __init__(
         self,
         path: pathlib.Path,
         labels: Mapping[str, Sequence[Any]],
-        size: int | None = None,
+        checkpoint: Mapping[str, Any] | None = None,
         *,
         columns: Sequence[str] = COLUMNS,
     ):
         self._first = tuple(columns)
-        self._columns: tuple[str, ...] | None = None
         self._labels, self._path = labels, path
-        if size is None:
-            self._file = path.open("x", newline="")
-        else:
-            if not path.is_file() or path.stat().st_size < size:
+        if checkpoint is not None:
+            size = checkpoint[f"{path.stem}_size"]
+            whole = has_recorded_rows(path, checkpoint) and path.is_file()
+            if not whole or path.stat().st_size < size:
                 raise ValueError(f"{path} lacks rows that the checkpoint has seen")
             _cut(path, size)
-            with path.open(newline="") as file:
-                self._columns = tuple(next(csv.reader(file), ())) or None
-            self._file = path.open("a", newline="")
-        self._writer = csv.writer(self._file)
+        elif path.exists():
+            _cut(path, 0)
+        self._file = path.open("a", newline="")
+        # Those of all lines so far.
+        self._rows, self._digest = _rows_and_digest(path)
+        with path.open(newline="") as file:
+            self._columns = tuple(next(csv.reader(file), ())) or None
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
         """Write arrays (members, iterations), one for each metric.
@@ -138,14 +143,21 @@ class MetricsWriter:
             path any more.
         """
         self._check_in_place()
+        lines = self._lines(metrics)
         with self._errors_named():
-            self._write(metrics)
+            self._file.write(lines)
+            self._file.flush()
+        self._rows += lines.count("\n")
+        self._digest.update(lines.replace("\r\n", "\n").encode(self._file.encoding))
 
-    def _write(self, metrics: Mapping[str, np.ndarray]) -> None:
+    def _lines(self, metrics: Mapping[str, np.ndarray]) -> str:
+        """Return the rows of metrics, and before the first ones the names."""
+        lines = io.StringIO(newline="")
+        writer = csv.writer(lines)
         if self._columns is None:
             others = tuple(sorted(set(metrics) - set(self._first)))
             self._columns = (*self._labels, *self._first, *others)
-            self._writer.writerow(self._columns)
+            writer.writerow(self._columns)
         members, iterations = metrics["env_steps"].shape
         labels = list(zip(*self._labels.values(), strict=True))
         names = self._columns[len(self._labels) :]
@@ -155,8 +167,8 @@ class MetricsWriter:
                     _cell(metrics[name][member, iteration]) if name in metrics else ""
                     for name in names
                 )
-                self._writer.writerow([*labels[member], *cells])
-        self._file.flush()
+                writer.writerow([*labels[member], *cells])
+        return lines.getvalue()
 
     def record(self) -> dict[str, Any]:
         """Write everything to the disk; return what a checkpoint records of the file.
@@ -171,9 +183,11 @@ class MetricsWriter:
             self._file.flush()
             output_file.flush(self._file.fileno())
             size, name = os.fstat(self._file.fileno()).st_size, self._path.stem
-            rows, digest = _rows_and_hash(self._path)
-        found = {"size": size, "rows": rows, "sha256": digest}
-        return {f"{name}_{field}": value for field, value in found.items()}
+        return {
+            f"{name}_size": size,
+            f"{name}_rows": self._rows,
+            f"{name}_sha256": self._digest.hexdigest(),
+        }
 
     @contextlib.contextmanager
     def _errors_named(self) -> Iterator[None]:
@@ -204,8 +218,8 @@ class MetricsWriter:
         self._file.close()
 
 
-def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, str]:
-    """Return the number of whole lines, or `most`, and their hash.
+def _rows_and_digest(path: pathlib.Path, most: int | None = None) -> tuple[int, Any]:
+    """Return the number of whole lines, or `most`, and their SHA-256.
 
     The hash does not see how lines end, because version control may change it.
     """
@@ -215,7 +229,7 @@ def _rows_and_hash(path: pathlib.Path, most: int | None = None) -> tuple[int, st
             if line.endswith(b"\n"):
                 digest.update(line.rstrip(b"\r\n") + b"\n")
                 count += 1
-    return count, digest.hexdigest()
+    return count, digest
 
 
 def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
@@ -233,8 +247,8 @@ def has_recorded_rows(path: pathlib.Path, record: Mapping[str, Any]) -> bool:
         return True
     if not path.is_file():
         return False
-    count, digest = _rows_and_hash(path, rows)
-    if count == rows and digest != seen:
+    count, digest = _rows_and_digest(path, rows)
+    if count == rows and digest.hexdigest() != seen:
         raise InputError(f"{path} is damaged: it has changed since the checkpoint")
     return count == rows
 
@@ -268,18 +282,16 @@ def _cell(value: Any) -> str:
 
 def read_metrics(
     path: pathlib.Path,
-    labels: Sequence[str],
-    num_members: int,
+    labels: Mapping[str, Sequence[int]],
     required: Sequence[str] = (),
     *,
     unfinished: bool = False,
-) -> dict[str, np.ndarray]:
+) -> Columns:
     """Return every metric of a `MetricsWriter`'s file, (members, iterations) each.
 
     Args:
       path: the file; an empty cell becomes NaN.
-      labels: names of the first columns, which are not metrics.
-      num_members: number of rows per iteration.
+      labels: columns that identify the members, (members,) each: "seed" and others.
       required: columns that it must have besides "env_steps".
       unfinished: leave out a last iteration that is incomplete, because training may be
         writing it. The result is empty if no iteration is complete yet.
@@ -288,7 +300,7 @@ def read_metrics(
       InputError: if the file is damaged, has no rows or lacks a column.
       OSError: if there is no such file.
     """
-    first = len(labels)
+    num_members = len(labels["seed"])
     try:
         with path.open(newline="") as file:
             header: list[str] = []
@@ -300,39 +312,54 @@ def read_metrics(
                 if len(row) != len(header):
                     raise ValueError(f"row {number} has {len(row)} cells")
                 if number:
-                    cells.extend(float(x) if x else math.nan for x in row[first:])
-        width = num_members * (len(header) - first)
+                    cells.extend(float(x) if x else math.nan for x in row)
+        width = num_members * len(header)
         if unfinished and width > 0:
             del cells[len(cells) // width * width :]
         if unfinished and not cells:
             return {}
         if not cells:
             raise ValueError("it has no rows")
-        values = np.array(cells).reshape(-1, num_members, len(header) - first)
+        values = np.array(cells).reshape(-1, num_members, len(header))
     except (ValueError, csv.Error) as error:
         raise InputError(f"{path} is damaged: {error}") from None
-    metrics = {name: values[:, :, i].T for i, name in enumerate(header[first:])}
-    for name in ("env_steps", *required):
+    metrics = {name: values[:, :, i].T for i, name in enumerate(header)}
+    for name in ("env_steps", *labels, *required):
         if name not in metrics:
             raise InputError(f"{path} is damaged: it has no column {name}")
     steps = metrics["env_steps"]
     if not (steps == steps[0]).all() or not (np.diff(steps[0]) > 0).all():
         raise InputError(f"{path} is damaged: its env_steps are not in order")
+    for label, members in labels.items():
+        if (metrics.pop(label) != np.array(members)[:, None]).any():
+            raise InputError(f"{path} is damaged: its rows are not in order")
     return metrics
 
 
 def final_returns(returns: np.ndarray) -> np.ndarray:
-    """Return each seed's mean return over the last tenth of iterations, (seeds,).
+    """Return the mean returns over the last tenth of iterations, (..., iterations).
 
     It also works for other metrics of episodes, such as their length. If no episode of
     a seed ended in the last tenth (in some tasks all episodes end at once), the result
     is the value of the last iteration in which one ended; NaN if none ended at all.
     """
-    last = returns[:, -max(1, returns.shape[1] // 10) :]
-    count = np.isfinite(last).sum(axis=1)
-    mean = np.nansum(last, axis=1) / np.maximum(count, 1)
+    last = returns[..., -max(1, returns.shape[-1] // 10) :]
+    count = np.isfinite(last).sum(axis=-1)
+    mean = np.nansum(last, axis=-1) / np.maximum(count, 1)
     ended = np.isfinite(returns)
-    last_ended = returns.shape[1] - 1 - ended[:, ::-1].argmax(axis=1)
-    newest = np.take_along_axis(returns, last_ended[:, None], axis=1)[:, 0]
-    newest = np.where(ended.any(axis=1), newest, np.nan)
+    last_ended = returns.shape[-1] - 1 - ended[..., ::-1].argmax(axis=-1)
+    newest = np.take_along_axis(returns, last_ended[..., None], axis=-1)[..., 0]
+    newest = np.where(ended.any(axis=-1), newest, np.nan)
     return np.where(count > 0, mean, newest)
+
+
+def finals(metrics: Columns, scores: Columns) -> dict[str, np.ndarray]:
+    """Return the final values of runs by name, (...), from columns (..., rows).
+
+    They are those of metrics.csv and, if there are any, of evaluations.csv.
+    """
+    values = {
+        f"final_{name}": final_returns(metrics[f"episode_{name}"])
+        for name in ("return", "length")
+    }
+    return values | ({"final_evaluation": scores["mean"][..., -1]} if scores else {})

@@ -58,16 +58,14 @@ class PeriodicEvaluation:
       schedule: the times of evaluations and their number of episodes.
       path: the file evaluations.csv.
       labels: columns that identify the members, (members,) each.
-      size: number of bytes to keep of an existing file, see
-        `metrics_files.MetricsWriter`.
+      checkpoint: see `metrics_files.MetricsWriter`.
       trackers: trackers that also get the scores.
 
     Attributes:
       seconds: time of all evaluations in this process, including compilation.
 
     Raises:
-      FileExistsError: if a new file would replace an existing one.
-      ValueError: if the existing file is missing or shorter than `size`.
+      ValueError: if rows that the checkpoint has seen are missing or have changed.
     """
 
     def __init__(
@@ -77,7 +75,7 @@ class PeriodicEvaluation:
         path: pathlib.Path,
         *,
         labels: Mapping[str, Sequence[Any]],
-        size: int | None = None,
+        checkpoint: Mapping[str, Any] | None = None,
         trackers: Sequence[Tracker] = (),
     ):
         def score(state: TrainState, seed: jax.Array) -> dict[str, jax.Array]:
@@ -94,7 +92,9 @@ class PeriodicEvaluation:
         self._members, self._trackers = members, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
-        self._writer = metrics_files.MetricsWriter(path, labels, size, columns=COLUMNS)
+        self._writer = metrics_files.MetricsWriter(
+            path, labels, checkpoint, columns=COLUMNS
+        )
 
     def iterations_left(self, done: int) -> int:
         """Return the iterations from `done` to the next evaluation, at least one."""

@@ -12,13 +12,13 @@ import socket
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, Required, TypedDict
+from typing import Any, Required, TypedDict
 
 import jax
 
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable, refusal
+from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     command_line,
     descriptions,
@@ -222,10 +222,15 @@ def has_run(folder: pathlib.Path) -> bool:
     return (folder / CONFIG).is_file()
 
 
-def write_description(folder: pathlib.Path, description: Mapping[str, Any]) -> None:
-    """Write config.json, the description of a run, sweep or shard."""
-    algorithm = descriptions.describe(description["algorithm"])
-    metrics_files.write_json(folder / CONFIG, {**description, "algorithm": algorithm})
+def write_description(
+    folder: pathlib.Path, description: Mapping[str, Any], name: str = CONFIG
+) -> None:
+    """Write config.json, the description of a run or a sweep, or fit.json."""
+    content = {**description}
+    if name == CONFIG:
+        algorithm = descriptions.describe(description["algorithm"])
+        content |= {"out": str(folder), "algorithm": algorithm}
+    metrics_files.write_json(folder / name, content)
 
 
 class _Description(TypedDict, total=False):
@@ -289,6 +294,8 @@ def _why_no_run(folder: pathlib.Path) -> str:
 def read(folder: pathlib.Path) -> dict[str, Any]:
     """Return the content of config.json, "algorithm" and "settings" as objects.
 
+    "out" is the folder, which may have been moved since it was written.
+
     Raises:
       InputError: if there is no such file, if it does not describe a run, or if its
         agent can't be imported here.
@@ -298,29 +305,11 @@ def read(folder: pathlib.Path) -> dict[str, Any]:
         description = json_reader.read(path, _Description)
     except (FileNotFoundError, NotADirectoryError):
         raise InputError(f"run is {folder}{_why_no_run(folder)}") from None
-    try:
+    with json_reader.blamed(path):
         algorithm = descriptions.read(description["algorithm"])
         algorithms.check(algorithm)
         check_seeds(description["seeds"], description["first_seed"])
-    except NotImportable:
-        raise
-    except ValueError as error:
-        raise InputError(
-            f"{path} is damaged, or another program wrote it: {error}"
-        ) from None
-    return {**description, "algorithm": algorithm}
-
-
-class StoredRun(NamedTuple):
-    """A run, sweep or shard that is stored in a folder and may be unfinished.
-
-    Attributes:
-      folder: the folder.
-      description: the content of its config.json, from `read`.
-    """
-
-    folder: pathlib.Path
-    description: Mapping[str, Any]
+    return {**description, "algorithm": algorithm, "out": folder}
 
 
 #: The largest number of seeds. Their absolute numbers are below 2**32.
@@ -337,7 +326,7 @@ def check_seeds(seeds: int, first_seed: int) -> None:
 
 
 def seeds_of(description: Mapping[str, Any]) -> range:
-    """Return the absolute numbers of a run's or sweep's seeds, from its config.json."""
+    """Return the absolute numbers of the seeds, from config.json or options by name."""
     return range(
         description["first_seed"], description["first_seed"] + description["seeds"]
     )

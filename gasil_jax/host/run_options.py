@@ -7,7 +7,7 @@ import pathlib
 import shlex
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Annotated, Any, TypeVar
 
 import jax
@@ -24,15 +24,14 @@ from gasil_jax.host import (
     descriptions,
     devices,
     environments,
+    interruption,
     output_file,
     run_folder,
     trackers,
 )
 from gasil_jax.host.environments import Settings
-from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.host.run_folder import StoredRun
 from gasil_jax.imitation import PPOGASIL, Agent
 from gasil_jax.rewards import REWARD_MODELS, Decompose, Normalize, RewardModel
 
@@ -150,11 +149,6 @@ def description(options: Options) -> dict[str, Any]:
         }
 
 
-def described(options: Options, algorithm: Algorithm) -> dict[str, Any]:
-    """Return every option by its own name, with the settings of an algorithm."""
-    return run_folder.flat({**description(options), "algorithm": algorithm})
-
-
 T = TypeVar("T", bound=Options)
 
 
@@ -162,7 +156,7 @@ def parse(
     kind: type[T],
     arguments: Sequence[str] | None,
     program: str,
-    resumed: StoredRun | None = None,
+    resumed: Mapping[str, Any] | None = None,
 ) -> T:
     """Return the options of a command line; its preset decides what is not given.
 
@@ -170,8 +164,8 @@ def parse(
       kind: the class of the options.
       arguments: the command line; default that of this process.
       program: name of the module that was started.
-      resumed: the run to continue. Its options are then the defaults, and the preset is
-        not used.
+      resumed: the config.json of the run to continue, from `run_folder.read`. Its
+        options are then the defaults, and the preset is not used.
 
     Raises:
       InputError: if a flag or a value is unknown, or differs from the run's.
@@ -191,13 +185,13 @@ def parse(
     return options
 
 
-def _stored_options(kind: type[T], run: StoredRun) -> T:
+def _stored_options(kind: type[T], stored: Mapping[str, Any]) -> T:
     """Return the options that a stored run was started with.
 
     Raises:
       InputError: if its config.json was written by another program.
     """
-    folder, stored = run
+    folder = stored["out"]
     of_algorithm = algorithm_options(stored["algorithm"])
     fields = [
         f
@@ -223,23 +217,23 @@ def _stored_options(kind: type[T], run: StoredRun) -> T:
     return kind(**{name: values[name] for name in names}, **of_algorithm)
 
 
-def refuse_changes(options: Options, run: StoredRun) -> None:
+def refuse_changes(options: Options, stored: Mapping[str, Any]) -> None:
     """Raise `InputError` if a run is continued with other options than it has.
 
     Args:
       options: the options of the continuation.
-      run: the stored run or sweep.
+      stored: the config.json of the run or sweep, from `run_folder.read`.
     """
-    before = run_folder.flat(vars(_stored_options(type(options), run)))
-    grows = ("total_steps", *(("seeds",) if "points" in run.description else ()))
+    before = run_folder.flat(vars(_stored_options(type(options), stored)))
+    grows = ("total_steps", *(("seeds",) if "points" in stored else ()))
     if changed := run_folder.differences(before, run_folder.flat(vars(options)), grows):
         raise InputError(
-            f"resume continues {run.folder}, where {'; '.join(changed)}: only "
+            f"resume continues {stored['out']}, where {'; '.join(changed)}: only "
             f"{' and '.join(grows)} may change, and grow, and checkpoint_every, "
             "keep_checkpoints, devices and log"
         )
     now = run_folder.flat(description(options))
-    run_folder.refuse_other_expert(run.description, now, run.folder)
+    run_folder.refuse_other_expert(stored, now, stored["out"])
 
 
 def _preset_options(kind: type[T], arguments: Sequence[str] | None) -> T:
@@ -291,8 +285,8 @@ def _action_size(env: str, preset: str) -> int | None:
     return int(built.action_size)
 
 
-def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
-    """Return the run that --resume continues, or None if there is none.
+def resumed_run(arguments: Sequence[str] | None) -> dict[str, Any] | None:
+    """Return the config.json of the run that --resume continues, None without one.
 
     Raises:
       InputError: if --resume is given without --out, if it is given without --env and
@@ -304,7 +298,7 @@ def resumed_run(arguments: Sequence[str] | None) -> StoredRun | None:
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
     if run_folder.has_run(given.out):
-        return StoredRun(given.out, run_folder.read(given.out))
+        return run_folder.read(given.out)
     if given.env is None:
         raise InputError(
             f"out is {given.out}, which holds no run to continue: to begin one there, "
@@ -437,11 +431,6 @@ def note_if_untuned(options: Options) -> None:
         command_line.note(f"{lacking}: options that are not given have their defaults")
 
 
-def seeds_of(options: Options) -> range:
-    """Return the seeds' absolute numbers, the same for every point of a sweep."""
-    return run_folder.seeds_of(vars(options))
-
-
 def evaluation_schedule(options: Options) -> EvaluationSchedule | None:
     """Return the times of evaluations during training; None without evaluations."""
     if options.evaluate_every is None:
@@ -468,15 +457,15 @@ def make_folder(options: Options) -> pathlib.Path:
     return run_folder.create_new(name)
 
 
-def begun(options: Options, folder: pathlib.Path) -> StoredRun | None:
-    """Return the run or sweep in a folder, None if none has begun.
+def begun(options: Options, folder: pathlib.Path) -> dict[str, Any] | None:
+    """Return the config.json of the run or sweep in a folder, None if none has begun.
 
     Raises:
       InputError: if it is not that of the options.
     """
     if not run_folder.has_run(folder):
         return None
-    stored = StoredRun(folder, run_folder.read(folder))
+    stored = run_folder.read(folder)
     refuse_changes(options, stored)
     return stored
 
@@ -513,10 +502,8 @@ def told_how_to_continue(folder: pathlib.Path, program: str) -> Iterator[None]:
     quoted = shlex.quote(str(folder))
     how = f"continue with: python -m {program} --resume --out {quoted}"
     try:
-        yield
-    except Interrupted as interrupted:
-        interrupted.add_note(how)
-        raise
+        with interruption.noted(how):
+            yield
     except output_file.WriteError as error:
         # A run that has results may be without checkpoints.
         if not run_folder.has_run(folder) or run_folder.has_results(folder):
@@ -526,8 +513,7 @@ def told_how_to_continue(folder: pathlib.Path, program: str) -> Iterator[None]:
 
 def write_config(options: Options, folder: pathlib.Path, **more: Any) -> None:
     """Write config.json: every option, and further fields that are given."""
-    described = description(options) | {"out": str(folder)} | more
-    run_folder.write_description(folder, described)
+    run_folder.write_description(folder, description(options) | more)
 
 
 def make_env(options: Options) -> Any:

@@ -15,6 +15,7 @@ from gasil_jax.host import (
     driver,
     environments,
     resources,
+    run_folder,
     run_options,
     trackers,
 )
@@ -24,18 +25,15 @@ from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.progress import Progress, announced
 from gasil_jax.host.run_options import Options
-from gasil_jax.sweeps import programs
+from gasil_jax.host.trackers import Tracker
 from gasil_jax.sweeps.programs import Program
 
 
 def prepare(options: Options, jobs: Sequence[Program]) -> Any:
     """Start the devices, check that everything fits, and return the environment.
 
-    Nothing is compiled before this is done.
-
-    Args:
-      options: options of the run or sweep.
-      jobs: the programs to train; the runs of each are trained at once.
+    Nothing is compiled before this is done. The runs of each program are trained at
+    once.
 
     Raises:
       InputError: if the programs do not fit the devices or the disk.
@@ -101,8 +99,8 @@ def train(
 
     Args:
       options: options of the run or sweep.
-      env: one environment.
-      jobs: the programs with their folders, in order, one or more.
+      env: what `prepare` returned.
+      jobs: the programs, one or more.
       title: title of the progress display.
       own_folder: whether there is one program, in the folder of a run that is locked
         already. Otherwise each is locked, lists its runs and says when it has ended.
@@ -148,24 +146,23 @@ def train(
                     if outcome.unsaved is not None:
                         # Its policies are nowhere else, so it is not finished.
                         raise outcome.unsaved
-                    job.finish(programs.measured(members, outcome))
+                    job.finish(outcome.measured)
             steps_before += members.env_steps(members.config.num_iterations)
     return members, outcome
 
 
-def _trackers(
-    options: Options, job: Program, own_folder: bool
-) -> list[trackers.Tracker]:
+def _trackers(options: Options, job: Program, own_folder: bool) -> list[Tracker]:
     """Return the trackers of a program, which has the name of its run or sweep."""
     *_, sweep, _, name = job.path.absolute().parts
     # What its members share is what the options say, but for traced numbers.
     shared = job.algorithm.replace(**options.algorithm.hyperparameters)
+    config = run_options.description(options) | {"algorithm": shared}
     labels = zip(*job.labels.values(), strict=True)
     return trackers.make(
         options.log,
         job.path,
         run_name=name if own_folder else f"{sweep}-{name}",
-        config=run_options.described(options, shared),
+        config=run_folder.flat(config),
         members={
             "-".join(map(str, label)): {**own, **dict(zip(job.labels, label))}
             for label, own in zip(labels, job.hyperparameters, strict=True)

@@ -1,11 +1,10 @@
 """Train from Python as the command line does: `gasil_jax.fit`."""
 
 import contextlib
-import dataclasses
 import json
 import pathlib
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -19,13 +18,12 @@ from gasil_jax.host import (
     descriptions,
     driver,
     environments,
-    json_reader,
     metrics_files,
     run_folder,
     run_options,
 )
 from gasil_jax.host.driver import Callback, FitProgress
-from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.interruption import Interruption, noted
 from gasil_jax.host.members import Members, make_members
 from gasil_jax.host.periodic_checkpoints import CheckpointSchedule
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
@@ -143,45 +141,48 @@ def fit(
     evaluation_schedule = None
     if evaluate_every is not None:
         evaluation_schedule = EvaluationSchedule(evaluate_every, evaluate_episodes)
-    interruption = Interruption()
-    record = None
+    interruption, described = Interruption(), None
+
+    def write() -> None:
+        if described is not None:
+            run_folder.write_description(path, *described)
+
     with contextlib.ExitStack() as stack:
         if folder is None:
             # Ctrl-C ends training at once, because there is nothing to save.
             path = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         else:
             path = pathlib.Path(folder)
-            record = _record(
+            described = _describe(
                 members,
-                path,
                 checkpoint_every=checkpoint_every,
                 evaluate_every=evaluate_every,
                 evaluate_episodes=evaluate_episodes if evaluate_every else None,
             )
-            stack.enter_context(_opened(record, resume))
+            run_folder.create(path, option="folder")
+            stack.enter_context(run_folder.lock(path, option="folder"))
+            _begin(path, *described, resume=resume)
+            how_to_continue = "continue with the same arguments and resume=True"
+            stack.enter_context(noted(how_to_continue))
             stack.enter_context(interruption)
         outcome = driver.drive(
             members,
             path,
             {"seed": members.seeds},
-            schedule=CheckpointSchedule(checkpoint_every, keep=2 if record else 0),
+            schedule=CheckpointSchedule(
+                checkpoint_every, keep=0 if described is None else 2
+            ),
             progress=Progress("fit", algorithm.config.total_steps, shown=False),
             interruption=interruption,
             evaluation_schedule=evaluation_schedule,
             callback=callback,
-            on_restored=record.write if record else lambda: None,
+            on_restored=write,
         )
-        tables = run_results.read(path, members.num_members)
-        if record is not None:
-            run_results.write(
-                path,
-                record.fields["env"],
-                members=members,
-                outcome=outcome,
-                tables=tables,
-            )
-        if outcome.unsaved is not None:
-            raise outcome.unsaved
+        if described is None:
+            tables = run_results.read(path, members)
+        else:
+            env_name = described[0]["env"]
+            tables, _ = run_results.finish(path, env_name, members, outcome)
         result = FitResult(outcome.states, *tables)
         if points is None:
             return result
@@ -209,48 +210,11 @@ def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[in
     raise refusal("seeds", seeds, f"a number of seeds, or {each}")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Record:
-    """What a folder says of the training in it.
+def _describe(members: Members, **arguments: Any) -> tuple[dict[str, Any], str]:
+    """Return what a folder says of training in it, and the name of the file.
 
-    Attributes:
-      folder: the folder.
-      options: the options with which a command trains the same; None if none can.
-      fields: every field of config.json, or of fit.json without options.
-    """
-
-    folder: pathlib.Path
-    options: run_options.Options | None
-    fields: Mapping[str, Any]
-
-    def write(self) -> None:
-        """Write config.json or fit.json."""
-        if self.options is not None:
-            run_options.write_config(self.options, self.folder)
-        else:
-            metrics_files.write_json(self.folder / run_folder.FIT, self.fields)
-
-    def read(self) -> Mapping[str, Any] | None:
-        """Return the fields that the file has; None if there is none.
-
-        Raises:
-          InputError: if it is damaged.
-        """
-        if self.options is not None:
-            begun = run_folder.has_run(self.folder)
-            return run_folder.read(self.folder) if begun else None
-        with contextlib.suppress(FileNotFoundError):
-            return json_reader.read(self.folder / run_folder.FIT, dict[str, Any])
-        return None
-
-
-def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record:
-    """Return the record of a training.
-
-    Args:
-      members: the seeds.
-      folder: the folder.
-      **arguments: the options of a run that are arguments of `fit`.
+    The file is config.json if a command can train the same, and fit.json otherwise. The
+    options of a run that are arguments of `fit` are `arguments`.
 
     Raises:
       ValueError: if the expert's data can't be read.
@@ -277,8 +241,8 @@ def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record
             **descriptions.describe(algorithm),
             **run_folder.expert_hash(algorithm),
         }
-        fields = {x: "a function" if callable(y) else y for x, y in described.items()}
-        return _Record(folder, None, fields)
+        plain = {x: "a function" if callable(y) else y for x, y in described.items()}
+        return plain, run_folder.FIT
     name, settings = made_with
     options = run_options.Options(
         env=name,
@@ -288,36 +252,31 @@ def _record(members: Members, folder: pathlib.Path, **arguments: Any) -> _Record
         **arguments,
         **run_options.algorithm_options(algorithm),
     )
-    return _Record(folder, options, run_folder.flat(run_options.description(options)))
+    return run_options.description(options), run_folder.CONFIG
 
 
-@contextlib.contextmanager
-def _opened(record: _Record, resume: bool) -> Iterator[None]:
-    """Create and lock a folder of `fit`, and write its record if training begins.
+def _begin(
+    folder: pathlib.Path, description: Mapping[str, Any], name: str, *, resume: bool
+) -> None:
+    """Write what is trained to a new folder, or compare it with what the folder says.
 
     Raises:
-      ValueError: if the folder can't be written, is in use, or holds other files.
+      ValueError: if the folder holds other files, or training that is not the same.
     """
-    folder = run_folder.create(record.folder, option="folder")
-    with run_folder.lock(folder, option="folder"):
-        before = record.read()
-        if before is None:
-            run_folder.refuse_used(folder, option="folder")
-            record.write()
-        elif not resume:
+    if not (folder / name).is_file():
+        run_folder.refuse_used(folder, option="folder")
+        run_folder.write_description(folder, description, name)
+    elif not resume:
+        raise ValueError(
+            f"folder is {folder}, where training has begun: give resume=True or "
+            "another folder"
+        )
+    else:
+        is_run = name == run_folder.CONFIG
+        before = (run_folder.read if is_run else run_folder.read_fit)(folder)
+        if changes := run_folder.differences(before, description):
             raise ValueError(
-                f"folder is {folder}, where training has begun: give resume=True or "
-                "another folder"
+                f"resume continues with {folder}, where {'; '.join(changes)}: "
+                "only total_steps may differ, and grow"
             )
-        else:
-            if changes := run_folder.differences(before, record.fields):
-                raise ValueError(
-                    f"resume continues with {folder}, where {'; '.join(changes)}: "
-                    "only total_steps may differ, and grow"
-                )
-            run_folder.refuse_other_expert(before, record.fields, folder)
-        try:
-            yield
-        except Interrupted as interrupted:
-            interrupted.add_note("continue with the same arguments and resume=True")
-            raise
+        run_folder.refuse_other_expert(before, run_folder.flat(description), folder)

@@ -4,6 +4,7 @@ Each job is a process of its own. If that dies it is run again, and continues fr
 checkpoint.
 """
 
+import contextlib
 import importlib
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -61,14 +62,8 @@ def run_on_ray(
             "launcher is 'ray': it needs the package ray "
             '(pip install "gasil_jax[ray]")'
         ) from None
-    connected = ray.is_initialized()
-    if not connected:
-        ray.init()
-    try:
+    with contextlib.nullcontext() if ray.is_initialized() else ray.init():
         failed = _failures(ray, program, jobs, devices)
-    finally:
-        if not connected:
-            ray.shutdown()
     if failed:
         told = ", ".join(f"{name} ({why})" for name, why in failed.items())
         if list(failed.values()) == [f"status {_BAD_INPUT}"] * len(jobs):

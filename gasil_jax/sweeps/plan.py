@@ -1,8 +1,4 @@
-"""The plan of a sweep: every point with every seed is a run.
-
-A run of one setting is a sweep of one point, whose only program has the run's own
-folder.
-"""
+"""The plan of a sweep: every point with every seed is a run."""
 
 import dataclasses
 import functools
@@ -12,13 +8,12 @@ from typing import Any
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
-from gasil_jax.host import run_folder
+from gasil_jax.host import json_reader, run_folder
 from gasil_jax.host.environments import Settings
 from gasil_jax.sweeps import points, programs
 from gasil_jax.sweeps.points import Point
 from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
-from gasil_jax.sweeps.shards import Shard
 
 #: The columns of a sweep's tables that identify its members.
 LABELS = ("point", "seed")
@@ -26,16 +21,14 @@ LABELS = ("point", "seed")
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """The points and seeds of a sweep, or the seeds of a run.
+    """The points and seeds of a sweep.
 
     Attributes:
       env: name of the environment.
       settings: settings of the environment.
       algorithm: the algorithm that the points change.
-      points: changed settings, by name. A point that is added later comes last. A run
-        has one, without changes.
+      points: changed settings, by name. A point that is added later comes last.
       seeds: absolute seed numbers.
-      is_run: whether it is a run and no sweep.
     """
 
     env: str
@@ -43,7 +36,6 @@ class Plan:
     algorithm: Algorithm
     points: Sequence[Point]
     seeds: Sequence[int]
-    is_run: bool = False
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
@@ -55,8 +47,8 @@ class Plan:
             for seed in self.seeds
         }
 
-    def part(self, shard: Shard | None) -> list[Run]:
-        """Return the runs of a shard, whatever is trained already; all for None.
+    def part(self, number: int = 1, count: int = 1) -> list[Run]:
+        """Return the runs of one of `count` shards, whatever is trained already.
 
         The sizes of shards differ by one run at most, and the runs of a program are
         divided as little as possible.
@@ -65,16 +57,13 @@ class Plan:
           InputError: if there are more shards than runs.
         """
         ordered = [x for each in programs.group(self.runs.values()) for x in each.runs]
-        if shard is None:
-            return ordered
         total = len(ordered)
-        if shard.count > total:
+        if count > total:
             raise InputError(
-                f"shard is {shard}: {total} members (points x seeds) make {total} "
-                "shards at most"
+                f"shard is {number}/{count}: {total} members (points x seeds) make "
+                f"{total} shards at most"
             )
-        first = (shard.number - 1) * total // shard.count
-        return ordered[first : shard.number * total // shard.count]
+        return ordered[(number - 1) * total // count : number * total // count]
 
     @functools.cached_property
     def _members(self) -> Mapping[Run, tuple[int, int]]:
@@ -87,20 +76,14 @@ class Plan:
         return dict(zip(LABELS, zip(*members, strict=True), strict=True))
 
     def stored(self, folder: pathlib.Path) -> list[Program]:
-        """Return the programs that have begun in the folder of the sweep or run."""
-        if self.is_run:
-            runs = tuple(self.runs.values())
-            return [Program(runs, folder, {"seed": self.seeds})]
+        """Return the programs that have begun in the folder of the sweep."""
         return programs.read(programs_of(folder), self.algorithm.config.total_steps)
 
     def trained(self, folder: pathlib.Path) -> list[Program]:
         """Return the programs that are trained to their end, of runs of this plan."""
         own = set(self.runs.values())
-        return [
-            each
-            for each in self.stored(folder)
-            if each.training and each.trains_any(own)
-        ]
+        stored = [x for x in self.stored(folder) if not own.isdisjoint(x.runs)]
+        return [x for x in stored if x.training]
 
     def missing(self, trained: Iterable[Program]) -> list[tuple[int, int]]:
         """Return the (index of the point, seed) of each run that no program has."""
@@ -122,25 +105,18 @@ def programs_of(folder: pathlib.Path) -> pathlib.Path:
     return folder / "programs"
 
 
-def stored_plan(folder: pathlib.Path, description: Mapping[str, Any]) -> Plan:
-    """Return the plan of a stored sweep or run.
-
-    Args:
-      folder: its folder.
-      description: its config.json, from `run_folder.read`.
+def stored_plan(description: Mapping[str, Any]) -> Plan:
+    """Return the plan of a stored sweep from its `run_folder.read`.
 
     Raises:
       InputError: if its points can't be trained.
     """
-    algorithm, of_sweep = description["algorithm"], description.get("points", ({},))
-    path = folder / run_folder.CONFIG
-    source = f"{path} is damaged, or another program wrote it: points: "
-    points.check(of_sweep, algorithm, source)
+    with json_reader.blamed(description["out"] / run_folder.CONFIG):
+        points.check(description["points"], description["algorithm"], "points: ")
     return Plan(
         description["env"],
         description["settings"],
-        algorithm,
-        of_sweep,
+        description["algorithm"],
+        description["points"],
         run_folder.seeds_of(description),
-        is_run="points" not in description,
     )

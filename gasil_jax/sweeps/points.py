@@ -48,23 +48,22 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
       InputError: if a name can't vary or is given twice, or if a value is not a number.
     """
     values: dict[str, tuple[Any, ...]] = {}
+    kinds = _kinds(algorithm)
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
-        kind = _kinds(algorithm).get(name)
-        if kind is None:
+        if name not in kinds:
             raise InputError(f"grid: {_why_not(name, algorithm)}")
-        read = float if kind is float else whole_number
+        read = whole_number if kinds[name] is int else float
         try:
             values[name] = tuple(dict.fromkeys(map(read, listed.split(","))))
         except ValueError:
-            like = "numbers, like {}=0.1,0.2"
-            like = like if kind is float else "whole numbers, like {}=10,20"
-            raise InputError(
-                f"grid has {entry!r}: it must be {like.format(name)}"
-            ) from None
+            like = f"numbers, like {name}=0.1,0.2"
+            if read is whole_number:
+                like = f"whole numbers, like {name}=10,20"
+            raise InputError(f"grid has {entry!r}: it must be {like}") from None
     return values
 
 
@@ -94,13 +93,9 @@ def _read(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
 def check(points: Sequence[Point], algorithm: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed.
 
-    Args:
-      points: the points.
-      algorithm: what they change.
-      source: begins the message.
-
     Raises:
-      InputError: if one does not; the message names the value and the range.
+      InputError: if one does not; the message, which begins with `source`, names the
+        value and the range.
     """
     allowed = _kinds(algorithm)
     without_effect = run_options.without_effect(algorithm)
@@ -159,7 +154,7 @@ def make_points(
             "grid is empty: it must be NAME=VALUE,..., or use --random or --points-file"
         )
     if random is None:
-        points = list(itertools.product(*values.values()))
+        points = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in points]
     kinds = _kinds(algorithm)
     values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
@@ -173,8 +168,6 @@ def make_points(
             "and at least 1"
         )
     chosen = np.random.default_rng(seed).choice(count, random, replace=False)
-    drawn = zip(*np.unravel_index(chosen, sizes), strict=True)
-    return [
-        {name: x[i] for (name, x), i in zip(values.items(), at, strict=True)}
-        for at in drawn
-    ]
+    columns = zip(values.values(), np.unravel_index(chosen, sizes), strict=True)
+    drawn = zip(*([listed[i] for i in at] for listed, at in columns), strict=True)
+    return [dict(zip(values, point, strict=True)) for point in drawn]

@@ -7,7 +7,6 @@ training.json. Its name is a hash of its runs, so two programs never share a fol
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import itertools
 import json
@@ -15,24 +14,17 @@ import math
 import os
 import pathlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from typing import Any
 
-import numpy as np
-
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, json_reader, metrics_files, run_folder
-from gasil_jax.host.driver import Outcome
-from gasil_jax.host.members import Members
+from gasil_jax.host.metrics_files import Columns
 from gasil_jax.sweeps.runs import Run, read_run
 
 _PROGRAM, _TRAINING = "program.json", "training.json"
 #: Stands for a folder that is not made yet; nothing is stored in it.
 NOWHERE = pathlib.Path(os.devnull)
-
-#: The columns of a table for one run, (rows,) each, by name.
-Columns = dict[str, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,21 +57,13 @@ class Program:
         """The traced numbers of each run, by name."""
         return tuple(run.algorithm.hyperparameters for run in self.runs)
 
-    @functools.cached_property
-    def name(self) -> str:
-        """A hash of its runs, the name of its folder."""
-        keys = " ".join(run.key for run in self.runs)
-        return hashlib.sha256(keys.encode()).hexdigest()[:16]
-
     def below(
         self, parent: pathlib.Path, labels: Mapping[str, Sequence[int]]
     ) -> "Program":
-        """Return the program with its folder below a folder, and with labels."""
-        return dataclasses.replace(self, path=parent / self.name, labels=labels)
-
-    def trains_any(self, runs: AbstractSet[Run]) -> bool:
-        """Return whether some of the runs are its own."""
-        return not runs.isdisjoint(self.runs)
+        """Return the program with labels, and a folder that has a hash as its name."""
+        keys = " ".join(run.key for run in self.runs)
+        path = parent / hashlib.sha256(keys.encode()).hexdigest()[:16]
+        return dataclasses.replace(self, path=path, labels=labels)
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
@@ -91,23 +75,17 @@ class Program:
         """
         with run_folder.lock(run_folder.create(self.path)):
             if not (self.path / _PROGRAM).exists():
-                runs = self.runs
-                every = list(dict.fromkeys(run.experiment for run in runs))
-                listed = [[every.index(run.experiment), run.seed] for run in runs]
+                every = list(dict.fromkeys(run.experiment for run in self.runs))
                 content = {
                     "experiments": list(map(json.loads, every)),
-                    "runs": listed,
+                    "runs": [[every.index(x.experiment), x.seed] for x in self.runs],
                     "labels": {name: list(x) for name, x in self.labels.items()},
                 }
                 metrics_files.write_json(self.path / _PROGRAM, content)
             yield
 
     def finish(self, measured: Mapping[str, Any]) -> None:
-        """Write training.json, which says that the program is trained to its end.
-
-        Args:
-          measured: what `measured` returns.
-        """
+        """Write training.json: `driver.Outcome.measured` of training to the end."""
         content = {**self._length, **measured}
         metrics_files.write_json(self.path / _TRAINING, content)
 
@@ -125,42 +103,43 @@ class Program:
             return {}
         return content if self._length.items() <= content.items() else {}
 
-    def tables(self) -> tuple[list[Columns], list[Columns]]:
-        """Return the metrics and the scores of each run.
-
-        The scores are none without evaluations.
+    def tables(self) -> list[tuple[Columns, Columns]]:
+        """Return the metrics and the scores of each run, (rows,); {} without scores.
 
         Raises:
           InputError: if a table is damaged.
         """
-        rows = self.algorithm.config.num_iterations
-        metrics = self._table("metrics.csv", metrics_files.SUMMARIZED, rows)
+        metrics = self._table("metrics.csv", metrics_files.SUMMARIZED)
+        if len(metrics[0]["env_steps"]) != self.algorithm.config.num_iterations:
+            raise InputError(f"{self.path}/metrics.csv is damaged: it lacks iterations")
         if self.training.get("evaluation_seconds") is None:
-            return metrics, []
-        return metrics, self._table("evaluations.csv", ("mean",))
+            return [(columns, {}) for columns in metrics]
+        return list(zip(metrics, self._table("evaluations.csv", ("mean",))))
 
-    def _table(
-        self, name: str, required: Sequence[str], rows: int | None = None
-    ) -> list[Columns]:
-        """Return a complete table by run, after checking its columns and `rows`."""
-        path, config = self.path / name, self.algorithm.config
-        count = len(self.runs)
+    def _table(self, name: str, required: Sequence[str]) -> list[Columns]:
+        """Return a table by run, after checking its columns and its last row."""
+        path, config, count = self.path / name, self.algorithm.config, len(self.runs)
         record = checkpoint.newest_record(self.path / "checkpoints")
         try:
             whole = metrics_files.has_recorded_rows(path, record)
-            columns = metrics_files.read_metrics(
-                path, (), count, (*self.labels, *required)
-            )
+            columns = metrics_files.read_metrics(path, self.labels, required)
         except OSError as error:
             raise InputError(f"{path} is damaged: {error}") from None
-        for label, values in self.labels.items():
-            if (columns.pop(label) != np.array(values)[:, None]).any():
-                raise InputError(f"{path} is damaged: its rows are not in order")
-        steps = columns["env_steps"][0]
-        whole &= steps[-1] == config.num_iterations * config.batch_steps
-        if not whole or rows not in (None, len(steps)):
+        last = columns["env_steps"][0, -1]
+        if not whole or last != config.num_iterations * config.batch_steps:
             raise InputError(f"{path} is damaged: it lacks iterations")
         return [{name: x[i] for name, x in columns.items()} for i in range(count)]
+
+
+def of_run(described: Mapping[str, Any], algorithm: Algorithm) -> Program:
+    """Return the program of a run of one setting, in the run's own folder, "out".
+
+    The fields are those of config.json, or the options.
+    """
+    seeds = run_folder.seeds_of(described)
+    env, settings = described["env"], described["settings"]
+    runs = tuple(Run(env, algorithm, seed, settings) for seed in seeds)
+    return Program(runs, described["out"] or NOWHERE, {"seed": seeds})
 
 
 def group(
@@ -170,10 +149,8 @@ def group(
 ) -> list[Program]:
     """Group runs into as few programs as possible.
 
-    Args:
-      runs: the runs.
-      most: the largest number of runs in a program; default no limit.
-      apart: runs for which it returns different values do not share a program.
+    Programs have `most` runs at most, by default any number. Runs for which `apart`
+    returns different values do not share one.
     """
     groups: dict[tuple[str, Any], dict[Run, None]] = {}
     for run in runs:
@@ -186,46 +163,28 @@ def group(
     return parts
 
 
-def measured(members: Members, outcome: Outcome) -> dict[str, Any]:
-    """Return what is stored of how this process trained: speed, device, versions."""
-    return {
-        "env_steps": outcome.new_steps,
-        "compile_seconds": outcome.compile_seconds,
-        "train_seconds": outcome.train_seconds,
-        "evaluation_seconds": outcome.evaluation_seconds,
-        "device": members.device_kind,
-        "device_count": len(members.devices),
-        "versions": metrics_files.versions(),
-    }
-
-
 def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
-    """Return the programs that have begun in the folders of a folder.
+    """Return the programs that have begun in the folders of a folder, if it is there.
 
-    Args:
-      parent: the folder, which may be missing.
-      total_steps: the length of the training, which may have grown since it began;
-        default the one that it began with.
+    The length of their training, `total_steps`, may have grown since; by default it is
+    the one that it began with.
 
     Raises:
       InputError: if a program.json is damaged.
     """
-    paths = sorted(parent.glob(f"[!.]*/{_PROGRAM}"))
-    return [_read(path, total_steps) for path in paths]
-
-
-def _read(path: pathlib.Path, total_steps: int | None) -> Program:
-    listed = json_reader.read(path, dict[str, Any])
-    try:
-        experiments, labels = listed["experiments"], dict(listed["labels"])
-        every = [read_run(experiments[index], seed) for index, seed in listed["runs"]]
-    except NotImportable:
-        raise
-    except (ValueError, KeyError, IndexError, TypeError) as error:
-        raise InputError(f"{path} is damaged: {error}") from None
-    if total_steps is not None:
-        every = [run.with_total_steps(total_steps) for run in every]
-    return Program(tuple(every), path.parent, labels)
+    begun = []
+    for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
+        listed = json_reader.read(path, dict[str, Any])
+        with json_reader.blamed(path):
+            every, labels = listed["experiments"], dict(listed["labels"])
+            runs = [
+                read_run(every[index], seed, total_steps)
+                for index, seed in listed["runs"]
+            ]
+            if {len(x) for x in (labels["seed"], *labels.values())} != {len(runs)}:
+                raise ValueError("its labels are not those of its runs")
+        begun.append(Program(tuple(runs), path.parent, labels))
+    return begun
 
 
 def unfinished(
@@ -234,12 +193,9 @@ def unfinished(
     """Return the programs to continue for requested runs, and the runs that none has.
 
     A program that has begun trains all of its runs, also those that are not requested.
-
-    Args:
-      requested: the runs.
-      stored: the programs that have begun, which may be trained already.
+    The stored ones may be trained already.
     """
-    begun_or_trained = {run for each in stored for run in each.runs}
     asked = set(requested)
-    begun = [x for x in stored if not x.training and x.trains_any(asked)]
-    return begun, [run for run in requested if run not in begun_or_trained]
+    begun = [x for x in stored if not x.training and not asked.isdisjoint(x.runs)]
+    asked.difference_update(*(x.runs for x in stored))
+    return begun, [run for run in requested if run in asked]

@@ -2,7 +2,7 @@
 
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -11,59 +11,44 @@ from gasil_jax.figures import plotting
 from gasil_jax.host import json_reader, metrics_files, output_file, policy_file
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import Members
-from gasil_jax.sweeps import programs
+from gasil_jax.host.metrics_files import SUMMARIZED, Columns
 
 
-class Tables(NamedTuple):
-    """The columns of metrics.csv and evaluations.csv, (seeds, rows) each.
+def read(folder: pathlib.Path, members: Members) -> tuple[Columns, Columns]:
+    """Return the metrics and the scores of a run's seeds, (seeds, rows) each.
 
-    Those of evaluations.csv are none if nothing was evaluated.
-    """
-
-    metrics: dict[str, np.ndarray]
-    evaluations: dict[str, np.ndarray]
-
-
-def read(folder: pathlib.Path, num_seeds: int) -> Tables:
-    """Return the tables of a run.
+    The scores are none if nothing was evaluated.
 
     Raises:
       InputError: if a table is damaged.
     """
-
-    def table(path: Any, required: Any) -> Any:
-        return metrics_files.read_metrics(path, ("seed",), num_seeds, required)
-
-    required = (*metrics_files.SUMMARIZED, "faulty_steps")
-    metrics = table(folder / "metrics.csv", required)
+    labels, required = {"seed": members.seeds}, (*SUMMARIZED, "faulty_steps")
+    metrics = metrics_files.read_metrics(folder / "metrics.csv", labels, required)
     path = folder / "evaluations.csv"
-    evaluated = path.exists() and path.stat().st_size > 0
-    return Tables(metrics, table(path, ("mean",)) if evaluated else {})
+    if not path.exists() or path.stat().st_size == 0:
+        return metrics, {}
+    return metrics, metrics_files.read_metrics(path, labels, ("mean",))
 
 
-def write(
-    folder: pathlib.Path,
-    env_name: str,
-    *,
-    members: Members,
-    outcome: Outcome,
-    tables: Tables,
-) -> dict[str, Any]:
-    """Write policy.npz, learning_curve.png and summary.json; return the summary.
+def finish(
+    folder: pathlib.Path, env_name: str, members: Members, outcome: Outcome
+) -> tuple[tuple[Columns, Columns], dict[str, Any]]:
+    """Write policy.npz, learning_curve.png and summary.json of a run that has ended.
 
-    Args:
-      folder: folder of the run.
-      env_name: name of the environment.
-      members: the run's seeds.
-      outcome: the result of their training.
-      tables: their tables, from `read`.
+    Returns:
+      The tables of the run, and the summary.
+
+    Raises:
+      InputError: if a table is damaged.
+      OSError: if the folder can no longer be written, or could not before.
     """
-    metrics, evaluations = tables
+    metrics, evaluations = tables = read(folder, members)
     seeds, agent = members.seeds, members.algorithm.agent.name
     returns, steps = metrics["episode_return"], metrics["env_steps"][0]
-    final = metrics_files.final_returns(returns)
+    finals = metrics_files.finals(metrics, evaluations)
     # The policies come first, because a figure or a summary can be made again.
-    policy_file.save(folder / "policy.npz", outcome.states, members.env, seeds, final)
+    policies, final = folder / "policy.npz", finals["final_return"]
+    policy_file.save(policies, outcome.states, members.env, seeds, final)
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
@@ -72,12 +57,6 @@ def write(
             title=f"{env_name}, {agent}",
             evaluations=evaluations or None,
         )
-    finals = {
-        "final_return": final,
-        "final_length": metrics_files.final_returns(metrics["episode_length"]),
-    }
-    if evaluations:
-        finals["final_evaluation"] = evaluations["mean"][:, -1]
     faults = {
         name: np.nansum(metrics[name], axis=1).astype(int)
         for name in ("faulty_steps", "skipped_updates")
@@ -91,10 +70,12 @@ def write(
         "unhealthy_seeds": [
             seed for seed, *bad in zip(seeds, *faults.values(), strict=True) if any(bad)
         ],
-        **_trained(folder / "summary.json", programs.measured(members, outcome)),
+        **_trained(folder / "summary.json", outcome.measured),
     }
     metrics_files.write_json(folder / "summary.json", summary)
-    return summary
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
+    return tables, summary
 
 
 def _by_seed_and_over_seeds(
@@ -103,14 +84,11 @@ def _by_seed_and_over_seeds(
     """Return each quantity, (seeds,), by seed, and over seeds; NaN becomes None."""
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
-        finite = np.isfinite(values)
-        known = [
-            x if is_finite else None for x, is_finite in zip(values.tolist(), finite)
-        ]
+        finite = values[np.isfinite(values)]
+        known = [x if np.isfinite(x) else None for x in values.tolist()]
         fields[name] = dict(zip(map(str, seeds), known, strict=True))
-        mean = float(values[finite].mean()) if finite.any() else None
+        fields[f"{name}_mean"] = float(finite.mean()) if finite.size else None
         estimate = statistics.estimate(values)
-        fields[f"{name}_mean"] = mean
         fields[f"{name}_interquartile_mean"] = estimate.interquartile_mean
         fields[f"{name}_interval"] = estimate.interval
     return fields
@@ -131,12 +109,9 @@ def _trained(path: pathlib.Path, measured: Mapping[str, Any]) -> dict[str, Any]:
 def speed(trainings: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return the seconds, steps/s and devices of programs trained one after the other.
 
-    For shards, which run in parallel, "env_steps_per_second" is the average speed of
-    one shard; None if no step was taken. "evaluation_seconds" is included if policies
-    were evaluated.
-
-    Args:
-      trainings: what `programs.measured` says of each program.
+    It is told from the `driver.Outcome.measured` of each. For shards, which run in
+    parallel, "env_steps_per_second" is the average speed of one shard; None if no step
+    was taken. "evaluation_seconds" is included if policies were evaluated.
     """
     seconds = [f"{x}_seconds" for x in ("compile", "train", "evaluation")]
     if any(x.get("evaluation_seconds") is None for x in trainings):

@@ -103,16 +103,14 @@ class Run:
         }
         return json.dumps({**self._fields, "algorithm": algorithm}, sort_keys=True)
 
-    def with_total_steps(self, total_steps: int) -> "Run":
-        """Return the run with another length of training."""
-        algorithm = self.algorithm.replace(total_steps=total_steps)
-        return dataclasses.replace(self, algorithm=algorithm)
 
-
-def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
+def read_run(
+    experiment: Mapping[str, Any], seed: int, total_steps: int | None = None
+) -> Run:
     """Return the run whose `Run.experiment`, read from JSON, and seed these are.
 
-    Settings that are newer than the stored run have their defaults.
+    Settings that are newer than the stored run have their defaults. Training may be of
+    another length than was stored, `total_steps`.
 
     Raises:
       ValueError: if a name is unknown, or a value of another type.
@@ -120,5 +118,7 @@ def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
     fields = dict(experiment)
     own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
     algorithm = descriptions.read(fields.pop("algorithm"))
+    if total_steps is not None:
+        algorithm = algorithm.replace(total_steps=total_steps)
     settings = json_reader.as_type(Settings, fields, "settings")
     return Run(algorithm=algorithm, seed=seed, settings=settings, **own)

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import functools
 import math
 import pathlib
 import sys
@@ -27,6 +28,7 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.members import member
 from gasil_jax.imitation.adversarial import AdversarialAgent
+from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.plan import stored_plan
 from gasil_jax.sweeps.programs import Program
 
@@ -38,23 +40,26 @@ class _Summary(TypedDict):
 
 
 def find(
-    folder: pathlib.Path, description: Mapping[str, Any], point: int | None
-) -> list[tuple[Program, Sequence[int]]]:
+    description: Mapping[str, Any], point: int | None
+) -> list[tuple[Program, list[int]]]:
     """Return the programs of a run, or of a sweep's point, with its members in each.
 
-    Args:
-      folder: folder of the run or sweep.
-      description: its config.json, from `run_folder.read`.
-      point: number of a sweep's point; default the best by mean.
+    The run or sweep is described by `run_folder.read`; the point is as in `load`.
 
     Raises:
       InputError: if the folder has no such point.
     """
-    plan = stored_plan(folder, description)
+    folder = description["out"]
+    if "points" not in description:
+        if point is not None:
+            raise InputError(
+                f"point is {point}: {folder} is a run, which has no points"
+            )
+        run = programs.of_run(description, description["algorithm"])
+        return [(run, list(range(len(run.runs))))]
+    plan = stored_plan(description)
     last = len(plan.points) - 1
-    if plan.is_run and point is not None:
-        raise InputError(f"point is {point}: {folder} is a run, which has no points")
-    if point is None and not plan.is_run:
+    if point is None:
         with contextlib.suppress(FileNotFoundError):
             point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
         if point is None:
@@ -62,17 +67,15 @@ def find(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"
             )
-    point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
-    requested = {plan.runs[point, seed] for seed in plan.seeds}
-    saved = [
-        (each, [i for i, run in enumerate(each.runs) if run in requested])
-        for each in plan.stored(folder)
-    ]
-    if not any(indices for _, indices in saved):
+    requested, saved = {plan.runs[point, seed] for seed in plan.seeds}, []
+    for each in plan.stored(folder):
+        if indices := [i for i, run in enumerate(each.runs) if run in requested]:
+            saved.append((each, indices))
+    if not saved:
         raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
-    return [(each, indices) for each, indices in saved if indices]
+    return saved
 
 
 def load(
@@ -102,27 +105,31 @@ def load(
     if not isinstance(which, str) or which not in ("last", "best"):
         raise refusal("which", which, "'last' or 'best'")
     description = run_folder.read(folder)
-    every = find(folder, description, point)
+    every = find(description, point)
     settings = dataclasses.asdict(description["settings"])
     with command_line.input_checked():
         env = environments.make_env(description["env"], **settings)
     states: dict[int, train.TrainState] = {}
     for program, indices in every:
-        count, algorithm = len(program.runs), program.algorithm
-        if which == "best" and len(indices) < count:
+        if which == "best" and len(indices) < len(program.runs):
             raise InputError(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        chosen = _checkpoint(folder, program.path / "checkpoints", which)
-
-        # The leaves of all members have the same shapes.
-        def init(seed: Any, algorithm: Algorithm = algorithm) -> Any:
-            return train.first_state(env, algorithm, jax.random.key(seed))
-
+        root = program.path / "checkpoints"
+        chosen, errors = checkpoint.latest(root)
+        for error in errors:
+            print(f"warning: {error}", file=sys.stderr)
+        if which == "best":
+            chosen = checkpoint.best(root)
+        if chosen is None:
+            scored = " with a score" if which == "best" else ""
+            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
+        init = functools.partial(train.first_state, env, program.algorithm)
+        keys = jax.random.split(jax.random.key(0), len(program.runs))
         with command_line.input_checked():
-            like = jax.eval_shape(jax.vmap(init), jnp.arange(count, dtype=jnp.uint32))
-            restored = chosen.restore(like)
+            # The leaves of all members have the same shapes.
+            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
         states |= {program.seeds[i]: member(restored, i) for i in indices}
     seeds = sorted(states)
     if seed is not None:
@@ -138,21 +145,6 @@ def load(
     stacked = jax.tree.map(stack, *(states[x] for x in seeds))
     first, (index, *_) = every[0]
     return env, first.runs[index].algorithm, seeds, stacked
-
-
-def _checkpoint(
-    folder: pathlib.Path, root: pathlib.Path, which: str
-) -> checkpoint.Checkpoint:
-    """Return the last or the best checkpoint in the folder of a run's checkpoints."""
-    chosen, errors = checkpoint.latest(root)
-    for error in errors:
-        print(f"warning: {error}", file=sys.stderr)
-    if which == "best":
-        chosen = checkpoint.best(root)
-    if chosen is None:
-        scored = " with a score" if which == "best" else ""
-        raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-    return chosen
 
 
 class Policies(NamedTuple):
@@ -181,8 +173,9 @@ def load_policies(
     """Return the policies of a run, or one that comes with the package.
 
     Args:
-      folder: folder of the run or sweep, or zoo:NAME.
-      which: see `load`; a policy of the zoo has no checkpoints.
+      folder: folder of the run or sweep, or zoo:NAME, which has no points and no
+        checkpoints.
+      which: see `load`.
       point: see `load`.
       seed: see `load`.
 

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import math
 import pathlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,11 +18,12 @@ from gasil_jax.host import (
     policy_file,
     run_folder,
 )
+from gasil_jax.host.metrics_files import Columns
 from gasil_jax.statistics import FEW_POINTS, Estimate, estimate, importance
 from gasil_jax.sweeps import run_results, saved_states
 from gasil_jax.sweeps.plan import LABELS, Plan
 from gasil_jax.sweeps.points import Point
-from gasil_jax.sweeps.programs import Columns, Program
+from gasil_jax.sweeps.programs import Program
 from gasil_jax.sweeps.runs import Run
 
 
@@ -71,11 +72,7 @@ class Results:
 
 
 def read(plan: Plan, trained: Sequence[Program]) -> Results:
-    """Return the results of a sweep that is trained to its end.
-
-    Args:
-      plan: the points and seeds.
-      trained: the programs that are trained to their end.
+    """Return the results of a sweep from the programs that are trained to their end.
 
     Raises:
       InputError: if a run is missing or has two different results, if a table is
@@ -88,40 +85,24 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
             f"{point} and seed {seed}: train them with python -m gasil_jax.sweep "
             "--resume"
         )
-    metrics: dict[Run, Columns] = {}
-    scores: dict[Run, Columns] = {}
+    stored: dict[Run, tuple[Columns, Columns]] = {}
     for each in trained:
-        runs = each.runs
-        own_metrics, own_scores = each.tables()
-        for run, columns in zip(runs, own_metrics, strict=True):
-            if not _equal(metrics.setdefault(run, columns), columns):
+        for run, own in zip(each.runs, each.tables(), strict=True):
+            if not _equal(stored.setdefault(run, own)[0], own[0]):
                 raise InputError(
                     f"{each.path} has another result than another program for seed "
                     f"{run.seed} of {run.experiment}"
                 )
-        scores |= dict(zip(runs, own_scores))
-
-    def by_point(value_of: Callable[[Run], float]) -> np.ndarray:
-        values = np.array([value_of(run) for run in plan.runs.values()])
-        return values.reshape(-1, len(plan.seeds))
-
-    def final(name: str) -> np.ndarray:
-        return by_point(
-            lambda x: metrics_files.final_returns(metrics[x][name][None])[0]
-        )
-
-    curves = _curves(plan, metrics)
-    finals = {
-        "final_return": final("episode_return"),
-        "final_length": final("episode_length"),
-    }
-    if scores:
-        of_scores = _curves(plan, scores)
-        curves |= {f"evaluation_{name}": values for name, values in of_scores.items()}
-        finals["final_evaluation"] = by_point(lambda run: scores[run]["mean"][-1])
+    every = [stored[run] for run in plan.runs.values()]
+    curves = _curves(plan, [metrics for metrics, _ in every])
+    for name, values in _curves(plan, [scores for _, scores in every]).items():
+        curves[f"evaluation_{name}"] = values
+    last = [metrics_files.finals(*own) for own in every]
+    shape = len(plan.points), len(plan.seeds)
+    finals = {name: np.reshape([x[name] for x in last], shape) for name in last[0]}
     diverged = np.any(curves["skipped_updates"] > 0, axis=2)
     # A program may be in several folders.
-    trainings = {each.name: each.training for each in trained}
+    trainings = {each.path.name: each.training for each in trained}
     return Results(plan, list(trainings.values()), curves, finals, diverged)
 
 
@@ -131,28 +112,27 @@ def _equal(first: Columns, second: Columns) -> bool:
     )
 
 
-def _curves(plan: Plan, tables: Mapping[Run, Columns]) -> Columns:
-    """Return every metric, (points, seeds, iterations); NaN after a run's last.
+def _curves(plan: Plan, every: Sequence[Columns]) -> Columns:
+    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row.
 
     Raises:
-      InputError: if runs have other metrics than the first one.
+      InputError: if runs have other columns than the first one.
     """
-    every = {member: tables[run] for member, run in plan.runs.items()}
-    (first, columns), *_ = every.items()
-    for (point, seed), metrics in every.items():
-        if differing := ", ".join(sorted(columns.keys() ^ metrics.keys())):
+    (first, *_), columns = plan.runs, every[0]
+    for (point, seed), own in zip(plan.runs, every, strict=True):
+        if differing := ", ".join(sorted(columns.keys() ^ own.keys())):
             raise InputError(
                 f"point {point}, seed {seed} was trained with other metrics than point "
                 f"{first[0]}, seed {first[1]}: {differing}"
             )
-    # Points may differ in batch_steps, and so in iterations.
-    length = max(len(metrics["env_steps"]) for metrics in every.values())
-    curves = {name: np.full((len(every), length), np.nan) for name in columns}
-    for index, metrics in enumerate(every.values()):
-        for name, values in metrics.items():
-            curves[name][index, : len(values)] = values
-    shape = (-1, len(plan.seeds), length)
-    return {name: values.reshape(shape) for name, values in curves.items()}
+    curves = {}
+    for name in columns:
+        # Points may differ in batch_steps, and so in iterations.
+        values = np.full((len(every), max(len(own[name]) for own in every)), np.nan)
+        for row, own in zip(values, every, strict=True):
+            row[: len(own[name])] = own[name]
+        curves[name] = values.reshape(len(plan.points), len(plan.seeds), -1)
+    return curves
 
 
 def finish(folder: pathlib.Path, results: Results) -> None:
@@ -168,10 +148,6 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     hyperparameters.png is written only if a hyperparameter varies among the points that
     have a final return, and policy.npz, with the policies of the best point by mean,
     only if there is one whose checkpoints are there.
-
-    Args:
-      folder: folder to write to.
-      results: the results, from `read`.
     """
     _write_results(folder / "results.csv", results)
     with output_file.atomic(folder / "curves.npz") as partial:
@@ -268,24 +244,18 @@ def report(points: Sequence[Point], summary: Mapping[str, Any]) -> list[str]:
         seconds += f", {summary['evaluation_seconds']:,.0f} s of evaluations"
     lines = [f"{run_results.speed_in_words(summary)} ({seconds})"]
     for title in ("best_by_mean", "best_by_worst_seed"):
-        best = summary[title]
-        if best is None:
-            lines.append(
-                f"{title}: none, because every point has a seed that diverged or in "
-                "which no episode ended"
-            )
-            continue
-        scores = summary["points"][best]
-        told = Estimate(scores["interquartile_mean"], scores["interval"])
-        lines.append(
-            f"{title}: {_label(points[best])} (mean {scores['mean']:.1f}, "
-            f"interquartile mean {told}, worst seed {scores['worst_seed']:.1f})"
-        )
+        told = "none, because every point has a seed that diverged or in which no "
+        told += "episode ended"
+        if (best := summary[title]) is not None:
+            scores = summary["points"][best]
+            middle = Estimate(scores["interquartile_mean"], scores["interval"])
+            told = f"{_label(points[best])} (mean {scores['mean']:.1f}, interquartile "
+            told += f"mean {middle}, worst seed {scores['worst_seed']:.1f})"
+        lines.append(f"{title}: {told}")
     shares = summary["importance"].items()
     shown = [f"{name} {share:.0%}" for name, share in shares if share is not None]
-    uncertain = ""
-    if len(points) < FEW_POINTS:
-        uncertain = f" (uncertain with {len(points)} points)"
+    few = len(points) < FEW_POINTS
+    uncertain = f" (uncertain with {len(points)} points)" if few else ""
     return lines + ([f"importance: {', '.join(shown)}{uncertain}"] if shown else [])
 
 

@@ -179,7 +179,7 @@ def test_adaptive_imitation_trains_it_and_it_is_evaluated(tmp_path):
     flags = [*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "ppo+gasil-adaptive"]
     flags += ["--policy-components", "3", "--entropy-coefficient", "0.01"]
     assert run.main([*flags, "--out", str(tmp_path)]) == 0
-    metrics = metrics_files.read_metrics(tmp_path / "metrics.csv", ("seed",), 1)
+    metrics = metrics_files.read_metrics(tmp_path / "metrics.csv", {"seed": [0]})
     assert np.isfinite(metrics["entropy"]).all()
     assert (metrics["skipped_updates"] == 0).all()
     assert evaluate.main([str(tmp_path), "--episodes", "2", "--stochastic"]) == 0

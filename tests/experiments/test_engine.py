@@ -25,7 +25,6 @@ from gasil_jax.host.members import Members
 from gasil_jax.host.periodic_evaluation import evaluation_key
 from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.runs import Run
-from gasil_jax.sweeps.shards import Shard
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
 SMALL |= {"total_steps": 12 * 256}
@@ -104,14 +103,14 @@ def test_an_agents_and_a_models_numbers_are_no_program_of_their_own(
 
 def test_shards_are_all_runs_once_and_none_moves_when_others_join():
     runs = [run(seed) for seed in range(60)]
-    shards = [engine.select_by_key(runs, Shard(number, 3)) for number in (1, 2, 3)]
+    shards = [engine.select_by_key(runs, number, 3) for number in (1, 2, 3)]
     assert sorted(x.seed for shard in shards for x in shard) == list(range(60))
     assert all(10 < len(shard) < 30 for shard in shards)
     for number, shard in enumerate(shards, start=1):
-        assert engine.select_by_key(runs[:40], Shard(number, 3)) == [
+        assert engine.select_by_key(runs[:40], number, 3) == [
             x for x in shard if x.seed < 40
         ]
-    assert engine.select_by_key(runs, Shard(1, 1)) == runs
+    assert engine.select_by_key(runs, 1, 1) == runs
 
 
 def test_a_record_is_what_make_train_gives(trained):

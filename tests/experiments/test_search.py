@@ -52,14 +52,12 @@ def test_a_value_at_an_end_is_tried_one_step_further():
 def test_the_best_of_all_points_is_chosen(tmp_path):
     store, one = Store(tmp_path), Search("swimmer", "ppo", 20)
     drawn = one.points(store)
-    assert one.best(store) is None and one.leading(store) is None
+    assert one.best(store) is None
     fill(store, one, drawn, np.arange(len(drawn)))
     assert one.chosen(store) is None  # until those beyond have been tried
-    assert one.leading(store) == drawn[-1]
     further = one.points(store)[len(drawn) :]
     fill(store, one, further, [0.0] * (len(further) - 1) + [99.0])
     assert one.best(store) is None  # until the best have been trained with more seeds
-    assert one.leading(store) == further[-1]
     finalists = one.finalists(store)
     assert finalists == (further[-1], drawn[-1], drawn[-2])
     requested = one.requested(store)
@@ -67,7 +65,7 @@ def test_the_best_of_all_points_is_chosen(tmp_path):
     fill(store, one, finalists, [0.0, 50.0, 60.0], range(1002, 1006))
     assert not store.missing(requested)
     point, best = one.best(store)  # (99 + 99) / 6 and (10 + 10 + 4 * 60) / 6
-    assert point == drawn[-2] == one.leading(store)
+    assert point == drawn[-2]
     assert best.tolist() == [10.0, 10.0, *[60.0] * 4]
     for run in one.runs(further)[-1]:
         settings = run.algorithm.settings

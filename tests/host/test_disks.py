@@ -265,6 +265,40 @@ def test_rows_that_could_not_be_written_are_not_written_later(tmp_path):
     assert writer._file.closed
 
 
+def test_a_row_that_is_changed_during_training_is_told_when_it_continues(tmp_path):
+    path = tmp_path / "metrics.csv"
+    start = lambda record=None: metrics_files.MetricsWriter(
+        path, {"seed": [0]}, record, columns=("env_steps",)
+    )
+    write = lambda writer, steps: writer.write({"env_steps": np.full((1, 1), steps)})
+    writer = start()
+    write(writer, 7.0)
+    record = writer.record()
+    writer.close()
+    # With other line ends, and a row after the checkpoint.
+    text = path.read_text()
+    path.write_text(text)
+    writer = start(record | {"metrics_size": path.stat().st_size})
+    write(writer, 8.0)
+    assert metrics_files.has_recorded_rows(path, writer.record())
+    path.write_bytes(path.read_bytes().replace(b"0,7", b"0,6"))
+    write(writer, 9.0)
+    with pytest.raises(ValueError, match="it has changed since the checkpoint"):
+        metrics_files.has_recorded_rows(path, writer.record())
+    writer.close()
+
+
+def test_a_table_of_other_seeds_is_refused(tmp_path):
+    path = tmp_path / "metrics.csv"
+    writer = metrics_files.MetricsWriter(path, {"seed": [3, 4]}, columns=("env_steps",))
+    writer.write({"env_steps": np.full((2, 1), 7.0)})
+    writer.close()
+    (first, _) = metrics_files.read_metrics(path, {"seed": [3, 4]})["env_steps"]
+    assert first.tolist() == [7.0]
+    with pytest.raises(ValueError, match="its rows are not in order"):
+        metrics_files.read_metrics(path, {"seed": [4, 3]})
+
+
 def test_windows_is_refused_in_a_line():
     program = "import sys; sys.platform = 'win32'; import gasil_jax"
     ended = subprocess.run(

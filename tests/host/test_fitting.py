@@ -57,7 +57,7 @@ def same(result, folder):
         (result.metrics, "metrics.csv"),
         (result.evaluations, "evaluations.csv"),
     ):
-        expected = metrics_files.read_metrics(folder / name, ("seed",), 2)
+        expected = metrics_files.read_metrics(folder / name, {"seed": [0, 1]})
         assert set(found) == set(expected)
         for column in expected:
             np.testing.assert_array_equal(found[column], expected[column])
@@ -273,6 +273,8 @@ def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypat
     (tmp_path / "full" / "file").touch()
     (tmp_path / "begun").mkdir()
     described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
+    why_no_run = "the environment is not one that gasil_jax.make_env returned"
+    described |= {"why_no_run": why_no_run, "env": "PointMass", "agent": "ppo"}
     (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(own, **{"algorithm": PPO, **changes})

@@ -94,8 +94,8 @@ def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch
     trained = [
         types.SimpleNamespace(
             runs=program.runs,
-            name=program.name,
-            tables=lambda value=value: ([metrics(value)], []),
+            path=tmp_path / str(value),
+            tables=lambda value=value: [(metrics(value), {})],
             training=training,
         )
         for program, value in zip(programs.group(plan.runs.values()), (1.0, 2.0))
