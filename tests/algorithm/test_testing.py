@@ -43,7 +43,7 @@ def test_an_example_is_what_the_first_iteration_gives():
     of = lambda x: kinds(x.replace(policy=None, value=None))
     assert of(example) == of(agent.given[-1])
     np.testing.assert_allclose(metrics["sum"], example.rollout.reward.sum(), rtol=1e-5)
-    buffer = agent.remember(begin(key).agent, example)
+    buffer = agent.remember(jax.jit(begin)(key).agent, example)
     assert buffer.size > 0 and buffer.size == state.agent.size
     np.testing.assert_allclose(buffer.observation, state.agent.observation, atol=1e-6)
     np.testing.assert_allclose(example.config.learning_rate, 1.5e-4)
