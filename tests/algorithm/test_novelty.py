@@ -23,6 +23,13 @@ def first_context():
     return jax.jit(lambda key: example_context(ENV, algorithm, key))(KEY)
 
 
+@functools.partial(jax.jit, static_argnums=0)
+def remembered(agent, context):
+    """The agent's first state with the context's episodes."""
+    sizes = gasil_jax.context.sizes_of(ENV, 4, 40)
+    return agent.remember(agent.init(KEY, sizes), context)
+
+
 def test_novelty_is_one_over_the_root_of_the_visits():
     agent = PPONovelty()
     context = first_context()
@@ -56,8 +63,7 @@ def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
             rollout=batch.replace(next_observation=places, reward=0.0 * batch.reward),
             normalizer=normalization.init(ENV.observation_size),
         )
-        state = agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40))
-        buffer = agent.remember(state, context).buffer
+        buffer = remembered(agent, context).buffer
         assert buffer.size > 0
         first = np.array(buffer.action[0])
         return int(np.where((np.array(batch.action) == first).all(-1))[1][0])
@@ -70,8 +76,7 @@ def test_ties_and_admission_of_the_buffer():
     def kept(**settings):
         agent = gasil_jax.PPOBC(buffer_steps=8, buffer_episodes=1, **settings)
         context = first_context()
-        batch, sizes = context.rollout, gasil_jax.context.sizes_of(ENV, 4, 40)
-        buffer = agent.remember(agent.init(KEY, sizes), context)
+        batch, buffer = context.rollout, remembered(agent, context)
         if buffer.size == 0:
             return None
         first = np.array(buffer.action[0])
@@ -94,8 +99,7 @@ def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
         context = context.replace(
             rollout=batch.replace(discounted_return=returns), history=history
         )
-        sizes = gasil_jax.context.sizes_of(ENV, 4, 40)
-        buffer = agent.remember(agent.init(KEY, sizes), context)
+        buffer = remembered(agent, context)
         return buffer.return_[:: int(buffer.size) // 2]
 
     np.testing.assert_allclose(kept(), [1.0, 1.0])
@@ -108,9 +112,7 @@ def test_only_better_episodes_are_admitted():
     batch = context.rollout
     returns = jnp.zeros_like(batch.discounted_return).at[:, 1].set(1.0)
     context = context.replace(rollout=batch.replace(discounted_return=returns))
-    buffer = agent.remember(
-        agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40)), context
-    )
+    buffer = remembered(agent, context)
     count = int(np.sum(np.array(batch.ended)[:, 1] & ~np.array(batch.cut_short)[:, 1]))
     assert buffer.size == 8 * count > 0
     assert (buffer.return_[: buffer.size] == 1.0).all()
