@@ -100,7 +100,7 @@ def replay(batches, max_episodes=None):
             length,
             max_episodes=max_episodes,
         )
-    return buffer, reference
+    return jax.tree.map(np.asarray, buffer), reference
 
 
 @settings(max_examples=150, deadline=None)
