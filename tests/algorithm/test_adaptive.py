@@ -68,7 +68,8 @@ def context_and_state():
     agent, key = ADAPTIVE.agent, jax.random.key(0)
     context = jax.jit(lambda key: example_context(ENV, ADAPTIVE, key))(key)
     sizes = Sizes(ADAPTIVE.config.num_envs, ENV.observation_size, ENV.action_size)
-    return context, agent.remember(agent.init(key, sizes), context)
+    first = jax.jit(lambda context: agent.remember(agent.init(key, sizes), context))
+    return context, first(context)
 
 
 @pytest.mark.parametrize("rule", adaptive.RULES)

@@ -1,5 +1,7 @@
 """The discriminator's gradient and the bonus against the paper's formulas."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -66,7 +68,8 @@ def test_an_absorbing_state_is_paid_for_ever():
     agent = gasil_jax.PPOGASIL(bonus="absorbing", buffer_steps=20)
     config = gasil_jax.Config(batch_steps=128, num_envs=4, minibatch_size=64)
     key = jax.random.key(0)
-    context = example_context(env, gasil_jax.Algorithm(agent, config=config), key)
+    algorithm = gasil_jax.Algorithm(agent, config=config)
+    context = jax.jit(lambda key: example_context(env, algorithm, key))(key)
     # All episodes of one environment terminate, and return most.
     batch = context.rollout
     first = jnp.arange(4) == 1
@@ -77,7 +80,7 @@ def test_an_absorbing_state_is_paid_for_ever():
     )
     context = context.replace(rollout=batch)
     sizes = gasil_jax.context.sizes_of(env, 4, 40)
-    state = agent.remember(agent.init(key, sizes), context)
+    state = jax.jit(lambda x: agent.remember(agent.init(key, sizes), x))(context)
     # 20 steps of episodes of 8: the third is cut.
     np.testing.assert_array_equal(state.buffer.terminated, True)
     discounted = lambda lengths: sum(0.99**x for x in lengths) + 0.5
@@ -87,12 +90,14 @@ def test_an_absorbing_state_is_paid_for_ever():
     policy = discounted(np.array(batch.episode_length)[ends]) / count
     logit = np.log(policy / good)
     after = 0.99 / (1 - 0.99) * np.log1p(np.exp(-logit))
-    bonuses = [
-        agent.replace(bonus=bonus).update_and_score(
-            state.discriminator, agent.source(state.buffer), context, key
-        )[1]
-        for bonus in ("absorbing", "softplus")
-    ]
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def score(bonus, state, context):
+        source = agent.source(state.buffer)
+        scorer = agent.replace(bonus=bonus)
+        return scorer.update_and_score(state.discriminator, source, context, key)[1]
+
+    bonuses = [score(bonus, state, context) for bonus in ("absorbing", "softplus")]
     expected = np.where(batch.terminated, after, 0.0)
     assert expected.any()
     np.testing.assert_allclose(bonuses[0] - bonuses[1], expected, rtol=1e-4, atol=1e-4)

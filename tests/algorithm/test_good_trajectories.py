@@ -100,7 +100,7 @@ def replay(batches, max_episodes=None):
             length,
             max_episodes=max_episodes,
         )
-    return buffer, reference
+    return jax.tree.map(np.asarray, buffer), reference
 
 
 @settings(max_examples=150, deadline=None)
@@ -256,19 +256,10 @@ def test_similar_episodes_share_their_return_as_by_hand(seed, distance):
                 if ended[time, env]:
                     offers[time, env] = return_[time, env], running[env]
                     running[env] = []
-        history = good_trajectories.record(
-            history,
-            jnp.array(observation),
-            jnp.zeros((*shape, 1)),
-            reward=jnp.zeros(shape),
-            ended=jnp.array(ended),
+        history, episodes = offer(
+            history, observation, ended, np.float32(return_), np.int32(length)
         )
-        episodes = good_trajectories.ended_episodes(
-            history,
-            jnp.array(ended),
-            jnp.float32(return_),
-            length=jnp.int32(length),
-        )
+        buffer = jax.tree.map(np.asarray, buffer)
         starts = [i for i in range(int(buffer.size)) if buffer.time[i] == 0]
         stops = [*starts[1:], int(buffer.size)]
         mine = [
@@ -282,12 +273,23 @@ def test_similar_episodes_share_their_return_as_by_hand(seed, distance):
         ranked_by = shared(buffer, history, episodes, scale, distance)
         for i, entry in enumerate(entries):
             np.testing.assert_allclose(ranked_by[entry], expected[i], rtol=1e-4)
-        buffer = good_trajectories.insert(
-            buffer, history, episodes, ranked_by=ranked_by
-        )
+        buffer = insert(buffer, history, episodes, ranked_by=ranked_by)
         ranked += len(entries)
     assert ranked > 6
 
+
+@jax.jit
+def offer(history, observation, ended, return_, length):
+    action = jnp.zeros((*ended.shape, 1))
+    history = good_trajectories.record(
+        history, observation, action, reward=jnp.zeros(ended.shape), ended=ended
+    )
+    return history, good_trajectories.ended_episodes(
+        history, ended, return_, length=length
+    )
+
+
+insert = jax.jit(good_trajectories.insert)
 
 shared = jax.jit(
     lambda buffer, history, episodes, scale, distance: good_trajectories.shared_returns(

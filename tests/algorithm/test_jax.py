@@ -113,12 +113,13 @@ def test_matrices_are_multiplied_in_full_precision():
     """Products are in full float32; by default a GPU uses TF32."""
     highest = jax.lax.Precision.HIGHEST
     env = gasil_jax.make_env("point_mass", max_episode_steps=2)
-    state = jax.eval_shape(lambda: gasil_jax.init(env, ALGORITHM, jax.random.key(0)))
+    init = lambda: gasil_jax.init(env, ALGORITHM, jax.random.key(0))
+    state = jax.eval_shape(init)
     jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, ALGORITHM, x))(state)
     precisions = list(products(jaxpr.jaxpr))
     assert len(precisions) > 10
     assert set(precisions) == {(highest, highest)}
-    act = policy.from_state(gasil_jax.init(env, ALGORITHM, jax.random.key(0)), env)
+    act = policy.from_state(jax.jit(init)(), env)
     precisions = list(
         products(jax.make_jaxpr(act)(jnp.zeros(env.observation_size)).jaxpr)
     )

@@ -123,7 +123,8 @@ def test_an_untrained_policy_has_the_initial_deviation_and_components_apart(comp
     algorithm = gasil_jax.algorithm(
         "ppo", policy_components=components, initial_deviation=0.25
     )
-    state = gasil_jax.init(env, algorithm, jax.random.key(0))
+    init = lambda key: gasil_jax.init(env, algorithm, key)
+    state = jax.jit(init)(jax.random.key(0))
     network = MixturePolicy((64, 64), 2, components=components)
     observation = jax.random.normal(jax.random.key(1), (9, env.observation_size))
     parameters = network.apply(state.actor_critic.policy.params, observation)

@@ -63,7 +63,7 @@ def test_networks_of_ones_own_are_trained_and_act():
     algorithm = gasil_jax.Algorithm(Own()).replace(buffer_steps=64, **SMALL)
     train = gasil_jax.make_train(env, algorithm)
     keys = jax.random.split(jax.random.key(0), 2)  # of two runs
-    before = gasil_jax.init(env, algorithm, keys[0])
+    before = jax.jit(lambda key: gasil_jax.init(env, algorithm, key))(keys[0])
     states, metrics = jax.jit(jax.vmap(train))(keys)
     assert np.isfinite(metrics["value_loss"]).all()
     state = gasil_jax.member(states, 0)

@@ -1,5 +1,7 @@
 """PPO+NOVELTY and PPO+BC+NOVELTY: visits, bonus, and which ties the buffer keeps."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,13 +16,23 @@ CONFIG = gasil_jax.Config(batch_steps=128, num_envs=4, minibatch_size=64)
 KEY = jax.random.key(0)
 
 
-def context_of(agent):
-    return example_context(ENV, gasil_jax.Algorithm(agent, config=CONFIG), KEY)
+@functools.cache
+def first_context():
+    """Of an agent with a buffer; the others here are given the same."""
+    algorithm = gasil_jax.Algorithm(gasil_jax.PPOBC(), config=CONFIG)
+    return jax.jit(lambda key: example_context(ENV, algorithm, key))(KEY)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def remembered(agent, context):
+    """The agent's first state with the context's episodes."""
+    sizes = gasil_jax.context.sizes_of(ENV, 4, 40)
+    return agent.remember(agent.init(KEY, sizes), context)
 
 
 def test_novelty_is_one_over_the_root_of_the_visits():
     agent = PPONovelty()
-    context = context_of(agent)
+    context = first_context()
     # Two places, far apart: one step in one of them, all others in the other.
     places = jnp.zeros_like(context.rollout.next_observation).at[0, 0].set(1e3)
     context = context.replace(
@@ -43,7 +55,7 @@ def test_novelty_is_one_over_the_root_of_the_visits():
 def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
     def kept(**settings):
         agent = PPOBCNovelty(buffer_steps=8, buffer_episodes=1, **settings)
-        context = context_of(agent)
+        context = first_context()
         batch = context.rollout
         # Environment 2 is alone where it is; the history has its observations too.
         places = jnp.zeros_like(batch.next_observation).at[:, 2].set(1e3)
@@ -51,8 +63,7 @@ def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
             rollout=batch.replace(next_observation=places, reward=0.0 * batch.reward),
             normalizer=normalization.init(ENV.observation_size),
         )
-        state = agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40))
-        buffer = agent.remember(state, context).buffer
+        buffer = remembered(agent, context).buffer
         assert buffer.size > 0
         first = np.array(buffer.action[0])
         return int(np.where((np.array(batch.action) == first).all(-1))[1][0])
@@ -64,9 +75,8 @@ def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
 def test_ties_and_admission_of_the_buffer():
     def kept(**settings):
         agent = gasil_jax.PPOBC(buffer_steps=8, buffer_episodes=1, **settings)
-        context = context_of(agent)
-        batch, sizes = context.rollout, gasil_jax.context.sizes_of(ENV, 4, 40)
-        buffer = agent.remember(agent.init(KEY, sizes), context)
+        context = first_context()
+        batch, buffer = context.rollout, remembered(agent, context)
         if buffer.size == 0:
             return None
         first = np.array(buffer.action[0])
@@ -80,7 +90,7 @@ def test_ties_and_admission_of_the_buffer():
 def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
     def kept(**settings):
         agent = gasil_jax.PPOBC(buffer_steps=16, **settings)
-        context = context_of(agent)
+        context = first_context()
         batch, history = context.rollout, context.history
         # Episodes of environment 1 are the best, and like no other's.
         returns = jnp.zeros_like(batch.discounted_return)
@@ -89,8 +99,7 @@ def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
         context = context.replace(
             rollout=batch.replace(discounted_return=returns), history=history
         )
-        sizes = gasil_jax.context.sizes_of(ENV, 4, 40)
-        buffer = agent.remember(agent.init(KEY, sizes), context)
+        buffer = remembered(agent, context)
         return buffer.return_[:: int(buffer.size) // 2]
 
     np.testing.assert_allclose(kept(), [1.0, 1.0])
@@ -99,13 +108,11 @@ def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
 
 def test_only_better_episodes_are_admitted():
     agent = gasil_jax.PPOBC(admission="better")
-    context = context_of(agent)
+    context = first_context()
     batch = context.rollout
     returns = jnp.zeros_like(batch.discounted_return).at[:, 1].set(1.0)
     context = context.replace(rollout=batch.replace(discounted_return=returns))
-    buffer = agent.remember(
-        agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4, 40)), context
-    )
+    buffer = remembered(agent, context)
     count = int(np.sum(np.array(batch.ended)[:, 1] & ~np.array(batch.cut_short)[:, 1]))
     assert buffer.size == 8 * count > 0
     assert (buffer.return_[: buffer.size] == 1.0).all()

@@ -27,6 +27,14 @@ MODEL = gasil_jax.Decompose(
 )
 
 
+_windows = jax.jit(decomposition.windows)
+
+
+def windows_of(*arguments):
+    """The windows of a history, in NumPy."""
+    return jax.tree.map(np.asarray, _windows(*arguments))
+
+
 def random_batches(seed, num_batches, delay=5):
     """Batches of episodes whose true reward is a function of the step.
 
@@ -135,21 +143,21 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
         keep_next=True,
         num_episodes=num_episodes,
     )
-    most = 0
+    record, most = jax.jit(good_trajectories.record), 0
     for batch in range(30):
-        step = batch * NUM_STEPS + jnp.arange(NUM_STEPS)[:, None]
+        step = batch * NUM_STEPS + np.arange(NUM_STEPS)[:, None]
         ended = (step + 1) % LIMIT == 0
-        zeros = jnp.zeros((NUM_STEPS, 1, OBS))
-        history = good_trajectories.record(
+        zeros = np.zeros((NUM_STEPS, 1, OBS), np.float32)
+        history = record(
             history,
             zeros,
             zeros[..., :ACT],
-            reward=ended * 1.0,
+            reward=np.float32(ended),
             ended=ended,
             next_observation=zeros,
         )
-        recorded = jnp.int32((batch + 1) * NUM_STEPS)
-        windows = decomposition.windows(history, recorded)
+        recorded = np.int32((batch + 1) * NUM_STEPS)
+        windows = windows_of(history, recorded)
         most = max(most, int(windows.ends.sum()))
         assert (windows.length[windows.ends] == LIMIT).all()
     assert most == complete
@@ -200,7 +208,7 @@ def test_windows_of_the_history_are_those_of_a_plain_loop():
                         position = ring - len(steps) + t
                         expected[env, position] = (payout[env], t + 1 - begin)
                     begin = t + 1
-        result = decomposition.windows(history, state.recorded_steps)
+        result = windows_of(history, state.recorded_steps)
         ends = np.nonzero(np.asarray(result.ends))
         assert set(zip(*ends, strict=True)) == set(expected)
         for place, (payout, length) in expected.items():
@@ -234,7 +242,7 @@ def test_in_the_history_every_window_has_what_it_paid():
     """Also one that began in an earlier batch, for a replay of whole episodes."""
     begin_before = 0
     for state, history, _, _ in decompose_all(random_batches(1, 9)):
-        complete = decomposition.windows(history, state.recorded_steps)
+        complete = windows_of(history, state.recorded_steps)
         reward = np.asarray(history.in_time(state.reward))
         for env, end in zip(*np.nonzero(np.asarray(complete.ends)), strict=True):
             begin = end + 1 - int(complete.length[env, end])
@@ -263,8 +271,8 @@ def test_a_failed_update_leaves_the_network_and_nothing_else():
         np.testing.assert_array_equal(left.open_steps, right.open_steps)
         np.testing.assert_array_equal(left.rates.mean, right.rates.mean)
         for mine, other in zip(
-            decomposition.windows(history, left.recorded_steps),
-            decomposition.windows(history, right.recorded_steps),
+            windows_of(history, left.recorded_steps),
+            windows_of(history, right.recorded_steps),
             strict=True,
         ):
             np.testing.assert_array_equal(mine, other)

@@ -138,7 +138,8 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
             rows.append(metrics)
         return state, jax.tree.map(lambda *x: np.stack(x), *rows)
 
-    first = gasil_jax.init(env, algorithm, jax.random.key(0))
+    init = lambda algorithm: gasil_jax.init(env, algorithm, jax.random.key(0))
+    first = jax.jit(init, static_argnums=0)(algorithm)
     state, metrics = train(first)
     assert np.nansum(metrics["episodes"]) > 0
     ended = np.asarray(metrics["episodes"]) > 0
@@ -156,7 +157,7 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
         assert counts[0] == np.nansum(metrics["episodes"])
     # All began together: more whole episodes, none cut.
     together = algorithm.replace(stagger_episodes=False)
-    ages = gasil_jax.init(env, together, jax.random.key(0)).environments.starting_age
+    ages = jax.jit(lambda: init(together).environments.starting_age)()
     assert not ages.any() and first.environments.starting_age.any()
     environments = first.environments.replace(starting_age=ages)
     _, metrics = train(first.replace(environments=environments))

@@ -34,16 +34,20 @@ def test_an_example_is_what_the_first_iteration_gives():
         learning_rate_schedule=((0.0, 0.5), (1.0, 1.0)),
     )
     example = jax.jit(lambda key: example_context(env, algorithm, key))(key)
-    begin = lambda key: gasil_jax.init(env, algorithm, key)
-    first = jax.jit(lambda key: gasil_jax.iterate(env, algorithm, begin(key)))
-    state, metrics = first(key)
+
+    @jax.jit
+    def first(key):
+        state = gasil_jax.init(env, algorithm, key)
+        return state.agent, *gasil_jax.iterate(env, algorithm, state)
+
+    before, state, metrics = first(key)
     kinds = lambda tree: jax.tree.map(
         lambda x: (jnp.shape(x), jnp.result_type(x)), tree
     )
     of = lambda x: kinds(x.replace(policy=None, value=None))
     assert of(example) == of(agent.given[-1])
     np.testing.assert_allclose(metrics["sum"], example.rollout.reward.sum(), rtol=1e-5)
-    buffer = agent.remember(begin(key).agent, example)
+    buffer = jax.jit(agent.remember)(before, example)
     assert buffer.size > 0 and buffer.size == state.agent.size
     np.testing.assert_allclose(buffer.observation, state.agent.observation, atol=1e-6)
     np.testing.assert_allclose(example.config.learning_rate, 1.5e-4)

@@ -1,6 +1,7 @@
 """Saving, loading and scoring a run's policies."""
 
 import csv
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -57,15 +58,19 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
 
 def test_stochastic_scores_vary_more(trained_point_mass):
     env, algorithm, states = trained_point_mass
-    score = lambda deterministic: evaluation.evaluate(
-        env,
-        algorithm,
-        gasil_jax.member(states, 0),
-        key=jax.random.key(0),
-        num_episodes=50,
-        deterministic=deterministic,
-    )["episode_return"]
-    assert float(jnp.std(score(False))) > float(jnp.std(score(True)))
+
+    @functools.partial(jax.jit, static_argnums=1)
+    def score(states, deterministic):
+        return evaluation.evaluate(
+            env,
+            algorithm,
+            gasil_jax.member(states, 0),
+            key=jax.random.key(0),
+            num_episodes=50,
+            deterministic=deterministic,
+        )["episode_return"]
+
+    assert np.std(score(states, False)) > np.std(score(states, True))
 
 
 def test_one_seed_scores_as_with_all_and_every_episode_is_written(tmp_path, capsys):
@@ -131,11 +136,10 @@ def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
             info = {**stepped.info, "time": time, "truncation": cut_off}
             return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
 
-    scores = evaluation.evaluate(
-        CutOff(env),
-        algorithm,
-        gasil_jax.member(states, 0),
-        key=jax.random.key(0),
-        num_episodes=3,
-    )
+    key, state = jax.random.key(0), gasil_jax.member(states, 0)
+    scores = jax.jit(
+        lambda s: evaluation.evaluate(
+            CutOff(env), algorithm, s, key=key, num_episodes=3
+        )
+    )(state)
     assert scores["episode_length"].tolist() == [7, 7, 7]

@@ -399,7 +399,8 @@ def test_an_algorithm_has_the_numbers_of_its_agent(my_agents):
 def test_numbers_that_are_not_given_have_their_defaults(my_agents):
     config = gasil_jax.Config(batch_steps=64, num_envs=4, hidden_sizes=(4,))
     algorithm = gasil_jax.Algorithm(my_agents.Own(), config=config)
-    env, key = gasil_jax.make_env("point_mass"), jax.random.key(0)
-    state = gasil_jax.init(env, algorithm, key, {"gamma": 0.9})
+    env, given = gasil_jax.make_env("point_mass"), {"gamma": 0.9}
+    init = jax.jit(lambda key: gasil_jax.init(env, algorithm, key, given))
+    state = init(jax.random.key(0))
     np.testing.assert_allclose(state.hyperparameters["my_weight"], 0.5)
     np.testing.assert_allclose(state.hyperparameters["gamma"], 0.9)
