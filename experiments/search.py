@@ -330,7 +330,7 @@ SPARSE = tuple(
 #: Sparse tasks that are trained longer, for `STEPS`: robots, and a grid of navix. No
 #: search trains on them. (In navix 0.7.4 no action reaches the ball of KeyCorridor.)
 SPARSE_ROBOTS = ("sparse:hopper", "sparse:halfcheetah")
-SPARSE_GRIDS = ("navix:Navix-DoorKey-6x6-v0",)
+SPARSE_GRIDS = ("navix:Navix-DoorKey-8x8-v0",)
 _ENTROPIES: Space = {"entropy_coefficient": (0.0, 0.01, 0.03)}
 #: Those that the searches train on; the others have no part in any choice.
 SPARSE_SEARCHED = tuple(SPARSE[i] for i in (0, 2, 4, 6, 7))

@@ -390,7 +390,7 @@ def _enlarged(
 #: How far each robot must go, in metres.
 ROBOTS: Mapping[str, float] = {
     "hopper": 1.0,
-    "halfcheetah": 5.0,
+    "halfcheetah": 12.0,
     "walker2d": 1.0,
     "swimmer": 3.0,
     "ant": 3.0,
