@@ -168,8 +168,7 @@ def shard_of(call):
     assert call[:2] == ["-m", "gasil_jax.sweep"]
     arguments = call[2:]
     options = run_options.parse(sweep.Options, arguments, "gasil_jax.sweep")
-    shard = shards.parse(options.shard)
-    return shard.number, shard.count, str(options.out), options.resume
+    return *shards.parse(options.shard), str(options.out), options.resume
 
 
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):

@@ -37,13 +37,16 @@ SMALL = (
 OFTEN = ("--checkpoint-every", str(20 * 128))
 
 
-def start(out, *arguments, cache):
-    """Start a run that keeps compiled programs in a folder of the user's cache."""
-    tests = ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL")
-    mine = {name: value for name, value in os.environ.items() if name not in tests}
+def start(out, *arguments, cache=None):
+    """Start a run, which may have a user's own cache of compiled programs."""
+    mine = dict(os.environ)
+    if cache is not None:
+        for tests_own in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
+            mine.pop(tests_own)
+        mine["XDG_CACHE_HOME"] = str(cache)
     return subprocess.Popen(
         [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
-        env=mine | {"XDG_CACHE_HOME": str(cache)},
+        env=mine,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
