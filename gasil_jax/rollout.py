@@ -135,6 +135,44 @@ def init(
     )
 
 
+def _restart_all(env: Any, states: Any, ended: jax.Array, *, keys: jax.Array) -> Any:
+    """Return the states (env, ...), in place of those that ended new ones."""
+
+    def select(new: jax.Array, old: jax.Array) -> jax.Array:
+        is_new = ended.reshape((-1,) + (1,) * (old.ndim - 1))
+        return _cast(jnp.where(is_new, new, old), old.dtype)
+
+    return jax.tree.map(select, jax.vmap(env.reset)(keys), states)
+
+
+def _restart_few(env: Any, states: Any, ended: jax.Array, *, keys: jax.Array) -> Any:
+    """Do what `_restart_all` does, but reset an eighth of the environments at a time.
+
+    Few episodes end in a step. Where a reset takes as long as a step, to reset all
+    environments would take a third of the time; where it is fast, this is slower.
+    """
+    num_envs = ended.shape[0]
+    at_once = -(-num_envs // 8)
+    # Behind those that ended come rows that are out of bounds, and are not written.
+    (rows,) = jnp.nonzero(ended, size=num_envs + at_once, fill_value=num_envs)
+
+    def restart(carry: tuple[jax.Array, Any]) -> tuple[jax.Array, Any]:
+        done, states = carry
+        now = jax.lax.dynamic_slice_in_dim(rows, done, at_once)
+        fresh = jax.vmap(env.reset)(keys.at[now].get(mode="clip"))
+        states = jax.tree.map(
+            lambda old, new: old.at[now].set(_cast(new, old.dtype), mode="drop"),
+            states,
+            fresh,
+        )
+        return done + at_once, states
+
+    def some_are_left(carry: tuple[jax.Array, Any]) -> jax.Array:
+        return carry[0] < jnp.sum(ended)
+
+    return jax.lax.while_loop(some_are_left, restart, (jnp.int32(0), states))[1]
+
+
 def collect(
     env: Any,
     policy: Callable[[jax.Array], Any],
@@ -170,11 +208,11 @@ def collect(
     num_envs = environments.episode_length.shape[0]
     low, high = wrappers.action_range(env)
 
+    restart = _restart_few if wrappers.resets_slowly(env) else _restart_all
+
     @jax.named_scope("environment")
-    def step_one(state: Any, action: jax.Array, reset_key: jax.Array) -> Any:
-        stepped = env.step(state, distribution.executed(action, low, high))
-        with jax.named_scope("reset"):
-            return stepped, env.reset(reset_key)
+    def step_one(state: Any, action: jax.Array) -> Any:
+        return env.step(state, distribution.executed(action, low, high))
 
     def step(carry: EnvironmentStates, key: jax.Array) -> Any:
         action_key, reset_key = jax.random.split(key)
@@ -185,7 +223,7 @@ def collect(
             parameters = policy(observation)
         action = distribution.sample(action_key, parameters)
         reset_keys = jax.random.split(reset_key, num_envs)
-        stepped, fresh = jax.vmap(step_one)(carry.state, action, reset_keys)
+        stepped = jax.vmap(step_one)(carry.state, action)
 
         true_reward = stepped.info.get("true_reward", stepped.reward)
         held = stepped.info.get("held_reward", jnp.zeros_like(stepped.reward))
@@ -223,13 +261,10 @@ def collect(
             cut_short=cut_short,
         )
 
-        def select(a: jax.Array, b: jax.Array) -> jax.Array:
-            return jnp.where(ended.reshape((-1,) + (1,) * (b.ndim - 1)), a, b)
-
+        with jax.named_scope("environment"), jax.named_scope("reset"):
+            state = restart(env, stepped, ended, keys=reset_keys)
         carry = EnvironmentStates(
-            state=jax.tree.map(
-                lambda a, b: _cast(select(a, b), b.dtype), fresh, stepped
-            ),
+            state=state,
             episode_return=jnp.where(ended, 0.0, episode_return),
             discounted_return=jnp.where(ended, 0.0, discounted_return),
             undiscounted_return=jnp.where(ended, 0.0, undiscounted_return),

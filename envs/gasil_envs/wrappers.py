@@ -10,7 +10,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs import Env, State, Wrapper
+from brax.envs import Env, PipelineEnv, State, Wrapper
 
 #: C MuJoCo's mjMAXVAL: a larger number means that the simulation has failed.
 _LARGEST = 1e10
@@ -68,6 +68,11 @@ def action_size(env: Any) -> int:
 def zero_action(env: Any) -> jax.Array:
     """Return the action that is all 0, as the environment's step gets it."""
     return jnp.int32(0) if is_discrete(env) else jnp.zeros(env.action_size)
+
+
+def resets_slowly(env: Any) -> bool:
+    """Return whether a reset takes about as long as a step: with Brax's own physics."""
+    return isinstance(getattr(env, "unwrapped", env), PipelineEnv)
 
 
 def _refuse_taken(state: State, *names: str) -> None:

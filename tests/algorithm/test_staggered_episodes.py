@@ -100,6 +100,27 @@ def test_a_first_episode_is_cut_at_the_limit_and_bootstrapped():
     assert len(set(ages.tolist())) > 5
 
 
+@pytest.mark.parametrize("num_envs", [1, 20])
+def test_a_few_resets_at_a_time_are_those_of_all_at_once(num_envs, monkeypatch):
+    class Drawn(Clock):
+        def reset(self, rng):
+            begin = jax.random.randint(rng, (1,), 0, 1000).astype(jnp.float32)
+            return super().reset(rng).replace(obs=begin)
+
+    env = wrappers.EpisodeLimit(Drawn(), LIMIT)
+    batches = []
+    for slowly in (False, True):
+        monkeypatch.setattr(wrappers, "resets_slowly", lambda env, slowly=slowly: slowly)
+        batches.append(collect(env, num_envs, num_steps=4 * LIMIT)[1])
+    batch, few = batches
+    # In some steps more end than are reset at a time.
+    assert batch.ended.sum(axis=1).max() > num_envs / 8
+    begins = batch.observation[1:][batch.ended[:-1]]
+    assert len(np.unique(begins)) > num_envs
+    for name in ("observation", "next_observation", "ended", "episode_length"):
+        np.testing.assert_array_equal(getattr(batch, name), getattr(few, name))
+
+
 def test_an_episode_that_ends_by_itself_before_it_is_cut_is_whole():
     ages, batch = collect(make(last=4), num_envs=32, num_steps=4)
     early = np.asarray(batch.completed[-1])
