@@ -5,6 +5,7 @@ import hashlib
 import os
 import pathlib
 import platform
+import warnings
 from typing import Any
 
 import jax
@@ -64,3 +65,6 @@ def _keep_compiled_programs() -> None:
         folder = pathlib.Path(home, "gasil_jax", f"jaxlib-{jaxlib.__version__}-{key}")
         folder.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(folder))
+        # On some processors no program can be loaded (jax issue 38445), and JAX says so
+        # for each. It is compiled again.
+        warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
