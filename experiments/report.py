@@ -595,7 +595,7 @@ class Page:
         What stands in brackets in a curve's name is for the text around it to say.
 
         Args:
-          kind: "noisy" for the tasks with noise; empty for those without.
+          kind: the kind of tasks, see `_sparse`.
           *names: the curves.
         """
         mean = self.mean_shares(kind)

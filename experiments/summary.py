@@ -277,9 +277,9 @@ class Summary:
             f"{', '.join(self.SLOTS)}, or a figure and its slot"
         )
 
-    def text(self, page: str) -> str:
-        """Return a page of `SUMMARIES` as Markdown."""
-        return report.fill((report.NOTES / f"{page}.md").read_text(), self.value)
+    def text(self, note: str) -> str:
+        """Return a note, such as a page of `SUMMARIES`, with its slots filled in."""
+        return report.fill((report.NOTES / f"{note}.md").read_text(), self.value)
 
     def tuned(self) -> str:
         """Return the tuned presets as JSON, updated by what complete searches chose."""

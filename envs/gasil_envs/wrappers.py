@@ -82,7 +82,7 @@ def _refuse_taken(state: State, *names: str) -> None:
             raise ValueError(f"info[{name!r}] is used by a wrapper: rename yours")
 
 
-class ActionNoise:
+class ActionNoise(Wrapper):
     """Add noise to the actions of an environment.
 
     A vector gets Gaussian noise of the deviation `scale` in units of half its range; a
@@ -90,33 +90,29 @@ class ActionNoise:
     """
 
     def __init__(self, env: Any, scale: float):
-        self._env, self._scale = env, scale
-
-    def __getattr__(self, name: str) -> Any:
-        if name == "_env":
-            raise AttributeError(name)
-        return getattr(self._env, name)
+        super().__init__(env)
+        self._scale = scale
 
     def reset(self, rng: jax.Array) -> State:
         """Start an episode; `rng` also draws the noise of its steps."""
         env_key, key = jax.random.split(rng)
-        state = self._env.reset(env_key)
+        state = self.env.reset(env_key)
         _refuse_taken(state, "action_noise_key")
         return state.replace(info={**state.info, "action_noise_key": key})
 
     def step(self, state: State, action: jax.Array) -> State:
         """Take a step with another action."""
         key, first, second = jax.random.split(state.info["action_noise_key"], 3)
-        if is_discrete(self._env):
-            other = jax.random.randint(first, (), 0, self._env.num_actions)
+        if is_discrete(self.env):
+            other = jax.random.randint(first, (), 0, self.env.num_actions)
             is_other = jax.random.bernoulli(second, self._scale)
             action = jnp.where(is_other, other, action)
         else:
-            low, high = action_range(self._env)
+            low, high = action_range(self.env)
             noise = jax.random.normal(first, action.shape)
             action = action + self._scale * 0.5 * (high - low) * noise
         info = {**state.info, "action_noise_key": key}
-        return self._env.step(state.replace(info=info), action)
+        return self.env.step(state.replace(info=info), action)
 
 
 class EpisodeLimit(Wrapper):

@@ -105,17 +105,17 @@ def label_ends(
     """
     low, high = axes.get_ylim()
     gap = 0.06  # Of the height of the axes, for this font size.
-    places = [(y - low) / (high - low) for y in ends.values()]
-    for i in range(1, len(places)):
-        places[i] = min(places[i], places[i - 1] - gap)
+    heights = [(y - low) / (high - low) for y in ends.values()]
+    for i in range(1, len(heights)):
+        heights[i] = min(heights[i], heights[i - 1] - gap)
     # What was moved below the axes is moved up again, and pushes the others.
     floor = 0.0
-    for i in reversed(range(len(places))):
-        places[i] = max(places[i], floor)
-        floor = places[i] + gap
-    for name, place in zip(ends, places, strict=True):
-        where = {"xycoords": "axes fraction", "va": "center", "fontsize": 7}
-        axes.annotate(name, (1.02, place), color=color_of[name], **where)
+    for i in reversed(range(len(heights))):
+        heights[i] = max(heights[i], floor)
+        floor = heights[i] + gap
+    for name, height in zip(ends, heights, strict=True):
+        style = {"xycoords": "axes fraction", "va": "center", "fontsize": 7}
+        axes.annotate(name, (1.02, height), color=color_of[name], **style)
 
 
 def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:

@@ -85,8 +85,8 @@ def _by_seed_and_over_seeds(
     fields: dict[str, Any] = {}
     for name, values in quantities.items():
         finite = values[np.isfinite(values)]
-        known = [x if np.isfinite(x) else None for x in values.tolist()]
-        fields[name] = dict(zip(map(str, seeds), known, strict=True))
+        jsonable = [x if np.isfinite(x) else None for x in values.tolist()]
+        fields[name] = dict(zip(map(str, seeds), jsonable, strict=True))
         fields[f"{name}_mean"] = float(finite.mean()) if finite.size else None
         estimate = statistics.estimate(values)
         fields[f"{name}_interquartile_mean"] = estimate.interquartile_mean
