@@ -367,17 +367,27 @@ _NOISY_ROBOTS = [f"{env}_noisy" for env in SPARSE_ROBOTS]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
+#: It differs from `ppo+novelty` in cloning alone.
+_CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty")
 
 
 def _sparse_panels(
     tasks: Sequence[str], shared: Sequence[str], total_steps: int
 ) -> list[Panels]:
-    """Return all agents on tasks, and on some of them those with PPO's values too."""
+    """Return all agents on tasks, also with the values that others' searches chose.
+
+    Args:
+      tasks: the tasks.
+      shared: those on which agents have PPO's values too.
+      total_steps: environment steps of each run.
+    """
+    with_noveltys = functools.partial(SparseShared, chooser="ppo+novelty")
     return [
         grid(own, arms, base=base, seeds=20, total_steps=total_steps)
         for own, arms, base in (
             (tasks, [*SPARSE_SPACES], SparseSearch),
             (shared, _SPARSE_SHARED, SparseShared),
+            (tasks, [_CLONING_NOVELTY], with_noveltys),
         )
     ]
 

@@ -86,10 +86,14 @@ _SHARES = """## How to read this
   the mean return of the episodes that end in an iteration, with the acting policy.
 - **In brackets** are the thousands of steps until the mean return is that high, the
   median over the seeds that solve the task.
+- **Sooner:** the probability that a random seed of the first curve solves its task in
+  fewer steps than a random seed of the second, where equal ones count half and a seed
+  that does not solve it comes last, averaged over tasks. Its verdict is that of a
+  permutation of seeds within each task.
 - **Better, worse:** on a task by Fisher's exact test, and on the mean over tasks by a
   permutation of seeds within each task, both corrected by Holm's method, the tasks and
-  the means each as one family. Intervals are the bootstrap's over seeds, without
-  correction.
+  the means each as one family. The change that noise makes is judged by the bootstrap
+  alone. Intervals are the bootstrap's over seeds, without correction.
 - **Not clear:** neither; it does not mean that two are equal."""
 
 
@@ -204,7 +208,7 @@ class Page:
     SLOTS = (
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "grids", "searches", "importance", "ranks", "published"),
-        *("passing", "shares", "lead", "means", "better", "chosen"),
+        *("passing", "shares", "lead", "sooner", "noise", "means", "better", "chosen"),
     )
 
     def __init__(
@@ -508,21 +512,25 @@ class Page:
         head = [panel, f"seeds above {threshold}", "interquartile mean"]
         return markdown_table(head, rows)
 
-    def _solved(self) -> shares.Solved:
-        """Return which seeds solve their task, of the curves that are complete."""
+    def _steps(self) -> shares.Steps:
+        """Return the steps until seeds solve their tasks, of complete curves."""
         from_ = self.figure.solved_from
         if from_ is None:
             raise self._no_slot("shares")
         return {
             key: np.array(
                 [
-                    shares.is_solved(record, from_(results.curve.env))
+                    shares.steps_until_solved(record, from_(results.curve.env))
                     for record in results.records.values()
                 ]
             )
             for key, results in self.results.items()
             if results.complete
         }
+
+    def _solved(self) -> shares.Solved:
+        """Return which seeds solve their task, of the curves that are complete."""
+        return {key: np.isfinite(steps) for key, steps in self._steps().items()}
 
     def _sparse(self, kind: str) -> list[str]:
         """Return the panels of a kind of tasks.
@@ -539,6 +547,27 @@ class Page:
             == ("long" in kind)
         ]
 
+    def _compared_on(
+        self, solved: shares.Solved, ours: str, kind: str
+    ) -> dict[tuple[str, str], list[str]]:
+        """Return the panels on which two curves are compared, by these curves.
+
+        Args:
+          solved: the curves that are complete.
+          ours: the curve that is compared with each other one; empty for the figure's
+            own comparisons.
+          kind: the kind of tasks, see `_sparse`.
+        """
+        panels = self._sparse(kind)
+        pairs = [key for key in self.figure.compared() if key[0] in panels]
+        if ours:
+            pairs = [(p, ours, x) for p in panels for x in self.figure.panels[p]]
+        having: dict[tuple[str, str], list[str]] = {}
+        for panel, first, second in pairs:
+            if {(panel, first), (panel, second)} <= solved.keys() and first != second:
+                having.setdefault((first, second), []).append(panel)
+        return having
+
     def shares(self, kind: str = "") -> str:
         """Return the share of seeds that solve each task: a column for each curve.
 
@@ -547,28 +576,21 @@ class Page:
         Args:
           kind: the kind of tasks, see `_sparse`.
         """
-        solved, from_ = self._solved(), self.figure.solved_from
-        panels = self._sparse(kind)
+        steps, panels = self._steps(), self._sparse(kind)
         names = self.figure.names(panels)
         rows = []
         for panel in panels:
-            if not any((panel, name) in solved for name in names):
+            if not any((panel, name) in steps for name in names):
                 continue
             cells = [panel.removeprefix("sparse:")]
             for name in names:
-                cell = ""
-                if (panel, name) in solved and from_ is not None:
-                    results = self.results[panel, name]
-                    steps = [
-                        shares.steps_until(record, from_(results.curve.env))
-                        for record, is_solved in zip(
-                            results.records.values(), solved[panel, name]
-                        )
-                        if is_solved
-                    ]
-                    cell = f"{solved[panel, name].mean():.2f}"
-                    cell += f" ({np.median(steps) / 1000:.0f})" if steps else ""
-                cells.append(cell)
+                until = steps.get((panel, name))
+                if until is None:
+                    cells.append("")
+                    continue
+                solved = np.isfinite(until)
+                median = f" ({np.median(until[solved]) / 1000:.0f})"
+                cells.append(f"{solved.mean():.2f}{median if solved.any() else ''}")
             rows.append(cells)
         mean = self.mean_shares(kind)
         means = ["mean", *(f"{mean[x]:.2f}" if x in mean else "" for x in names)]
@@ -613,14 +635,8 @@ class Page:
           kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
-        solved, panels = self._solved(), self._sparse(kind)
-        pairs = [key for key in self.figure.compared() if key[0] in panels]
-        if ours:
-            pairs = [(p, ours, x) for p in panels for x in self.figure.panels[p]]
-        having: dict[tuple[str, str], list[str]] = {}
-        for panel, first, second in pairs:
-            if {(panel, first), (panel, second)} <= solved.keys() and first != second:
-                having.setdefault((first, second), []).append(panel)
+        solved = self._solved()
+        having = self._compared_on(solved, ours, kind)
         one = shares.compare(solved, [(p, *x) for x, ps in having.items() for p in ps])
         mean = {
             x: shares.overall(solved, ps, x[0], other=x[1]) for x, ps in having.items()
@@ -637,6 +653,67 @@ class Page:
                     f"[{low:+.2f}, {high:+.2f}], {verdict}; {counted(verdicts)} of "
                     f"{len(on)} tasks."
                 )
+        return "\n".join(lines)
+
+    def sooner(self, ours: str = "", kind: str = "", *others: str) -> str:
+        """Return whether a curve's seeds solve their tasks sooner than other curves'.
+
+        The verdicts are one family.
+
+        Args:
+          ours: the curve, as for `lead`.
+          kind: the kind of tasks, see `_sparse`.
+          *others: the curves to list the comparisons with; default all.
+        """
+        steps = self._steps()
+        having = self._compared_on(steps, ours, kind)
+        every = {
+            x: shares.sooner(steps, on, x[0], other=x[1]) for x, on in having.items()
+        }
+        p_values = corrected({x: p for x, (_, p) in every.items()})
+        sooner = {key: -until for key, until in steps.items()}
+        lines = []
+        for (first, second), on in having.items():
+            if second in (others or [second]):
+                middle = every[first, second][0]
+                probability = improvement(sooner, on, first, other=second)
+                verdict = shares.Difference(middle, p_values[first, second]).verdict
+                lines.append(
+                    f"- {first} sooner than {second}: with probability {probability}, "
+                    f"{verdict}, on {len(on)} tasks."
+                )
+        return "\n".join(lines)
+
+    def noise(self, ours: str, *others: str) -> str:
+        """Return how noise changes the lead of other curves over one.
+
+        The tasks are those that have a version with noise. The verdicts are one family.
+
+        Args:
+          ours: the curve.
+          *others: the curves whose leads are listed.
+        """
+        solved = self._solved()
+        changes = {}
+        for other in others:
+            on = [
+                panel
+                for panel in self._sparse("")
+                if {(p, x) for p in (panel, f"{panel}_noisy") for x in (ours, other)}
+                <= solved.keys()
+            ]
+            if on:
+                noisy = [f"{panel}_noisy" for panel in on]
+                change = shares.change(solved, on, noisy, pair=(other, ours))
+                changes[other] = len(on), *change
+        p_values = corrected({x: p for x, (*_, p) in changes.items()})
+        lines = []
+        for other, (count, middle, (low, high), _) in changes.items():
+            verdict = shares.Difference(middle, p_values[other]).verdict
+            lines.append(
+                f"- {other}'s lead over {ours}: {middle:+.2f} [{low:+.2f}, "
+                f"{high:+.2f}] with noise, {verdict}, on {count} tasks."
+            )
         return "\n".join(lines)
 
     def chosen(self) -> str:

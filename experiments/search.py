@@ -413,15 +413,20 @@ class SparseSearch(Search):
 
 @dataclasses.dataclass(frozen=True)
 class SparseShared(SparseSearch):
-    """The search of an agent for one setting, with PPO's learning rate and entropy.
+    """The search of an agent for one setting, with what another agent's search chose.
 
     PPO's search tries learning rates, in place of a coefficient of imitation.
+
+    Attributes:
+      chooser: the agent whose values are used, also where the own search chose others.
     """
 
+    chooser: str = "ppo"
+
     def chosen(self, store: Store) -> Point | None:
-        """Return the chosen point with PPO's values, or None if runs lack."""
+        """Return the chosen point with the chooser's values, or None if runs lack."""
         own = super().chosen(store)
-        shared = SparseSearch(self.env, "ppo").chosen(store)
+        shared = SparseSearch(self.env, self.chooser).chosen(store)
         return None if own is None or shared is None else {**own, **shared}
 
 

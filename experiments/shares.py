@@ -1,4 +1,4 @@
-"""Shares of seeds that solve a task, and their comparisons.
+"""Shares of seeds that solve a task, steps until then, and their comparisons.
 
 Where a task is either solved or not, this says more than a mean return. Verdicts are
 corrected by Holm's method for the number of comparisons in their family.
@@ -17,18 +17,20 @@ from experiments.store import Record
 
 #: Which seeds solve a panel's task, bool (seeds,), by panel and curve.
 Solved = Mapping[tuple[str, str], np.ndarray]
+#: The results of `steps_until_solved`, (seeds,), by panel and curve.
+Steps = Mapping[tuple[str, str], np.ndarray]
 _DRAWS = 10_000
 
 
-def is_solved(record: Record, threshold: float) -> bool:
-    """Return whether a run's final return is at least half of a success's."""
-    return record.final >= threshold / 2
+def steps_until_solved(record: Record, success: float) -> float:
+    """Return the steps after which a run's mean return is half of a success's.
 
-
-def steps_until(record: Record, threshold: float) -> float:
-    """Return the steps after which the mean return is half of a success's, or NaN."""
-    reached = record.episode_return >= threshold / 2
-    return float(record.env_steps[reached.argmax()]) if reached.any() else math.nan
+    They are infinite for a run that does not solve its task: whose final return is less
+    than half of a success's, whatever it was before.
+    """
+    if not record.final >= success / 2:
+        return math.inf
+    return float(record.env_steps[(record.episode_return >= success / 2).argmax()])
 
 
 @functools.cache
@@ -85,6 +87,25 @@ def compare(
     return {k: Difference(middle[k], p) for k, p in corrected(p_values).items()}
 
 
+def _lead(
+    solved: Solved,
+    panels: Sequence[str],
+    pair: tuple[str, str],
+    rng: np.random.Generator,
+) -> tuple[float, np.ndarray]:
+    """Return the mean over panels of a pair's difference, and its bootstrap draws.
+
+    Seeds are drawn within each panel.
+    """
+    middle, drawn = 0.0, np.zeros(_DRAWS)
+    for panel in panels:
+        for curve, sign in zip(pair, (1, -1)):
+            seeds = solved[panel, curve]
+            middle += sign * seeds.mean()
+            drawn += sign * rng.binomial(len(seeds), seeds.mean(), _DRAWS) / len(seeds)
+    return middle / len(panels), drawn / len(panels)
+
+
 def overall(
     solved: Solved, panels: Sequence[str], ours: str, *, other: str
 ) -> tuple[float, tuple[float, float], float]:
@@ -94,17 +115,61 @@ def overall(
     p-value, not corrected, is that of a permutation of seeds within each panel.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
-    middle, drawn, dealt = 0.0, np.zeros(_DRAWS), np.zeros(_DRAWS)
+    middle, drawn = _lead(solved, panels, (ours, other), rng)
+    dealt = np.zeros(_DRAWS)
     for panel in panels:
         first, second = solved[panel, ours], solved[panel, other]
-        middle += first.mean() - second.mean()
-        sizes = len(first), len(second)
-        shares = [rng.binomial(len(x), x.mean(), _DRAWS) for x in (first, second)]
-        drawn += shares[0] / sizes[0] - shares[1] / sizes[1]
         total = int(first.sum() + second.sum())
-        got = rng.hypergeometric(total, sum(sizes) - total, sizes[0], _DRAWS)
-        dealt += got / sizes[0] - (total - got) / sizes[1]
-    low, high = np.percentile(drawn, [2.5, 97.5]) / len(panels)
+        left = len(first) + len(second) - total
+        got = rng.hypergeometric(total, left, len(first), _DRAWS)
+        dealt += got / len(first) - (total - got) / len(second)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    as_far = int(np.sum(np.abs(dealt) >= abs(middle) * len(panels) - 1e-9))
+    return middle, (float(low), float(high)), (1 + as_far) / (1 + _DRAWS)
+
+
+def change(
+    solved: Solved,
+    panels: Sequence[str],
+    others: Sequence[str],
+    *,
+    pair: tuple[str, str],
+) -> tuple[float, tuple[float, float], float]:
+    """Return how much a pair's mean difference is larger on other panels.
+
+    The 95% interval and the p-value, not corrected, are those of the percentile
+    bootstrap over seeds, drawn within each panel.
+    """
+    rng = np.random.default_rng(zlib.crc32("/".join(pair).encode()))
+    before, after = (_lead(solved, x, pair, rng) for x in (panels, others))
+    drawn = after[1] - before[1]
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
+    p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS))
+    return after[0] - before[0], (float(low), float(high)), p_value
+
+
+def sooner(
+    steps: Steps, panels: Sequence[str], ours: str, *, other: str
+) -> tuple[float, float]:
+    """Return how much more often than not a seed of ours is sooner, and its p-value.
+
+    It is the probability that a random seed of ours solves its task in fewer steps than
+    a random seed of the other curve, where equal ones count half, less one half,
+    averaged over panels. The p-value, not corrected, is that of a permutation of seeds
+    within each panel.
+    """
+    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
+    middle, dealt = 0.0, np.zeros(_DRAWS)
+    for panel in panels:
+        first, second = steps[panel, ours], steps[panel, other]
+        x = np.concatenate([first, second])
+        # How many seeds are later; equal ones, and the seed itself, count half.
+        later = ((x > x[:, None]) + 0.5 * (x == x[:, None])).sum(axis=1)
+        among_ours = len(first) ** 2 / 2
+        pairs = len(first) * len(second)
+        middle += (later[: len(first)].sum() - among_ours) / pairs - 0.5
+        rows = rng.permuted(np.tile(later, (_DRAWS, 1)), axis=1)[:, : len(first)]
+        dealt += (rows.sum(axis=1) - among_ours) / pairs - 0.5
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
-    interval = float(low), float(high)
-    return middle / len(panels), interval, (1 + as_far) / (1 + _DRAWS)
+    return middle / len(panels), (1 + as_far) / (1 + _DRAWS)

@@ -38,11 +38,9 @@ def test_the_exact_test_is_scipys(counts):
 
 
 def test_a_seed_solves_a_task_with_half_of_a_successs_return():
-    assert shares.is_solved(record(0, 0.5), 1.0)
-    assert not shares.is_solved(record(1, 0.49), 1.0)
-    assert not shares.is_solved(record(0, np.nan), 1.0)
-    assert shares.steps_until(record(0, 0.6, 0, 1), 1.0) == 2000
-    assert np.isnan(shares.steps_until(record(0, 0.4), 1.0))
+    until = lambda *returns: shares.steps_until_solved(record(*returns), 1.0)
+    assert until(0, 0.6, 0, 1) == 2000 and until(0, 0.5) == 2000
+    assert until(0, 0.4) == until(1, 0.49) == until(0, np.nan) == np.inf
 
 
 def test_differences_are_corrected_and_the_mean_is_over_panels():
@@ -60,6 +58,46 @@ def test_differences_are_corrected_and_the_mean_is_over_panels():
     assert p < 0.001
     *_, same = shares.overall(solved, "xyz", "a", other="a")
     assert same == 1.0
+
+
+def test_who_is_sooner_is_the_rank_sum_test():
+    """Steps infinite for seeds that never solve tie with each other, and come last."""
+    rng = np.random.default_rng(0)
+    steps = {}
+    for panel in "xy":
+        for curve, later in (("a", 0.0), ("b", 3.0)):
+            until = rng.integers(0, 10, 15) + later
+            steps[panel, curve] = np.where(until > 9, np.inf, until)
+    expected = []
+    for panel in "xy":
+        ours, other = steps[panel, "a"], steps[panel, "b"]
+        wins = scipy.stats.mannwhitneyu(other, ours).statistic
+        expected.append(wins / 15**2 - 0.5)
+    middle, p = shares.sooner(steps, "xy", "a", other="b")
+    assert middle == pytest.approx(np.mean(expected)) and middle > 0.1
+    # One task alone has SciPy's p-value, which is that of a normal distribution.
+    exact = scipy.stats.mannwhitneyu(steps["x", "a"], steps["x", "b"]).pvalue
+    assert shares.sooner(steps, "x", "a", other="b")[1] == pytest.approx(
+        exact, abs=0.02
+    )
+    assert p < 0.01
+    back, same_p = shares.sooner(steps, "xy", "b", other="a")
+    assert back == pytest.approx(-middle) and same_p < 0.01
+    assert shares.sooner(steps, "xy", "a", other="a") == (0.0, 1.0)
+
+
+def test_a_change_of_leads_has_the_spread_of_four_shares():
+    some = lambda count: np.arange(20) < count
+    solved = {("x", "a"): some(15), ("x", "b"): some(5)}
+    solved |= {("noisy", "a"): some(8), ("noisy", "b"): some(10)}
+    middle, (low, high), p = shares.change(solved, "x", ["noisy"], pair=("a", "b"))
+    assert middle == pytest.approx(-0.1 - 0.5)
+    variances = [x.mean() * (1 - x.mean()) / 20 for x in solved.values()]
+    spread = 1.96 * np.sqrt(sum(variances))
+    assert (high - low) / 2 == pytest.approx(spread, rel=0.06)
+    assert p == pytest.approx(2 * scipy.stats.norm.sf(0.6 / spread * 1.96), abs=5e-3)
+    _, _, none = shares.change(solved, "x", "x", pair=("a", "b"))
+    assert none > 0.5
 
 
 def test_one_point_is_chosen_for_all_tasks(tmp_path):
@@ -97,10 +135,31 @@ def test_a_page_tells_shares_and_verdicts(tmp_path):
     words = "novelty against ppo: mean share +1.00 [+1.00, +1.00], better; better on 3"
     assert f"{words} of 3 tasks" in page.lead("novelty")
     assert page.value("means", "", "ppo", "novelty") == "PPO 0.00, NOVELTY 1.00"
+    words = (
+        "- novelty sooner than ppo: with probability 1.00 [1.00, 1.00], better, on 3"
+    )
+    assert page.value("sooner", "novelty", "", "ppo") == f"{words} tasks."
     assert "How to read this" in page.text()
     assert page.picture().axes
     with pytest.raises(InputError):
         report.Page("matrix", store).shares()
+
+
+def test_a_page_tells_what_noise_changes(tmp_path, monkeypatch):
+    monkeypatch.setattr(SparseSearch, "chosen", lambda *_: {})
+    store, figure = Store(tmp_path), FIGURES["sparse"]
+    page = lambda: report.Page("sparse", store)
+    for panel, curves in figure.panels.items():
+        if panel.removesuffix("_noisy") != "sparse:u_maze":
+            continue
+        for agent in ("ppo", "ppo+sil"):
+            solves = (agent == "ppo") == panel.endswith("_noisy")
+            returns = [solved_from(curves[agent].env) * solves] * 10
+            store.add(dict.fromkeys(curves[agent].runs(store), record(*returns)))
+    words = (
+        "ppo+sil's lead over ppo: -2.00 [-2.00, -2.00] with noise, worse, on 1 tasks"
+    )
+    assert page().value("noise", "ppo", "ppo+sil", "ppo+bc") == f"- {words}."
 
 
 def test_longer_tasks_are_told_apart_and_without_their_package(tmp_path, monkeypatch):
