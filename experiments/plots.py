@@ -87,16 +87,42 @@ def _draw_legends(figure: Figure, picture: Picture, panels: Sequence[Any]) -> No
                 axes.legend(frameon=False, fontsize=7)
 
 
-def _colors(figure: Figure) -> dict[str, Any]:
-    """Return the color of each curve's name, the same in all panels.
+#: The styles of lines that have the same color.
+_STYLES = ("-", "--", ":", "-.")
 
-    If the names are numbers, or more than there are colors, they go from dark to light.
+
+def _lines(figure: Figure) -> dict[str, dict[str, Any]]:
+    """Return color, style and width of each curve's line, the same in all panels.
+
+    If there are more names than colors, curves of one agent share its color. If the
+    styles are too few for that, or if the names are numbers, colors go from dark to
+    light. The figure's subject is thick.
     """
     names = figure.names()
-    if len(names) > len(plotting.COLORS) or all(map(str.isdecimal, names)):
+    agent_of = {name: curve.agent for _, name, curve in figure.curves()}
+    alike = {
+        name: [x for x in names if agent_of[x] == agent_of[name]] for name in names
+    }
+    many = len(names) > len(plotting.COLORS)
+    few_styles = many and max(map(len, alike.values())) > len(_STYLES)
+    style_of = dict.fromkeys(names, "-")
+    if few_styles or all(map(str.isdecimal, names)):
         shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
-        return dict(zip(names, shades, strict=True))
-    return _with_free_colors(names)
+        color_of: dict[str, Any] = dict(zip(names, shades, strict=True))
+    elif many:
+        agents = _with_free_colors(dict.fromkeys(agent_of.values()))
+        color_of = {name: agents[agent_of[name]] for name in names}
+        style_of = {name: _STYLES[alike[name].index(name)] for name in names}
+    else:
+        color_of = _with_free_colors(names)
+    return {
+        name: {
+            "color": color_of[name],
+            "linestyle": style_of[name],
+            "linewidth": 2.4 if name == figure.favourite else 1.2,
+        }
+        for name in names
+    }
 
 
 def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
@@ -126,8 +152,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
     all, have a band, their 95% interval. Where tasks are either solved or not, curves
     are the share of seeds that solve the task.
     """
-    color_of = _colors(figure)
-    drawn = {}
+    lines, drawn = _lines(figure), {}
     for label in figure.panels[panel]:
         if (panel, label) not in records:
             continue
@@ -140,7 +165,7 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
         if figure.solved_from is not None:
             half = figure.solved_from(figure.panels[panel][label].env) / 2
             share = np.mean(returns >= half, axis=0)
-            axes.plot(steps / 1e6, share, color=color_of[label], label=label)
+            axes.plot(steps / 1e6, share, label=label, **lines[label])
             axes.set_ylim(-0.03, 1.03)
             continue
         finite = np.isfinite(returns).all(axis=0)
@@ -151,15 +176,14 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
     ranked = sorted(middle_of, key=lambda x: -middle_of[x][-1])
     banded = sorted(ranked, key=lambda x: x != figure.favourite)[:_MOST_BANDS]
     for label, (steps, returns) in drawn.items():
-        color = color_of[label]
         if label in banded:
             low, high = bootstrap_interval(returns, resamples=500)
-            axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-        width = 2.4 if label == figure.favourite else 1.2
-        line = {"color": color, "label": label, "linewidth": width}
-        axes.plot(steps, middle_of[label], **line)
+            band = {"color": lines[label]["color"], "alpha": 0.2, "linewidth": 0}
+            axes.fill_between(steps, low, high, **band)
+        axes.plot(steps, middle_of[label], label=label, **lines[label])
     if _has_direct_labels(figure):
         ends = {label: float(middle_of[label][-1]) for label in ranked}
+        color_of = {label: lines[label]["color"] for label in ends}
         plotting.label_ends(axes, ends, color_of)
     axes.set_xlabel("million steps")
 
@@ -177,7 +201,7 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, *, axes: Any) -> None
     for i, (line, points) in enumerate(lines.items()):
         complete = [x for x in points if (panel, points[x]) in scores]
         agent = next(curves[name].agent for name in points.values())
-        style = ("-", "--", ":", "-.")[drawn.count(agent) % 4]
+        style = _STYLES[drawn.count(agent) % len(_STYLES)]
         drawn.append(agent)
         if not complete:
             continue

@@ -319,15 +319,14 @@ class Page:
           ours: the curve.
           *others: the curves it is compared with.
         """
+        if rewards not in ("", "delayed", "dense"):
+            raise self._no_slot("better", rewards, ours, *others)
         panels = self._chosen(*filter(None, [rewards]))
         parts = []
         for other in others:
-            keys = [(p, ours, other) for p in panels if other in self.figure.panels[p]]
-            verdicts = [
-                self.comparisons[key].verdict for key in keys if key in self.comparisons
-            ]
-            measured = "" if len(verdicts) == len(keys) else " measured"
-            better = verdicts.count("better")
+            on, verdicts = self._verdicts(self.comparisons, panels, (ours, other))
+            measured = "" if len(verdicts) == len(on) else " measured"
+            better = [*verdicts.values()].count("better")
             parts.append(
                 f"than {other.upper()} on {better} of {len(verdicts)}{measured} tasks"
             )
@@ -347,6 +346,17 @@ class Page:
         comparisons = self._compared(scores)
         return self._tally(scores, comparisons, lacking="without enough evaluations")
 
+    def _verdicts(
+        self,
+        comparisons: Mapping[tuple[str, ...], Comparison],
+        panels: Sequence[str],
+        pair: tuple[str, str],
+    ) -> tuple[list[str], dict[str, str]]:
+        """Return the panels that have a pair's second curve, and verdicts by panel."""
+        on = [panel for panel in panels if pair[1] in self.figure.panels[panel]]
+        compared = {panel: comparisons.get((panel, *pair)) for panel in on}
+        return on, {panel: x.verdict for panel, x in compared.items() if x}
+
     def _tally(
         self,
         scores: Scores,
@@ -359,14 +369,14 @@ class Page:
         for other in self.figure.names(panels):
             with_other = [p for p in panels if other in self.figure.panels[p]]
             ours = str(self.figure.rival(with_other[0], other))
-            complete = [p for p in with_other if (p, ours, other) in comparisons]
-            if complete:
-                verdicts = [comparisons[p, ours, other].verdict for p in complete]
-                probability = improvement(scores, complete, ours, other=other)
-                others = len(with_other) - len(complete)
+            on, verdicts = self._verdicts(comparisons, panels, (ours, other))
+            if verdicts:
+                probability = improvement(scores, [*verdicts], ours, other=other)
+                words = counted([*verdicts.values()])
+                others = len(on) - len(verdicts)
                 more = f", {others} {lacking}" if others else ""
                 lines.append(
-                    f"- {ours} against {other}: {counted(verdicts)} of {len(complete)}"
+                    f"- {ours} against {other}: {words} of {len(verdicts)}"
                     f"{more}; probability of improvement {probability}."
                 )
         return "\n".join(lines)
@@ -649,8 +659,8 @@ class Page:
             verdicts = [one[panel, first, second].verdict for panel in on]
             if second in (others or [second]):
                 lines.append(
-                    f"- {first} against {second}: mean share {middle:+.2f} "
-                    f"[{low:+.2f}, {high:+.2f}], {verdict}; {counted(verdicts)} of "
+                    f"- {first} against {second}: mean share {middle:+z.2f} "
+                    f"[{low:+z.2f}, {high:+z.2f}], {verdict}; {counted(verdicts)} of "
                     f"{len(on)} tasks."
                 )
         return "\n".join(lines)
@@ -711,8 +721,8 @@ class Page:
         for other, (count, middle, (low, high), _) in changes.items():
             verdict = shares.Difference(middle, p_values[other]).verdict
             lines.append(
-                f"- {other}'s lead over {ours}: {middle:+.2f} [{low:+.2f}, "
-                f"{high:+.2f}] with noise, {verdict}, on {count} tasks."
+                f"- {other}'s lead over {ours}: {middle:+z.2f} [{low:+z.2f}, "
+                f"{high:+z.2f}] with noise, {verdict}, on {count} tasks."
             )
         return "\n".join(lines)
 

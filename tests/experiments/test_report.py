@@ -17,6 +17,7 @@ from experiments.report import Page
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
+from gasil_jax.figures import plotting
 from gasil_jax.statistics import interquartile_mean
 
 STORE = Store(RESULTS / "runs")
@@ -279,10 +280,19 @@ def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
     page.write(tmp_path)
     assert (tmp_path / "delays.png").stat().st_size > 3000
     # An agent has the color that it has where learning curves are drawn.
-    colors = plots._colors(FIGURES["matrix"])
+    drawn = plots._lines(FIGURES["matrix"])
     lines = {x.get_label(): x for x in page.picture().axes[0].containers}
     for agent in ("ppo", "ppo+gasil"):
-        assert lines[agent].lines[0].get_color() == colors[agent]
+        assert lines[agent].lines[0].get_color() == drawn[agent]["color"]
+
+
+def test_where_colors_are_too_few_an_agents_curves_share_its_color():
+    lines = plots._lines(FIGURES["sparse"])
+    looks = {tuple(x[key] for key in ("color", "linestyle")) for x in lines.values()}
+    assert len(looks) == len(lines) > len(plotting.COLORS)
+    own, shared = lines["ppo+sil"], lines["ppo+sil (PPO's values)"]
+    assert own["color"] == shared["color"] != lines["ppo"]["color"]
+    assert own["linestyle"] != shared["linestyle"]
 
 
 @pytest.mark.parametrize("count", [3, 9])
