@@ -4,7 +4,9 @@ import atexit
 import gc
 import importlib.metadata
 import os
+import pathlib
 import shutil
+import sys
 import tempfile
 
 import pytest
@@ -19,6 +21,13 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # By default programs that compile in less than a second are compiled by each process.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+# MJX imports Warp where it is installed, which takes longer than all other imports. Of
+# it nothing is used, here or in the programs that tests start.
+_warp = str(pathlib.Path(__file__).parent / "without_warp")
+if _warp not in sys.path:
+    sys.path.insert(0, _warp)
+    _paths = [_warp, *filter(None, [os.environ.get("PYTHONPATH")])]
+    os.environ["PYTHONPATH"] = os.pathsep.join(_paths)
 
 # Without fusion emitters XLA's CPU backend generates code in a third of the time, and
 # with less work in one part than in 32 for as many threads. Later releases cannot do
@@ -28,13 +37,6 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
     _flags += " --xla_cpu_use_fusion_emitters=false"
     _flags += " --xla_cpu_parallel_codegen_split_count=1"
     os.environ["XLA_FLAGS"] = _flags.strip()
-
-from gasil_envs import registry
-from gasil_envs.physics import native
-from gasil_jax.host import run_options
-from gasil_jax.host.members import Members
-
-native.reserve_threads(2)
 
 # What JAX traces and compiles stays alive: to look through all of it as often as Python
 # does by default takes a twentieth of the time.
@@ -57,6 +59,16 @@ def pytest_configure(config):
     """Say what our mark means, so that pytest knows it."""
     text = f"{_AS_FOR_USERS}: compile with all of XLA's optimizations"
     config.addinivalue_line("markers", text)
+
+
+def pytest_collectstart():
+    """Give two devices their threads, before a module of tests starts JAX.
+
+    Not earlier: of several processes, one only hands out tests and needs no imports.
+    """
+    from gasil_envs.physics import native
+
+    native.reserve_threads(2)
 
 
 def _is_optimized(item):
@@ -91,6 +103,9 @@ def equal_members_share_a_program():
     settings. Yields the programs, for a test that needs one to be compiled.
     """
     import jax
+
+    from gasil_envs import registry
+    from gasil_jax.host.members import Members
 
     jax.devices()  # The first run would start as many as it has members.
     compile_ = Members.compile
@@ -155,7 +170,7 @@ def _untrained(out, env, **settings):
     import numpy as np
 
     import gasil_jax
-    from gasil_jax.host import checkpoint
+    from gasil_jax.host import checkpoint, run_options
     from gasil_jax.host.environments import Settings
 
     algorithm = gasil_jax.algorithm(

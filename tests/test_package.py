@@ -19,7 +19,7 @@ ROOT = pathlib.Path(__file__).parent.parent
 #: What only an extra installs, by the names of the modules.
 EXTRAS = (
     "gymnax imageio_ffmpeg latex2mathml minari mkdocs optuna ray stable_baselines3 "
-    "tensorboardX wandb pytest hypothesis"
+    "tensorboardX wandb warp pytest hypothesis"
 ).split()
 _RUN = """
 import sys

@@ -1,0 +1,3 @@
+"""Stands for Warp where it is not installed."""
+
+raise ImportError("Warp is hidden from tests")
