@@ -81,9 +81,11 @@ def test_agents_learn(agent, expert):
     print(agent, returns.round(2).tolist())
     assert (returns[:, -3:].mean(axis=1) > returns[:, :2].mean(axis=1) + 3.0).all()
     # Evaluations take the most probable action.
-    score = jax.vmap(
-        lambda state: evaluation.evaluate(
-            env, algorithm, state, key=jax.random.key(5), num_episodes=8
+    score = jax.jit(
+        jax.vmap(
+            lambda state: evaluation.evaluate(
+                env, algorithm, state, key=jax.random.key(5), num_episodes=8
+            )
         )
     )(states)
     assert (score["episode_return"] > 17.0).all()
@@ -97,10 +99,12 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
     policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
     state, observation = gasil_jax.member(states, 1), np.eye(LENGTH, dtype=np.float32)
     network = CategoricalPolicy(SETTINGS["hidden_sizes"], 3)
-    logits = network.apply(
-        state.actor_critic.policy.params,
-        normalization.normalize(state.normalizer, observation),
-    )
+    logits = jax.jit(
+        lambda state: network.apply(
+            state.actor_critic.policy.params,
+            normalization.normalize(state.normalizer, observation),
+        )
+    )(state)
     act, in_numpy = gasil_jax.load_policy(path), numpy_policy.load(path)
     for action in (act(observation), jax.vmap(act)(observation), in_numpy(observation)):
         np.testing.assert_array_equal(action, logits.argmax(axis=1))
@@ -217,11 +221,13 @@ def test_the_discriminators_reward_is_that_of_its_formula(finished):
     observation = np.tile(np.eye(LENGTH, dtype=np.float32), (3, 1))
     action = np.repeat(np.arange(3), LENGTH)
     network = Discriminator(algorithm.agent.discriminator_hidden_sizes)
-    logit = network.apply(
-        state.agent.discriminator.params,
-        normalization.normalize(state.normalizer, observation),
-        np.eye(3, dtype=np.float32)[action],
-    )
+    logit = jax.jit(
+        lambda state: network.apply(
+            state.agent.discriminator.params,
+            normalization.normalize(state.normalizer, observation),
+            np.eye(3, dtype=np.float32)[action],
+        )
+    )(state)
     expected = -np.log(1 / (1 + np.exp(-np.asarray(logit, np.float64))))
     np.testing.assert_allclose(reward(observation, action), expected, rtol=1e-4)
     one = jax.jit(jax.vmap(reward))(observation, action)

@@ -214,7 +214,7 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
     observation = 3 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
     network = MixturePolicy(SETTINGS["hidden_sizes"], 2, components=3)
     normalized = normalization.normalize(state.normalizer, observation)
-    parameters = network.apply(state.actor_critic.policy.params, normalized)
+    parameters = jax.jit(network.apply)(state.actor_critic.policy.params, normalized)
     mean, log_std, logits = (np.asarray(x, float) for x in parameters)
     chosen = logits.argmax(axis=1)
     assert len(set(chosen.tolist())) > 1  # Or the order of the output is not tested.

@@ -30,27 +30,30 @@ def saved(trained_point_mass, tmp_path_factory):
 @pytest.mark.parametrize("seed", [5, 6, 7, None])
 def test_it_is_the_networks_gaussian(saved, seed):
     env, algorithm, states, folder = saved
-    state = gasil_jax.member(states, 1 if seed is None else seed - 5)
-    observation = 3.0 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
-    # The last one is far beyond the clip.
-    observation = observation.at[-1].multiply(1e3)
-    normalized = normalization.normalize(state.normalizer, observation)
-    assert jnp.abs(normalized).max() == numpy_policy.CLIP
     network = GaussianPolicy(algorithm.config.hidden_sizes, env.action_size)
-    mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
 
+    @jax.jit
+    def expected(state, key):
+        observation = jax.random.normal(key, (9, env.observation_size))
+        # The last one is far beyond the clip.
+        observation = (3.0 * observation).at[-1].multiply(1e3)
+        normalized = normalization.normalize(state.normalizer, observation)
+        mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
+        noise = jnp.exp(log_std)[None] * jax.random.normal(key, mean.shape)
+        means, draws = (jnp.clip(x, -1.0, 1.0) for x in (mean, mean + noise))
+        return observation, normalized, means, draws
+
+    state = gasil_jax.member(states, 1 if seed is None else seed - 5)
+    key = jax.random.key(3)
+    observation, normalized, means, draws = expected(state, key)
+    assert np.abs(normalized).max() == numpy_policy.CLIP
     act = gasil_jax.load_policy(folder, seed)
-    expected = jnp.clip(mean, -1.0, 1.0)
-    np.testing.assert_allclose(act(observation), expected, atol=1e-5)
-    np.testing.assert_allclose(jax.jit(jax.vmap(act))(observation), expected, atol=1e-5)
+    np.testing.assert_allclose(act(observation), means, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(jax.vmap(act))(observation), means, atol=1e-5)
     in_numpy = numpy_policy.load(folder / "policy.npz", seed)(np.asarray(observation))
     assert in_numpy.dtype == np.float32
-    np.testing.assert_allclose(in_numpy, expected, atol=1e-5)
-
-    key = jax.random.key(3)
-    noise = jnp.exp(log_std)[None] * jax.random.normal(key, mean.shape)
-    expected = jnp.clip(mean + noise, -1.0, 1.0)
-    np.testing.assert_allclose(act(observation, key), expected, atol=1e-5)
+    np.testing.assert_allclose(in_numpy, means, atol=1e-5)
+    np.testing.assert_allclose(act(observation, key), draws, atol=1e-5)
 
 
 def test_draws_in_numpy_have_the_policys_spread(saved):
@@ -159,12 +162,16 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
         "ppo", activation=activation, layer_norm=layer_norm, hidden_sizes=(8, 5)
     )
     init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states = jax.jit(init)(jnp.arange(2, dtype=jnp.uint32))
+    # Shapes, of which all that is a policy's is drawn here.
+    states = jax.eval_shape(init, np.arange(2, dtype=np.uint32))
     rng = np.random.default_rng(0)
-    draw = lambda x: x + jnp.asarray(rng.normal(size=x.shape), x.dtype)
+    draw = lambda x: rng.normal(size=x.shape).astype(x.dtype)
     params = jax.tree.map(draw, states.actor_critic.policy.params)
     learner = states.actor_critic.policy.replace(params=params)
-    states = states.replace(actor_critic=states.actor_critic.replace(policy=learner))
+    states = states.replace(
+        actor_critic=states.actor_critic.replace(policy=learner),
+        normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
+    )
     policy_file.save(tmp_path / "policy.npz", states, env, [0, 1], np.zeros(2))
 
     weights = numpy_policy.read(tmp_path, 1)
@@ -181,9 +188,9 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     np.testing.assert_allclose(policy.make(weights)(observation), x, rtol=1e-3)
     # The network that trains is the same.
     network = GaussianPolicy((8, 5), 2, activation, layer_norm)
-    own = jax.tree.map(lambda leaf: leaf[1], params)
-    normalizer = gasil_jax.member(states, 1).normalizer
-    mean, _ = network.apply(own, normalization.normalize(normalizer, observation))
+    own, normalizer = jax.tree.map(lambda x: x[1], (params, states.normalizer))
+    normalized = normalization.normalize(normalizer, observation)
+    mean, _ = jax.jit(network.apply)(own, normalized)
     np.testing.assert_allclose(mean, x, rtol=1e-3)
     if layer_norm:
         arrays = dict(np.load(tmp_path / "policy.npz"))

@@ -210,7 +210,14 @@ def test_a_loop_of_ones_own_begins_with_settings_that_are_allowed():
 
 def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
     env = gasil_jax.make_env("point_mass")
-    state = gasil_jax.init(env, PPO_GASIL, jax.random.key(0))
+
+    def init(algorithm):
+        """Shapes: of a state's values only these numbers are looked at."""
+        start = lambda key: gasil_jax.init(env, algorithm, key)
+        numbers = {x: jnp.float32(y) for x, y in algorithm.hyperparameters.items()}
+        return jax.eval_shape(start, jax.random.key(0)).replace(hyperparameters=numbers)
+
+    state = init(PPO_GASIL)
     traced = lambda state, algorithm=PPO_GASIL: jax.eval_shape(
         lambda state: gasil_jax.iterate(env, algorithm, state), state
     )
@@ -224,14 +231,14 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
         gasil_jax.iterate(env, PPO_GASIL, own(alpha=-1.0))
     with pytest.raises(ValueError, match=r"sil_coefficient is a setting of ppo\+sil"):
         traced(own(sil_coefficient=0.1))
-    pair = jax.tree.map(lambda *leaves: jnp.stack(leaves), state, state)
+    pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), state)
     with pytest.raises(ValueError, match=r"batch of 2 states: .*jax.vmap this"):
         traced(pair)
     # Minibatches would hold the batch's last step many times.
     more = {"num_envs": 2 * CONFIG.num_envs}
     with pytest.raises(ValueError, match=r"history.* is .*\[4, .* needs .*\[8, "):
         traced(state, PPO_GASIL.replace(**more))
-    plain = gasil_jax.init(env, PPO, jax.random.key(0))
+    plain = init(PPO)
     with pytest.raises(ValueError, match=r"num_envs is .*\[4\]: .* needs .*\[8\]"):
         traced(plain, PPO.replace(**more))
     with pytest.raises(ValueError, match=r"history.*, 128.* needs .*, 256"):

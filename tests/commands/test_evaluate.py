@@ -45,9 +45,9 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
         lambda s: evaluation.evaluate(env, algorithm, s, key=key, num_episodes=3)
     )(state)
     act = numpy_policy.make(policy.weights(state, env))
-    step = jax.jit(env.step)
+    reset, step = jax.jit(env.reset), jax.jit(env.step)
     for i, reset_key in enumerate(jax.random.split(jax.random.split(key)[0], 3)):
-        running, total, length = env.reset(reset_key), 0.0, 0
+        running, total, length = reset(reset_key), 0.0, 0
         while not running.done:
             running = step(running, jnp.asarray(act(np.asarray(running.obs))))
             total += float(running.info["true_reward"])
