@@ -192,12 +192,16 @@ def random_policies():
     env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.algorithm("ppo", **SETTINGS, policy_components=3)
     init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states = jax.jit(init)(jnp.arange(2, dtype=jnp.uint32))
+    # Shapes, of which all that is a policy's is drawn here.
+    states = jax.eval_shape(init, np.arange(2, dtype=np.uint32))
     rng = np.random.default_rng(0)
-    other = lambda x: x + jnp.asarray(0.3 * rng.normal(size=x.shape), x.dtype)
+    draw = lambda x: (0.5 * rng.normal(size=x.shape)).astype(x.dtype)
     learner = states.actor_critic.policy
-    learner = learner.replace(params=jax.tree.map(other, learner.params))
-    states = states.replace(actor_critic=states.actor_critic.replace(policy=learner))
+    learner = learner.replace(params=jax.tree.map(draw, learner.params))
+    states = states.replace(
+        actor_critic=states.actor_critic.replace(policy=learner),
+        normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
+    )
     return env, states
 
 
@@ -210,17 +214,19 @@ def save(path):
 
 def test_a_saved_policy_acts_as_the_network(tmp_path):
     env, states = save(tmp_path / "policy.npz")
-    state = gasil_jax.member(states, 1)
+    params, normalizer = jax.tree.map(
+        lambda x: x[1], (states.actor_critic.policy.params, states.normalizer)
+    )
     observation = 3 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
     network = MixturePolicy(SETTINGS["hidden_sizes"], 2, components=3)
-    normalized = normalization.normalize(state.normalizer, observation)
-    parameters = jax.jit(network.apply)(state.actor_critic.policy.params, normalized)
+    normalized = normalization.normalize(normalizer, observation)
+    parameters = jax.jit(network.apply)(params, normalized)
     mean, log_std, logits = (np.asarray(x, float) for x in parameters)
     chosen = logits.argmax(axis=1)
     assert len(set(chosen.tolist())) > 1  # Or the order of the output is not tested.
     expected = np.clip(mean[np.arange(9), chosen], -1.0, 1.0)
     act, in_numpy = gasil_jax.load_policy(tmp_path), numpy_policy.load(tmp_path)
-    for action in (act(observation), jax.vmap(act)(observation)):
+    for action in (act(observation), jax.jit(jax.vmap(act))(observation)):
         np.testing.assert_allclose(action, expected, atol=1e-5)
     drawn = in_numpy(np.asarray(observation))
     assert drawn.dtype == np.float32
