@@ -17,17 +17,27 @@ CLONING = SMALL["ppo+bc-adaptive"]
 
 @functools.cache
 def context_and_state():
-    context = jax.jit(lambda key: example_context(ENV, CLONING, key))(KEY)
+    agent = CLONING.agent
     sizes = gasil_jax.context.sizes_of(ENV, CLONING.config.num_envs, 200)
-    return context, CLONING.agent.remember(CLONING.agent.init(KEY, sizes), context)
+
+    @jax.jit
+    def first(key):
+        context = example_context(ENV, CLONING, key)
+        return context, agent.remember(agent.init(key, sizes), context)
+
+    return first(KEY)
 
 
 @functools.cache
 def networks():
     """The networks after an iteration: Adam's first steps have no unit."""
-    state = gasil_jax.init(ENV, CLONING, KEY)
-    iterate = jax.jit(lambda x: gasil_jax.iterate(ENV, CLONING, x)[0])
-    return iterate(state).actor_critic
+
+    @jax.jit
+    def first(key):
+        state = gasil_jax.init(ENV, CLONING, key)
+        return gasil_jax.iterate(ENV, CLONING, state)[0].actor_critic
+
+    return first(KEY)
 
 
 @jax.jit
