@@ -7,6 +7,8 @@ import numpy as np
 import gasil_jax
 from gasil_jax.rewards import normalization
 
+update = jax.jit(normalization.update)
+
 
 def plain_scale(reward, ended, gamma):
     """Baselines' VecNormalize, a step at a time."""
@@ -24,7 +26,7 @@ def test_batches_give_the_scale_of_all_steps():
     ended = rng.random((60, 3)) < 0.1
     normalizer = normalization.init(3)
     for begin, end in ((0, 7), (7, 8), (8, 60)):
-        normalizer = normalization.update(
+        normalizer = update(
             normalizer,
             jnp.asarray(reward[begin:end], jnp.float32),
             jnp.asarray(ended[begin:end]),
@@ -43,7 +45,7 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
     for length in (20, 1000):
         reward = np.zeros((2 * length, 4), np.float32)
         reward[length - 1 :: length] = payments = rng.uniform(500, 3000, (2, 4))
-        normalizer = normalization.update(
+        normalizer = update(
             normalization.init(4),
             jnp.asarray(reward),
             jnp.asarray(reward > 0),
