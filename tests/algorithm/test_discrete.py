@@ -81,11 +81,9 @@ def test_agents_learn(agent, expert):
     print(agent, returns.round(2).tolist())
     assert (returns[:, -3:].mean(axis=1) > returns[:, :2].mean(axis=1) + 3.0).all()
     # Evaluations take the most probable action.
-    score = jax.jit(
-        jax.vmap(
-            lambda state: evaluation.evaluate(
-                env, algorithm, state, key=jax.random.key(5), num_episodes=8
-            )
+    score = jax.vmap(
+        lambda state: evaluation.evaluate(
+            env, algorithm, state, key=jax.random.key(5), num_episodes=8
         )
     )(states)
     assert (score["episode_return"] > 17.0).all()

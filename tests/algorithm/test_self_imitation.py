@@ -18,6 +18,15 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
         num_envs, num_steps, 9, observation_size=1, action_size=1
     )
     replay = self_imitation.init_replay(capacity, 1, 1)
+
+    @jax.jit
+    def add(replay, history, observation, reward, ended):
+        history = good_trajectories.record(
+            history, observation, -observation, reward=reward, ended=ended
+        )
+        replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
+        return replay, history
+
     running = [[] for _ in range(num_envs)]
     expected = []
     for batch in range(6):
@@ -26,10 +35,7 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
         ended = rng.random((num_steps, num_envs)) < 0.3
         if batch == 3:
             reward[1, 0] = np.nan
-        history = good_trajectories.record(
-            history, observation, -observation, reward=reward, ended=ended
-        )
-        replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
+        replay, history = add(replay, history, observation, reward, ended)
         for env in range(num_envs):
             for t in range(num_steps):
                 running[env].append((observation[t, env, 0], reward[t, env]))
