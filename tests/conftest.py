@@ -4,9 +4,7 @@ import atexit
 import gc
 import importlib.metadata
 import os
-import pathlib
 import shutil
-import sys
 import tempfile
 
 import pytest
@@ -21,13 +19,6 @@ if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 # By default programs that compile in less than a second are compiled by each process.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
-# MJX imports Warp where it is installed, which takes longer than all other imports. Of
-# it nothing is used, here or in the programs that tests start.
-_warp = str(pathlib.Path(__file__).parent / "without_warp")
-if _warp not in sys.path:
-    sys.path.insert(0, _warp)
-    _paths = [_warp, *filter(None, [os.environ.get("PYTHONPATH")])]
-    os.environ["PYTHONPATH"] = os.pathsep.join(_paths)
 
 # Without fusion emitters XLA's CPU backend generates code in a third of the time, and
 # with less work in one part than in 32 for as many threads. Later releases cannot do

@@ -1,3 +1,0 @@
-"""Stands for Warp where it is not installed."""
-
-raise ImportError("Warp is hidden from tests")
