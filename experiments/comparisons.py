@@ -110,8 +110,6 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         for key, terms in family.items()
         if all((panel, curve) in scores for _, panel, curve in terms)
     }
-    quantile = statistics.NormalDist().inv_cdf
-    errors = quantile(1 - LEVEL / (2 * max(1, len(complete)))) + quantile(_POWER)
     raw = {}
     for key, terms in complete.items():
         sides = [scores[panel, curve] for _, panel, curve in terms]
@@ -123,10 +121,23 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
-        visible = errors * float(np.std(drawn))
+        visible = visible_effect(drawn, len(complete))
         raw[key] = Comparison(middle, low, high, p_value, visible)
     p_values = corrected({key: x.p for key, x in raw.items()})
     return {key: dataclasses.replace(x, p=p_values[key]) for key, x in raw.items()}
+
+
+def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
+    """Return the smallest true effect that would be found with a probability of 80%.
+
+    Args:
+      drawn: bootstrap samples of the effect, (draws,).
+      comparisons: the number of comparisons in the family, of whose smallest p-value
+        the level is that of the test.
+    """
+    quantile = statistics.NormalDist().inv_cdf
+    errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
+    return errors * float(np.std(drawn))
 
 
 def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:

@@ -9,10 +9,11 @@ import functools
 import math
 import zlib
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from experiments.comparisons import LEVEL, corrected
+from experiments.comparisons import LEVEL, corrected, visible_effect
 from experiments.store import Record
 
 #: Which seeds solve a panel's task, bool (seeds,), by panel and curve.
@@ -87,35 +88,69 @@ def compare(
     return {k: Difference(middle[k], p) for k, p in corrected(p_values).items()}
 
 
-def _lead(
+@dataclasses.dataclass(frozen=True)
+class Lead(Difference):
+    """A difference of shares that is averaged over panels.
+
+    Attributes:
+      drawn: its bootstrap samples over seeds, drawn within each panel, (draws,).
+      comparisons: the number of comparisons in its family.
+    """
+
+    drawn: np.ndarray
+    comparisons: int = 1
+
+    def __str__(self) -> str:
+        return "{:+z.2f} [{:+z.2f}, {:+z.2f}]".format(*self.middle_and_interval)
+
+    @property
+    def middle_and_interval(self) -> tuple[float, float, float]:
+        """The difference, and the ends of its 95% interval."""
+        low, high = np.percentile(self.drawn, [2.5, 97.5])
+        return self.middle, float(low), float(high)
+
+    @property
+    def verdict_in_words(self) -> str:
+        """The verdict; if it is not clear, with what would have been."""
+        if self.verdict != "not clear":
+            return self.verdict
+        visible = visible_effect(self.drawn, self.comparisons)
+        return f"not clear (visible from {visible:.2f} on)"
+
+
+def family(leads: Mapping[Any, Lead]) -> dict[Any, Lead]:
+    """Return the leads of a family with their p-values corrected."""
+    p_values = corrected({key: lead.p for key, lead in leads.items()})
+    count = len(leads)
+    return {
+        key: dataclasses.replace(lead, p=p_values[key], comparisons=count)
+        for key, lead in leads.items()
+    }
+
+
+def _mean_lead(
     solved: Solved,
     panels: Sequence[str],
     pair: tuple[str, str],
     rng: np.random.Generator,
 ) -> tuple[float, np.ndarray]:
-    """Return the mean over panels of a pair's difference, and its bootstrap draws.
-
-    Seeds are drawn within each panel.
-    """
+    """Return the mean over panels of a pair's difference, and its bootstrap draws."""
     middle, drawn = 0.0, np.zeros(_DRAWS)
     for panel in panels:
         for curve, sign in zip(pair, (1, -1)):
             seeds = solved[panel, curve]
-            middle += sign * seeds.mean()
+            middle += sign * float(seeds.mean())
             drawn += sign * rng.binomial(len(seeds), seeds.mean(), _DRAWS) / len(seeds)
     return middle / len(panels), drawn / len(panels)
 
 
-def overall(
-    solved: Solved, panels: Sequence[str], ours: str, *, other: str
-) -> tuple[float, tuple[float, float], float]:
-    """Return the mean difference over panels, its 95% interval, and its p-value.
+def overall(solved: Solved, panels: Sequence[str], ours: str, *, other: str) -> Lead:
+    """Return the mean difference over panels.
 
-    The interval is the percentile bootstrap's over seeds, drawn within each panel. The
-    p-value, not corrected, is that of a permutation of seeds within each panel.
+    The p-value, not corrected, is that of a permutation of seeds within each panel.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
-    middle, drawn = _lead(solved, panels, (ours, other), rng)
+    middle, drawn = _mean_lead(solved, panels, (ours, other), rng)
     dealt = np.zeros(_DRAWS)
     for panel in panels:
         first, second = solved[panel, ours], solved[panel, other]
@@ -123,9 +158,8 @@ def overall(
         left = len(first) + len(second) - total
         got = rng.hypergeometric(total, left, len(first), _DRAWS)
         dealt += got / len(first) - (total - got) / len(second)
-    low, high = np.percentile(drawn, [2.5, 97.5])
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) * len(panels) - 1e-9))
-    return middle, (float(low), float(high)), (1 + as_far) / (1 + _DRAWS)
+    return Lead(middle, (1 + as_far) / (1 + _DRAWS), drawn)
 
 
 def change(
@@ -134,25 +168,31 @@ def change(
     others: Sequence[str],
     *,
     pair: tuple[str, str],
-) -> tuple[float, tuple[float, float], float]:
+) -> Lead:
     """Return how much a pair's mean difference is larger on other panels.
 
-    The 95% interval and the p-value, not corrected, are those of the percentile
-    bootstrap over seeds, drawn within each panel.
+    The p-value, not corrected, is that of the percentile bootstrap.
     """
     rng = np.random.default_rng(zlib.crc32("/".join(pair).encode()))
-    before, after = (_lead(solved, x, pair, rng) for x in (panels, others))
+    before, after = (_mean_lead(solved, x, pair, rng) for x in (panels, others))
     drawn = after[1] - before[1]
-    low, high = np.percentile(drawn, [2.5, 97.5])
     beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
     p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS))
-    return after[0] - before[0], (float(low), float(high)), p_value
+    return Lead(after[0] - before[0], p_value, drawn)
 
 
-def sooner(
-    steps: Steps, panels: Sequence[str], ours: str, *, other: str
-) -> tuple[float, float]:
-    """Return how much more often than not a seed of ours is sooner, and its p-value.
+def _more_than_half(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return how much more often than not ours are sooner, (..., seeds) each -> (...).
+
+    That is the share of pairs in which ours is smaller, where equal ones count half,
+    less one half.
+    """
+    one, two = ours[..., :, None], others[..., None, :]
+    return ((one < two) + 0.5 * (one == two)).mean(axis=(-1, -2)) - 0.5
+
+
+def sooner(steps: Steps, panels: Sequence[str], ours: str, *, other: str) -> Lead:
+    """Return how much more often than not a seed of ours is sooner.
 
     It is the probability that a random seed of ours solves its task in fewer steps than
     a random seed of the other curve, where equal ones count half, less one half,
@@ -160,16 +200,14 @@ def sooner(
     within each panel.
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
-    middle, dealt = 0.0, np.zeros(_DRAWS)
+    middle, dealt, drawn = 0.0, np.zeros(_DRAWS), np.zeros(_DRAWS)
     for panel in panels:
-        first, second = steps[panel, ours], steps[panel, other]
-        x = np.concatenate([first, second])
-        # How many seeds are later; equal ones, and the seed itself, count half.
-        later = ((x > x[:, None]) + 0.5 * (x == x[:, None])).sum(axis=1)
-        among_ours = len(first) ** 2 / 2
-        pairs = len(first) * len(second)
-        middle += (later[: len(first)].sum() - among_ours) / pairs - 0.5
-        rows = rng.permuted(np.tile(later, (_DRAWS, 1)), axis=1)[:, : len(first)]
-        dealt += (rows.sum(axis=1) - among_ours) / pairs - 0.5
+        pair = steps[panel, ours], steps[panel, other]
+        middle += float(_more_than_half(*pair))
+        all_seeds = np.tile(np.concatenate(pair), (_DRAWS, 1))
+        parts = np.split(rng.permuted(all_seeds, axis=1), [len(pair[0])], axis=1)
+        dealt += _more_than_half(*parts)
+        drawn += _more_than_half(*(rng.choice(x, (_DRAWS, len(x))) for x in pair))
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
-    return middle / len(panels), (1 + as_far) / (1 + _DRAWS)
+    p_value = (1 + as_far) / (1 + _DRAWS)
+    return Lead(middle / len(panels), p_value, drawn / len(panels))

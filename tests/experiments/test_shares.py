@@ -53,11 +53,11 @@ def test_differences_are_corrected_and_the_mean_is_over_panels():
     ]
     alone = shares.fisher_p(18, 20, 4, 20)
     assert result["x", "a", "b"].p == pytest.approx(3 * alone)
-    middle, (low, high), p = shares.overall(solved, "xyz", "a", other="b")
+    lead = shares.overall(solved, "xyz", "a", other="b")
+    middle, low, high = lead.middle_and_interval
     assert middle == pytest.approx((14 + 14 + 1) / 60) and low < middle < high
-    assert p < 0.001
-    *_, same = shares.overall(solved, "xyz", "a", other="a")
-    assert same == 1.0
+    assert lead.p < 0.001 and lead.verdict_in_words == "better"
+    assert shares.overall(solved, "xyz", "a", other="a").p == 1.0
 
 
 def test_who_is_sooner_is_the_rank_sum_test():
@@ -73,31 +73,41 @@ def test_who_is_sooner_is_the_rank_sum_test():
         ours, other = steps[panel, "a"], steps[panel, "b"]
         wins = scipy.stats.mannwhitneyu(other, ours).statistic
         expected.append(wins / 15**2 - 0.5)
-    middle, p = shares.sooner(steps, "xy", "a", other="b")
-    assert middle == pytest.approx(np.mean(expected)) and middle > 0.1
+    lead = shares.sooner(steps, "xy", "a", other="b")
+    middle, low, high = lead.middle_and_interval
+    assert middle == pytest.approx(np.mean(expected)) and 0.1 < middle < high
+    assert low < middle and lead.p < 0.01
     # One task alone has SciPy's p-value, which is that of a normal distribution.
     exact = scipy.stats.mannwhitneyu(steps["x", "a"], steps["x", "b"]).pvalue
-    assert shares.sooner(steps, "x", "a", other="b")[1] == pytest.approx(
-        exact, abs=0.02
-    )
-    assert p < 0.01
-    back, same_p = shares.sooner(steps, "xy", "b", other="a")
-    assert back == pytest.approx(-middle) and same_p < 0.01
-    assert shares.sooner(steps, "xy", "a", other="a") == (0.0, 1.0)
+    alone = shares.sooner(steps, "x", "a", other="b")
+    assert alone.p == pytest.approx(exact, abs=0.02)
+    back = shares.sooner(steps, "xy", "b", other="a")
+    assert back.middle == pytest.approx(-middle) and back.p < 0.01
+    same = shares.sooner(steps, "xy", "a", other="a")
+    assert same.middle == pytest.approx(0.0) and same.p == 1.0
 
 
 def test_a_change_of_leads_has_the_spread_of_four_shares():
     some = lambda count: np.arange(20) < count
     solved = {("x", "a"): some(15), ("x", "b"): some(5)}
     solved |= {("noisy", "a"): some(8), ("noisy", "b"): some(10)}
-    middle, (low, high), p = shares.change(solved, "x", ["noisy"], pair=("a", "b"))
+    change = shares.change(solved, "x", ["noisy"], pair=("a", "b"))
+    middle, low, high = change.middle_and_interval
     assert middle == pytest.approx(-0.1 - 0.5)
-    variances = [x.mean() * (1 - x.mean()) / 20 for x in solved.values()]
-    spread = 1.96 * np.sqrt(sum(variances))
-    assert (high - low) / 2 == pytest.approx(spread, rel=0.06)
-    assert p == pytest.approx(2 * scipy.stats.norm.sf(0.6 / spread * 1.96), abs=5e-3)
-    _, _, none = shares.change(solved, "x", "x", pair=("a", "b"))
-    assert none > 0.5
+    deviation = np.sqrt(sum(x.mean() * (1 - x.mean()) / 20 for x in solved.values()))
+    assert (high - low) / 2 == pytest.approx(1.96 * deviation, rel=0.06)
+    normal_p = 2 * scipy.stats.norm.sf(0.6 / deviation)
+    assert change.p == pytest.approx(normal_p, abs=5e-3)
+    none = shares.change(solved, "x", "x", pair=("a", "b"))
+    assert none.p > 0.5
+    # Of a single comparison, 1.96 + 0.84 deviations would be found.
+    deviation = np.sqrt(2 * (0.75 * 0.25 + 0.25 * 0.75) / 20)
+    words = f"not clear (visible from {2.80 * deviation:.2f} on)"
+    assert shares.family({"": none})[""].verdict_in_words == words
+    pair = shares.family({"changed": change, "none": none})
+    assert pair["changed"].p == pytest.approx(2 * change.p)
+    visible = [float(x.verdict_in_words.split()[-2]) for x in (none, pair["none"])]
+    assert visible[0] < visible[1]
 
 
 def test_one_point_is_chosen_for_all_tasks(tmp_path):
