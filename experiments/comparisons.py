@@ -116,15 +116,20 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
-        beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
         enough = all(len(x) >= FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
-        p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS)) if enough else 1.0
+        p_value = bootstrap_p(drawn) if enough else 1.0
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
         visible = visible_effect(drawn, len(complete))
         raw[key] = Comparison(middle, low, high, p_value, visible)
     p_values = corrected({key: x.p for key, x in raw.items()})
     return {key: dataclasses.replace(x, p=p_values[key]) for key, x in raw.items()}
+
+
+def bootstrap_p(drawn: np.ndarray) -> float:
+    """Return the p-value of bootstrap samples of an effect, (draws,)."""
+    beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
+    return min(1.0, 2 * (1 + beyond) / (1 + len(drawn)))
 
 
 def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
@@ -149,6 +154,20 @@ def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:
     return {key: higher[key] for key in p_values}
 
 
+def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return the share of pairs of seeds in which ours is more; equal ones count half.
+
+    Args:
+      ours: our seeds, (..., seeds).
+      others: the other seeds, (..., other seeds).
+
+    Returns:
+      The shares, (...).
+    """
+    one, two = ours[..., :, None], others[..., None, :]
+    return ((one > two) + 0.5 * (one == two)).mean(axis=(-1, -2))
+
+
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:
     """Return the probability of improvement over the panels, as text.
 
@@ -159,13 +178,6 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str)
     """
     rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
 
-    def probability(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        more, same = (
-            a[..., :, None] > b[..., None, :],
-            a[..., :, None] == b[..., None, :],
-        )
-        return (more + 0.5 * same).mean(axis=(-1, -2))
-
     def resampled(values: np.ndarray) -> np.ndarray:
         return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
 
@@ -173,8 +185,8 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str)
         return np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
 
     pairs = [(of(panel, ours), of(panel, other)) for panel in panels]
-    middle = np.mean([probability(*pair) for pair in pairs])
-    drawn = [probability(*map(resampled, pair)) for pair in pairs]
+    middle = np.mean([share_of_more(*pair) for pair in pairs])
+    drawn = [share_of_more(*map(resampled, pair)) for pair in pairs]
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
     return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
 

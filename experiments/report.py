@@ -195,6 +195,16 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ", ".join(f"{x[0]} to {x[-1]}" if len(x) > 1 else f"{x[0]}" for x in runs)
 
 
+def _verdicts(
+    comparisons: Mapping[tuple[str, ...], Comparison],
+    panels: Sequence[str],
+    pair: tuple[str, str],
+) -> dict[str, str]:
+    """Return the verdicts on a pair of curves by panel, where there are any."""
+    compared = {panel: comparisons.get((panel, *pair)) for panel in panels}
+    return {panel: x.verdict for panel, x in compared.items() if x}
+
+
 class Page:
     """The page of a figure; `SLOTS` are the methods that slots in its text may name.
 
@@ -324,7 +334,8 @@ class Page:
         panels = self._chosen(*filter(None, [rewards]))
         parts = []
         for other in others:
-            on, verdicts = self._verdicts(self.comparisons, panels, (ours, other))
+            on = [panel for panel in panels if other in self.figure.panels[panel]]
+            verdicts = _verdicts(self.comparisons, on, (ours, other))
             measured = "" if len(verdicts) == len(on) else " measured"
             better = [*verdicts.values()].count("better")
             parts.append(
@@ -346,17 +357,6 @@ class Page:
         comparisons = self._compared(scores)
         return self._tally(scores, comparisons, lacking="without enough evaluations")
 
-    def _verdicts(
-        self,
-        comparisons: Mapping[tuple[str, ...], Comparison],
-        panels: Sequence[str],
-        pair: tuple[str, str],
-    ) -> tuple[list[str], dict[str, str]]:
-        """Return the panels that have a pair's second curve, and verdicts by panel."""
-        on = [panel for panel in panels if pair[1] in self.figure.panels[panel]]
-        compared = {panel: comparisons.get((panel, *pair)) for panel in on}
-        return on, {panel: x.verdict for panel, x in compared.items() if x}
-
     def _tally(
         self,
         scores: Scores,
@@ -367,9 +367,9 @@ class Page:
     ) -> str:
         lines, panels = [], panels or self._chosen()
         for other in self.figure.names(panels):
-            with_other = [p for p in panels if other in self.figure.panels[p]]
-            ours = str(self.figure.rival(with_other[0], other))
-            on, verdicts = self._verdicts(comparisons, panels, (ours, other))
+            on = [panel for panel in panels if other in self.figure.panels[panel]]
+            ours = str(self.figure.rival(on[0], other))
+            verdicts = _verdicts(comparisons, on, (ours, other))
             if verdicts:
                 probability = improvement(scores, [*verdicts], ours, other=other)
                 words = counted([*verdicts.values()])

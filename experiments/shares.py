@@ -13,7 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments.comparisons import LEVEL, corrected, visible_effect
+from experiments.comparisons import (
+    LEVEL,
+    bootstrap_p,
+    corrected,
+    share_of_more,
+    visible_effect,
+)
 from experiments.store import Record
 
 #: Which seeds solve a panel's task, bool (seeds,), by panel and curve.
@@ -176,19 +182,7 @@ def change(
     rng = np.random.default_rng(zlib.crc32("/".join(pair).encode()))
     before, after = (_mean_lead(solved, x, pair, rng) for x in (panels, others))
     drawn = after[1] - before[1]
-    beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
-    p_value = min(1.0, 2 * (1 + beyond) / (1 + _DRAWS))
-    return Lead(after[0] - before[0], p_value, drawn)
-
-
-def _more_than_half(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return how much more often than not ours are sooner, (..., seeds) each -> (...).
-
-    That is the share of pairs in which ours is smaller, where equal ones count half,
-    less one half.
-    """
-    one, two = ours[..., :, None], others[..., None, :]
-    return ((one < two) + 0.5 * (one == two)).mean(axis=(-1, -2)) - 0.5
+    return Lead(after[0] - before[0], bootstrap_p(drawn), drawn)
 
 
 def sooner(steps: Steps, panels: Sequence[str], ours: str, *, other: str) -> Lead:
@@ -203,11 +197,13 @@ def sooner(steps: Steps, panels: Sequence[str], ours: str, *, other: str) -> Lea
     middle, dealt, drawn = 0.0, np.zeros(_DRAWS), np.zeros(_DRAWS)
     for panel in panels:
         pair = steps[panel, ours], steps[panel, other]
-        middle += float(_more_than_half(*pair))
+        # Ours is sooner where the other's steps are more.
+        middle += float(share_of_more(*pair[::-1])) - 0.5
         all_seeds = np.tile(np.concatenate(pair), (_DRAWS, 1))
         parts = np.split(rng.permuted(all_seeds, axis=1), [len(pair[0])], axis=1)
-        dealt += _more_than_half(*parts)
-        drawn += _more_than_half(*(rng.choice(x, (_DRAWS, len(x))) for x in pair))
+        dealt += share_of_more(*parts[::-1]) - 0.5
+        resampled = [rng.choice(x, (_DRAWS, len(x))) for x in pair]
+        drawn += share_of_more(*resampled[::-1]) - 0.5
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
     p_value = (1 + as_far) / (1 + _DRAWS)
     return Lead(middle / len(panels), p_value, drawn / len(panels))
