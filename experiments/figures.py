@@ -711,6 +711,7 @@ FIGURES: Mapping[str, Figure] = {
             _CAUSES,
             base=None,
             changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+            seeds=20,
             total_steps=SPARSE_STEPS,
         ),
         comparisons=_changes(),
