@@ -36,7 +36,22 @@ SIMPLE, FLAT, PYRAMID = (
 def solve(problem, iterations=4):
     """Solve one problem."""
     function = functools.partial(newton.solve_many, iterations, 4)
-    return batching.batch_last(batching.in_tiles(function))(problem)
+    return batching.batch_last(function, batching.in_tiles(function))(problem)
+
+
+def test_a_batch_of_one_is_a_batch():
+    """Under `vmap` one simulation is computed in a tile, and alone it is not."""
+    marked = batching.batch_last(lambda x: x + 1.0, lambda x: x + 2.0)
+    for function, batch, expected in (
+        (marked, (), 1.0),
+        (jax.vmap(marked), (1,), 2.0),
+        (jax.vmap(jax.vmap(marked)), (1, 1), 2.0),
+        (jax.vmap(jax.jit(jax.vmap(marked))), (2, 3), 2.0),
+    ):
+        result = function(jnp.zeros(batch))
+        np.testing.assert_array_equal(result, np.full(batch, expected))
+    tiled = jax.jit(batching.in_tiles(lambda x: 2.0 * x))
+    np.testing.assert_array_equal(tiled(jnp.ones((3, 1))), np.full((3, 1), 2.0))
 
 
 def test_host_calls_that_would_deadlock_are_refused(monkeypatch):

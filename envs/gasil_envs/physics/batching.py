@@ -75,18 +75,23 @@ def take(x: jax.Array, index: Iterable[int]) -> jax.Array:
     return jnp.stack(rows) if rows else x[:0]
 
 
-def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
+def batch_last(
+    function: Callable[[Any], Any], batched: Callable[[Any], Any] | None = None
+) -> Callable[[Any], Any]:
     """Make `jax.vmap`, nested if needed, extend a trailing batch axis.
 
     Args:
       function: from a tree of arrays to a tree of arrays, all with a trailing batch.
+      batched: the same function, to be called under `jax.vmap`; default `function`.
 
     Returns:
       The same function of arrays without a batch.
     """
     function = jax.custom_batching.custom_vmap(function)
+    batched = jax.custom_batching.custom_vmap(batched or function)
 
     @function.def_vmap
+    @batched.def_vmap
     def rule(axis_size: int, in_batched: list[Any], tree: Any) -> tuple[Any, Any]:
         is_batched = in_batched[0]
 
@@ -101,7 +106,7 @@ def batch_last(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
             return jnp.moveaxis(x, -2, 0)
 
         joined = materialize(jax.tree.map(join, tree, is_batched))
-        result = materialize(function(joined))
+        result = materialize(batched(joined))
         result = jax.tree.map(part, result)
         return result, jax.tree.map(lambda _: True, result)
 
@@ -151,7 +156,7 @@ def in_tiles(function: Callable[[Any], Any]) -> Callable[[Any], Any]:
         return jax.tree.map(join, results)
 
     def call(tree: Any) -> Any:
-        if not on_cpu() or jax.tree.leaves(tree)[0].shape[-1] == 1:
+        if not on_cpu():
             return function(tree)
         with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
             return jax.jit(tiled)(tree)
