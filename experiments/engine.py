@@ -12,9 +12,12 @@ import math
 import multiprocessing.connection
 import os
 import pathlib
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from multiprocessing import resource_tracker
 from multiprocessing.context import SpawnProcess
 from typing import Any
 
@@ -38,6 +41,9 @@ _WRITTEN = (
 )
 #: The file of a scratch folder that says how each session trained.
 _SESSIONS = "provenance.json"
+_HOW_TO_CONTINUE = "continue with: the same command and --resume"
+_ENDING = "waiting until all processes have saved; Ctrl-C again quits now"
+_SECONDS_BETWEEN_POLLS = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -145,8 +151,15 @@ def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
     return [x for x in runs if int(x.key, 16) % count == number - 1]
 
 
-def train(stored: Program, setup: Setup) -> dict[Run, Record]:
+def train(
+    stored: Program, setup: Setup, on_restored: Callable[[], None] = lambda: None
+) -> dict[Run, Record]:
     """Train a program, or continue its training, and return its runs' records.
+
+    Args:
+      stored: the program.
+      setup: how it is trained.
+      on_restored: called once a signal is answered by saving.
 
     Raises:
       InputError: if it does not fit into memory or on the disk, or if another process
@@ -169,8 +182,10 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     )
     env = assembly.prepare(options, [stored])
     _add_session(stored, setup)
-    with interruption.noted("continue with: the same command and --resume"):
-        assembly.train(options, env, [stored], title=title(stored))
+    with interruption.noted(_HOW_TO_CONTINUE):
+        assembly.train(
+            options, env, [stored], title=title(stored), on_restored=on_restored
+        )
     return records(stored)
 
 
@@ -276,11 +291,48 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
 
 def _train_on_core(core: int, stored: Program, setup: Setup, folder: Any) -> None:
     """Train a program on one core; what this process prints goes to a log file."""
+    has_begun = threading.Event()
+
+    def end_or_ignore(number: int, frame: Any) -> None:
+        # Training has answered a first signal, and must save before it ends. A cluster
+        # sends one to all processes, and the parent sends another.
+        if not has_begun.is_set():
+            sys.exit(128 + number)
+
+    signal.signal(signal.SIGTERM, end_or_ignore)
     os.sched_setaffinity(0, {core})
     with open(f"{stored.path}.log", "a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
-        Store(folder).add(train(stored, setup))
+        Store(folder).add(train(stored, setup, has_begun.set))
+
+
+def _start(core: int, stored: Program, setup: Setup, folder: Any) -> SpawnProcess:
+    """Start a process that trains a program.
+
+    Ctrl-C, which goes to all processes of a terminal, does not reach it: a process that
+    still imports would print where it was.
+    """
+    arguments = (core, stored, setup, folder)
+    process = SpawnProcess(target=_train_on_core, args=arguments)
+    # Else the first process starts it, and that unblocks the signal.
+    resource_tracker.ensure_running()
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    process.start()
+    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+    return process
+
+
+def _end(processes: Collection[SpawnProcess]) -> None:
+    """End processes, and wait until they have saved; a second Ctrl-C kills them."""
+    try:
+        for process in processes:
+            process.terminate()
+        for process in processes:
+            process.join()
+    finally:
+        for process in processes:
+            process.kill()
 
 
 def train_in_processes(
@@ -298,6 +350,7 @@ def train_in_processes(
     Raises:
       InputError: if there are more processes than cores, as `train_missing`, or if the
         training of a program failed; the others are trained first.
+      Interrupted: if a signal was received; the processes have saved and ended.
     """
     cores = sorted(os.sched_getaffinity(0))
     if setup.processes > len(cores):
@@ -308,25 +361,36 @@ def train_in_processes(
     _scratch(setup).mkdir(parents=True, exist_ok=True)
     free, failed = cores[: setup.processes], list[Program]()
     running: dict[Any, tuple[SpawnProcess, Program, int]] = {}
-    while True:
-        begun = [*failed, *(stored for _, stored, _ in running.values())]
-        begun_here = {run for each in begun for run in each.runs}
-        waiting = [run for run in missing() if run not in begun_here]
-        for stored in _requested(waiting, store, setup)[: len(free)]:
-            core = free.pop()
-            arguments = (core, stored, setup, store.folder)
-            process = SpawnProcess(target=_train_on_core, args=arguments)
-            process.start()
-            running[process.sentinel] = process, stored, core
-        if not running:
-            break
-        for sentinel in multiprocessing.connection.wait(list(running)):
-            process, stored, core = running.pop(sentinel)
-            process.join()
-            free.append(core)
-            failed += [stored] if process.exitcode else []
-            outcome = "failed" if process.exitcode else "done"
-            print(f"{outcome}: {title(stored)}", flush=True)
+    with (
+        interruption.noted(_HOW_TO_CONTINUE),
+        interruption.Interruption() as received,
+        received.answering(_ENDING),
+    ):
+        while True:
+            begun = [*failed, *(stored for _, stored, _ in running.values())]
+            begun_here = {run for each in begun for run in each.runs}
+            waiting = [run for run in missing() if run not in begun_here]
+            for stored in _requested(waiting, store, setup)[: len(free)]:
+                core = free.pop()
+                process = _start(core, stored, setup, store.folder)
+                running[process.sentinel] = process, stored, core
+            if not running and received.signal is None:
+                break
+            ended: list[Any] = []
+            while not ended and received.signal is None:
+                ended = multiprocessing.connection.wait(
+                    list(running), _SECONDS_BETWEEN_POLLS
+                )
+            if received.signal is not None:
+                _end([process for process, _, _ in running.values()])
+                raise interruption.Interrupted(received.signal)
+            for sentinel in ended:
+                process, stored, core = running.pop(sentinel)
+                process.join()
+                free.append(core)
+                failed += [stored] if process.exitcode else []
+                outcome = "failed" if process.exitcode else "done"
+                print(f"{outcome}: {title(stored)}", flush=True)
     if failed:
         logs = ", ".join(f"{stored.path}.log" for stored in failed)
         raise InputError(f"the training of {len(failed)} programs failed: see {logs}")
