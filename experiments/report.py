@@ -5,6 +5,7 @@ A page is the text of ``notes/NAME.md`` with its slots, {{NAME ARGUMENTS}}, fill
 
 import csv
 import dataclasses
+import functools
 import inspect
 import itertools
 import pathlib
@@ -522,8 +523,9 @@ class Page:
         head = [panel, f"seeds above {threshold}", "interquartile mean"]
         return markdown_table(head, rows)
 
+    @functools.cached_property
     def _steps(self) -> shares.Steps:
-        """Return the steps until seeds solve their tasks, of complete curves."""
+        """The steps until seeds solve their tasks, of complete curves."""
         from_ = self.figure.solved_from
         if from_ is None:
             raise self._no_slot("shares")
@@ -538,9 +540,10 @@ class Page:
             if results.complete
         }
 
+    @functools.cached_property
     def _solved(self) -> shares.Solved:
-        """Return which seeds solve their task, of the curves that are complete."""
-        return {key: np.isfinite(steps) for key, steps in self._steps().items()}
+        """Which seeds solve their task, of the curves that are complete."""
+        return {key: np.isfinite(steps) for key, steps in self._steps.items()}
 
     def _sparse(self, kind: str) -> list[str]:
         """Return the panels of a kind of tasks.
@@ -586,7 +589,7 @@ class Page:
         Args:
           kind: the kind of tasks, see `_sparse`.
         """
-        steps, panels = self._steps(), self._sparse(kind)
+        steps, panels = self._steps, self._sparse(kind)
         names = self.figure.names(panels)
         rows = []
         for panel in panels:
@@ -614,7 +617,7 @@ class Page:
         Args:
           kind: the kind of tasks, see `_sparse`.
         """
-        solved, panels = self._solved(), self._sparse(kind)
+        solved, panels = self._solved, self._sparse(kind)
         return {
             name: float(np.mean([solved[p, name].mean() for p in panels]))
             for name in self.figure.names(panels)
@@ -645,7 +648,7 @@ class Page:
           kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
-        solved = self._solved()
+        solved = self._solved
         having = self._compared_on(solved, ours, kind)
         one = shares.compare(solved, [(p, *x) for x, ps in having.items() for p in ps])
         mean = shares.family(
@@ -675,7 +678,7 @@ class Page:
           kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
-        steps = self._steps()
+        steps = self._steps
         having = self._compared_on(steps, ours, kind)
         every = shares.family(
             {x: shares.sooner(steps, on, x[0], other=x[1]) for x, on in having.items()}
@@ -700,7 +703,7 @@ class Page:
           ours: the curve.
           *others: the curves whose leads are listed.
         """
-        solved = self._solved()
+        solved = self._solved
         tasks: dict[str, list[str]] = {}
         for other in others:
             for panel in self._sparse(""):
@@ -748,6 +751,7 @@ class Page:
         head = ["task", "agent", "hyperparameters", "trained with"]
         return markdown_table(head, rows)
 
+    @functools.cache  # noqa: B019  # The summaries have many of a page's slots too.
     def value(self, slot: str, *arguments: str) -> str:
         """Return the text of a slot.
 

@@ -151,10 +151,15 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
 
 
 class Store:
-    """The runs of a folder, with `run in store`, `store[run]` and `store.add`."""
+    """The runs of a folder, with `run in store`, `store[run]` and `store.add`.
+
+    Attributes:
+      folder: the folder.
+      answers: what was computed from the runs alone; forgotten when some are added.
+    """
 
     def __init__(self, folder: pathlib.Path):
-        self.folder = folder
+        self.folder, self.answers = folder, dict[Any, Any]()
         self._records: dict[str, dict[Run, Record]] = {}
 
     def _path(self, env: str) -> pathlib.Path:
@@ -184,6 +189,7 @@ class Store:
         read and written.
         """
         added = 0
+        self.answers.clear()
         self.folder.mkdir(parents=True, exist_ok=True)
         for env in sorted({run.env for run in records}):
             with run_folder.wait_for_lock(self.folder):

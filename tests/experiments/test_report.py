@@ -205,7 +205,7 @@ def test_a_table_and_a_tally(page):
     assert page.value("better", "", "ours", "other") == words
     del page.comparisons["two", "ours", "other"]
     words = "better than OTHER on 1 of 1 measured tasks"
-    assert page.value("better", "", "ours", "other") == words
+    assert page.better("", "ours", "other") == words
     assert "- one, ours - other: 100 [" in page.value("differences")
     assert "commit c, changed" in page.settings()
 
