@@ -47,10 +47,8 @@ from experiments.search import (
     PaperSearch,
     Point,
     Search,
-    SharedValues,
     SingleSetting,
     SparseSearch,
-    SparseShared,
     searches,
     solved_from,
 )
@@ -281,10 +279,13 @@ _EQUAL = joined(
     for delay in (1, DELAY)
     for arms, base in (
         (PAIR, Search),
-        ([Arm(_WITH_PPOS.format(x), x) for x in PAPERS[1:]], SharedValues),
+        (
+            [Arm(_WITH_PPOS.format(x), x) for x in PAPERS[1:]],
+            functools.partial(Search, chooser="ppo"),
+        ),
         (
             [Arm(_WITH_GASILS.format("ppo"), "ppo")],
-            functools.partial(SharedValues, chooser="ppo+gasil"),
+            functools.partial(Search, chooser="ppo+gasil"),
         ),
     )
 )
@@ -381,12 +382,14 @@ def _sparse_panels(
       shared: those on which agents have PPO's values too.
       total_steps: environment steps of each run.
     """
-    with_noveltys = functools.partial(SparseShared, chooser="ppo+novelty")
+    with_ppos, with_noveltys = (
+        functools.partial(SparseSearch, chooser=x) for x in ("ppo", "ppo+novelty")
+    )
     return [
         grid(own, arms, base=base, seeds=20, total_steps=total_steps)
         for own, arms, base in (
             (tasks, [*SPARSE_SPACES], SparseSearch),
-            (shared, _SPARSE_SHARED, SparseShared),
+            (shared, _SPARSE_SHARED, with_ppos),
             (tasks, [_CLONING_NOVELTY], with_noveltys),
         )
     ]

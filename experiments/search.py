@@ -15,7 +15,7 @@ import itertools
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -142,12 +142,16 @@ class Search:
       reward_delay: the environment's reward delay.
       decompose_rewards: whether to decompose delayed rewards; adaptive imitation does
         so in any case.
+      chooser: another agent. What its search chose is used in place of the own search's
+        choice, for all hyperparameters that both agents have.
     """
 
+    _final_seeds: ClassVar[range] = FINALIST_SEEDS
     env: str
     agent: str
     reward_delay: int = 1
     decompose_rewards: bool = False
+    chooser: str | None = None
 
     def algorithm(self, point: Point) -> Algorithm:
         """Return a point's algorithm."""
@@ -215,22 +219,44 @@ class Search:
     def requested(self, store: Store) -> list[Run]:
         """Return all runs of the search that are known so far."""
         runs = self.runs(self.points(store))
-        runs += self.runs(self.finalists(store), FINALIST_SEEDS)
+        runs += self.runs(self.finalists(store), self._final_seeds)
         return list(dict.fromkeys(itertools.chain(*runs)))
 
     def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
         """Return the best finalist and its scores, or None if runs are missing."""
         finalists = self.finalists(store)
-        scores = self.scores(finalists, store, FINALIST_SEEDS)
+        scores = self.scores(finalists, store, self._final_seeds)
         if scores is None or not finalists:
             return None
         chosen = int(scores.mean(axis=1).argmax())
         return finalists[chosen], scores[chosen]
 
     def chosen(self, store: Store) -> Point | None:
-        """Return the chosen point, or None if the search is incomplete."""
+        """Return the chosen point, or None if runs of a search are missing."""
         best = self.best(store)
-        return None if best is None else best[0]
+        if best is None or self.chooser is None:
+            return best and best[0]
+        other = dataclasses.replace(self, agent=self.chooser, chooser=None)
+        if (shared := other.chosen(store)) is None:
+            return None
+        own = self.algorithm({}).settings
+        return {**best[0], **{name: x for name, x in shared.items() if name in own}}
+
+
+class SingleStage(Search):
+    """A search that chooses among all of its points, which have the same seeds."""
+
+    _final_seeds = SEEDS
+
+    def finalists(self, store: Store) -> tuple[Point, ...]:
+        """Return all points of the search."""
+        return self.points(store)
+
+
+def _grid(space: Space) -> tuple[Point, ...]:
+    """Return all points of a space."""
+    rows = itertools.product(*space.values())
+    return tuple(dict(zip(space, row, strict=True)) for row in rows)
 
 
 #: The values of the paper's appendix, and for PPO+BC and PPO+SIL, of which it gives
@@ -258,17 +284,14 @@ PAPER_STEPS_OF = {"humanoid": 3_000_000}
 @functools.cache
 def paper_points(agent: str) -> tuple[Point, ...]:
     """Return the points of an agent's search under the paper's protocol."""
-    space = PAPER_SPACES[agent]
-    every = tuple(
-        dict(zip(space, row, strict=True)) for row in itertools.product(*space.values())
-    )
+    every = _grid(PAPER_SPACES[agent])
     if len(every) <= _PAPER_POINTS:
         return every
-    return _drawn(space, _PAPER_POINTS, f"paper {agent}")
+    return _drawn(PAPER_SPACES[agent], _PAPER_POINTS, f"paper {agent}")
 
 
 @dataclasses.dataclass(frozen=True)
-class PaperSearch(Search):
+class PaperSearch(SingleStage):
     """The search of one agent on one task under the paper's own protocol.
 
     It has the paper's batch, 2,048 steps of one environment that starts at age 0, and
@@ -303,19 +326,6 @@ class PaperSearch(Search):
         own = {"alpha": _HUMANOID["alpha"]} if self._has_schedule else {}
         return tuple({**point, **own} for point in points)
 
-    def requested(self, store: Store) -> list[Run]:
-        """Return all runs of the search."""
-        return list(itertools.chain(*self.runs(self.points(store))))
-
-    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """Return the best point and its scores, or None if runs are missing."""
-        points = self.points(store)
-        scores = self.scores(points, store)
-        if scores is None:
-            return None
-        chosen = int(scores.mean(axis=1).argmax())
-        return points[chosen], scores[chosen]
-
 
 #: The sparse tasks, and the ways to explore and imitate that are compared on them.
 SPARSE = tuple(
@@ -343,7 +353,7 @@ SPARSE_SPACES: Mapping[str, Space] = {
     "ppo+novelty": {**_ENTROPIES, "novelty_coefficient": (0.1, 1.0)},
     "ppo+bc+novelty": {**_ENTROPIES, "novelty_coefficient": (0.1, 1.0)},
 }
-_SPARSE_SEEDS, SPARSE_STEPS = range(1000, 1002), 500_000
+SPARSE_STEPS = 500_000
 #: What does not differ between agents on the sparse tasks.
 SPARSE_BASE: Point = {
     "total_steps": SPARSE_STEPS,
@@ -356,7 +366,7 @@ SPARSE_BASE: Point = {
 SPARSE_PROTOCOL = (
     f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps ({STEPS:,} for "
     "robots and navix), rewards normalized. For every agent six points were tried, "
-    f"each with {len(_SPARSE_SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
+    f"each with {len(SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
     f"{', '.join(x.partition(':')[2] for x in SPARSE_SEARCHED)}: three weights of the "
     "entropy, and two learning rates for PPO or two weights of imitation or of novelty "
     "for the others. The point with the highest return over the last fifth of "
@@ -366,7 +376,7 @@ SPARSE_PROTOCOL = (
 
 
 @dataclasses.dataclass(frozen=True)
-class SparseSearch(Search):
+class SparseSearch(SingleStage):
     """The search of an agent for one setting for all sparse tasks.
 
     The point with the highest mean progress, over the tasks of the search and two
@@ -382,52 +392,20 @@ class SparseSearch(Search):
 
     def points(self, store: Store) -> tuple[Point, ...]:
         """Return all points of the search."""
-        space = SPARSE_SPACES[self.agent]
-        rows = itertools.product(*space.values())
-        return tuple(dict(zip(space, row, strict=True)) for row in rows)
+        return _grid(SPARSE_SPACES[self.agent])
 
-    def requested(self, store: Store) -> list[Run]:
-        """Return the runs of the search on its own task."""
-        runs = self.runs(self.points(store), _SPARSE_SEEDS)
-        return list(itertools.chain(*runs))
-
-    def progress(self, store: Store) -> np.ndarray | None:
-        """Return the progress, (points, tasks, seeds), or None if runs are missing."""
-        points, every = self.points(store), []
+    def scores(
+        self, points: Iterable[Point], store: Store, seeds: Iterable[int] = SEEDS
+    ) -> np.ndarray | None:
+        """Return the progress, (points, seeds of all tasks), or None if runs lack."""
+        points, every = tuple(points), list[np.ndarray]()
         for env in SPARSE_SEARCHED:
-            own = dataclasses.replace(self, env=env)
-            scores = own.scores(points, store, _SPARSE_SEEDS)
+            one = dataclasses.replace(self, env=env)
+            scores = super(SparseSearch, one).scores(points, store, seeds)
             if scores is None:
                 return None
             every.append(np.clip(scores / solved_from(env), 0.0, 1.0))
-        return np.stack(every, axis=1)
-
-    def best(self, store: Store) -> tuple[Point, np.ndarray] | None:
-        """Return the best point and its progress, or None if runs are missing."""
-        progress = self.progress(store)
-        if progress is None:
-            return None
-        chosen = int(progress.mean(axis=(1, 2)).argmax())
-        return self.points(store)[chosen], progress[chosen].ravel()
-
-
-@dataclasses.dataclass(frozen=True)
-class SparseShared(SparseSearch):
-    """The search of an agent for one setting, with what another agent's search chose.
-
-    PPO's search tries learning rates, in place of a coefficient of imitation.
-
-    Attributes:
-      chooser: the agent whose values are used, also where the own search chose others.
-    """
-
-    chooser: str = "ppo"
-
-    def chosen(self, store: Store) -> Point | None:
-        """Return the chosen point with the chooser's values, or None if runs lack."""
-        own = super().chosen(store)
-        shared = SparseSearch(self.env, self.chooser).chosen(store)
-        return None if own is None or shared is None else {**own, **shared}
+        return np.hstack(every)
 
 
 @functools.cache
@@ -473,26 +451,6 @@ class SingleSetting(Search):
                 return None
             ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
-
-
-@dataclasses.dataclass(frozen=True)
-class SharedValues(Search):
-    """The search of an agent on a task, with another agent's choice of shared values.
-
-    Attributes:
-      chooser: the other agent. Values of hyperparameters that it does not have are
-        those that the agent's own search chose.
-    """
-
-    chooser: str = "ppo"
-
-    def chosen(self, store: Store) -> Point | None:
-        """Return the chosen point with the shared values, or None if runs lack."""
-        own = super().chosen(store)
-        shared = Search(self.env, self.chooser, self.reward_delay).chosen(store)
-        if own is None or shared is None:
-            return None
-        return {**own, **{name: shared[name] for name in _SHARED}}
 
 
 def importance(agent: str, store: Store) -> dict[str, float]:
@@ -563,43 +521,3 @@ def best_of(search: Search, store: Store) -> np.ndarray | None:
             ]
         )
     return np.mean(returns, axis=0)
-
-
-class Coverage(NamedTuple):
-    """The numbers of stored and planned runs of an agent on a task.
-
-    Points beyond the grid and the further seeds of the best points are only planned
-    once they are known. An incomplete search has no final runs yet.
-    """
-
-    panel: str
-    name: str
-    search: Search
-    searched: int
-    to_search: int
-    trained: int
-    to_train: int
-
-    @property
-    def complete(self) -> bool:
-        """Whether all planned runs are stored."""
-        return (self.searched, self.trained) == (self.to_search, self.to_train)
-
-
-def coverage(store: Store, curves: Iterable[tuple[str, str, Any]]) -> list[Coverage]:
-    """Return the coverage of each curve whose settings a search chooses.
-
-    Args:
-      store: the store of all runs.
-      curves: the curves, each with its panel and name.
-    """
-
-    def stored(runs: Any) -> Any:
-        return sum(run in store for run in runs)
-
-    rows = []
-    for panel, name, curve in curves:
-        runs = curve.search.requested(store)
-        counts = (stored(runs), len(runs), stored(curve.runs(store)), curve.seeds)
-        rows.append(Coverage(panel, name, curve.search, *counts))
-    return rows

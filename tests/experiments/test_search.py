@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from experiments import __main__, search
-from experiments.figures import FIGURES
 from experiments.report import Page
 from experiments.search import (
     AGENTS,
@@ -104,7 +103,7 @@ def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
 
 
 def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
-    store, mixed = Store(tmp_path), search.SharedValues("hopper", "ppo+bc")
+    store, mixed = Store(tmp_path), Search("hopper", "ppo+bc", chooser="ppo")
     chosen = {}
     for agent in ("ppo", "ppo+bc"):
         assert mixed.chosen(store) is None
@@ -153,20 +152,23 @@ def test_holes_of_the_plan_are_told(tmp_path, capsys):
     store, one = Store(tmp_path / "runs"), Search("hopper", "ppo", 20)
     drawn = one.points(store)
     fill(store, one, drawn, range(len(drawn)))
-    curves = FIGURES["matrix"].curves()
-    rows = {x.search: x for x in search.coverage(store, curves)}
-    # Where rewards are delayed, there is PPO with decomposed rewards too.
-    assert len(rows) == len(CELLS) * len(AGENTS) + len(TASKS)
-    mine, other = rows[one], rows[Search("hopper", "ppo", 1)]
-    assert mine.searched == 2 * len(drawn) < mine.to_search
-    assert (mine.trained, mine.to_train) == (0, 20) and not mine.complete
-    assert (other.searched, other.to_train) == (0, 10)
     assert __main__.main(["coverage", "--results", str(tmp_path)]) == 1
     printed = capsys.readouterr().out
-    line = next(x for x in printed.splitlines() if x.startswith("hopper-delayed"))
-    assert "humanoid (raw) ppo+gasil 0 of 64 0 of 10" in " ".join(printed.split())
-    words = f"hopper-delayed ppo {mine.searched} of {mine.to_search} 0 of 20"
-    assert line.split() == words.split()
+    of_matrix, _ = printed.split("paper_protocol")
+    _, *lines = of_matrix.splitlines()
+    # Where rewards are delayed, there is PPO with decomposed rewards too.
+    assert len(lines) == len(CELLS) * len(AGENTS) + len(TASKS)
+    planned = len(one.requested(store))
+    assert planned > 2 * len(drawn)
+    line = next(x for x in lines if x.startswith("hopper-delayed"))
+    assert line.split() == (
+        f"hopper-delayed ppo {2 * len(drawn)} of {planned} 0 of 20".split()
+    )
+    words = " ".join(printed.split())
+    assert f"hopper ppo 0 of {2 * len(drawn)} 0 of 10" in words
+    # With its schedule of alpha two of the 32 points are as others.
+    assert "humanoid (raw) ppo+gasil 0 of 60 0 of 10" in words
+    assert "humanoid-delayed (raw) ppo+gasil 0 of 64 0 of 10" in words
 
 
 def test_the_papers_protocol_has_the_appendix_s_values():
