@@ -9,7 +9,7 @@ import math
 import statistics
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,24 +28,31 @@ _VERDICTS = ("better", "not clear", "worse")
 Scores = Mapping[tuple[str, str], np.ndarray]
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
-    """A difference of interquartile means.
+class Effect(NamedTuple):
+    """A difference before its p-value is corrected.
 
     Attributes:
       middle: the difference.
-      low: the low end of its 95% interval.
-      high: the high end.
-      p: its p-value, corrected by Holm's method.
-      visible: the smallest true difference that would be found with a probability of
-        80%, at the level of the family's smallest p-value.
+      p: its p-value.
+      drawn: bootstrap samples of it, (draws,).
     """
 
     middle: float
-    low: float
-    high: float
     p: float
-    visible: float
+    drawn: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Difference:
+    """A difference of two curves.
+
+    Attributes:
+      middle: the difference.
+      p: its p-value, corrected by Holm's method.
+    """
+
+    middle: float
+    p: float
 
     @property
     def verdict(self) -> str:
@@ -54,8 +61,41 @@ class Comparison:
             return "not clear"
         return "better" if self.middle > 0 else "worse"
 
-    def __str__(self) -> str:
-        return in_words(self.middle, self.low, self.high)
+
+@dataclasses.dataclass(frozen=True)
+class Comparison(Difference):
+    """A difference with its interval, which is its text: f"{comparison:.2f}".
+
+    Attributes:
+      low: the low end of its 95% interval.
+      high: the high end.
+      visible: the smallest true difference that would be found with a probability of
+        80%, at the level of the family's smallest p-value.
+    """
+
+    low: float
+    high: float
+    visible: float
+
+    def __format__(self, spec: str) -> str:
+        return in_words(self.middle, self.low, self.high, spec)
+
+    def verdict_in_words(self, spec: str = "") -> str:
+        """Return the verdict; if it is not clear, with what would have been."""
+        if self.verdict != "not clear":
+            return self.verdict
+        return f"not clear (visible from {number(self.visible, spec)} on)"
+
+
+def judged(effects: Mapping[Any, Effect]) -> dict[Any, Comparison]:
+    """Return the comparisons of a family of tests."""
+    p_values = corrected({key: effect.p for key, effect in effects.items()})
+    compared = {}
+    for key, (middle, _, drawn) in effects.items():
+        low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
+        visible = visible_effect(drawn, len(effects))
+        compared[key] = Comparison(middle, p_values[key], low, high, visible)
+    return compared
 
 
 @functools.cache
@@ -107,20 +147,17 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         for key, terms in family.items()
         if all((panel, curve) in scores for _, panel, curve in terms)
     }
-    raw = {}
+    effects = {}
     for key, terms in complete.items():
         sides = [scores[panel, curve] for _, panel, curve in terms]
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
-        low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
         enough = all(len(x) >= FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
         p_value = bootstrap_p(drawn) if enough else 1.0
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
-        visible = visible_effect(drawn, len(complete))
-        raw[key] = Comparison(middle, low, high, p_value, visible)
-    p_values = corrected({key: x.p for key, x in raw.items()})
-    return {key: dataclasses.replace(x, p=p_values[key]) for key, x in raw.items()}
+        effects[key] = Effect(middle, p_value, drawn)
+    return judged(effects)
 
 
 def bootstrap_p(drawn: np.ndarray) -> float:
@@ -186,7 +223,7 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str)
     middle = np.mean([share_of_more(*pair) for pair in pairs])
     drawn = [share_of_more(*map(resampled, pair)) for pair in pairs]
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
-    return f"{middle:.2f} [{low:.2f}, {high:.2f}]"
+    return in_words(float(middle), low, high, ".2f")
 
 
 def counted(verdicts: Sequence[str]) -> str:
@@ -195,14 +232,14 @@ def counted(verdicts: Sequence[str]) -> str:
     return ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
 
 
-def number(value: float) -> str:
-    """Return a score as text, without decimals from 100 on."""
-    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}"
+def number(value: float, spec: str = "") -> str:
+    """Return a score as text; by default without decimals from 100 on."""
+    return format(value, spec or (".0f" if abs(value) >= 100 else ".1f"))
 
 
-def in_words(middle: float, low: float, high: float) -> str:
-    """Return a number and its interval as text."""
-    return f"{number(middle)} [{number(low)}, {number(high)}]"
+def in_words(middle: float, low: float, high: float, spec: str = "") -> str:
+    """Return a number and its interval as text, formatted as by `number`."""
+    return "{} [{}, {}]".format(*(number(x, spec) for x in (middle, low, high)))
 
 
 def interval(scores: np.ndarray) -> str:
@@ -210,7 +247,8 @@ def interval(scores: np.ndarray) -> str:
     middle = float(interquartile_mean(scores))
     if len(scores) < FEWEST_SEEDS:
         return number(middle)
-    return in_words(middle, *map(float, bootstrap_interval(scores)))
+    low, high = map(float, bootstrap_interval(scores))
+    return in_words(middle, low, high)
 
 
 def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
@@ -232,4 +270,4 @@ def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
     means = interquartile_mean(np.reshape(drawn, (len(drawn), -1)), axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     every = np.concatenate([x.repeat(most // len(x)) for x in scores])
-    return f"{float(interquartile_mean(every)):.2f} [{low:.2f}, {high:.2f}]"
+    return in_words(float(interquartile_mean(every)), low, high, ".2f")

@@ -25,6 +25,7 @@ from experiments.comparisons import (
     counted,
     improvement,
     interval,
+    judged,
     number,
     over_tasks,
 )
@@ -266,7 +267,7 @@ class Page:
             if favourite:
                 rival = str(self.figure.rival(panel, label))
                 against = self.comparisons.get((panel, rival, label))
-                cells += [str(against), against.verdict] if against else ["", ""]
+                cells += [f"{against}", against.verdict] if against else ["", ""]
             rows.append(cells)
         return markdown_table(head, rows)
 
@@ -560,13 +561,10 @@ class Page:
             == ("long" in kind)
         ]
 
-    def _compared_on(
-        self, solved: shares.Solved, ours: str, kind: str
-    ) -> dict[tuple[str, str], list[str]]:
-        """Return the panels on which two curves are compared, by these curves.
+    def _compared_on(self, ours: str, kind: str) -> dict[tuple[str, str], list[str]]:
+        """Return the panels on which two complete curves are compared, by these curves.
 
         Args:
-          solved: the curves that are complete.
           ours: the curve that is compared with each other one; empty for the figure's
             own comparisons.
           kind: the kind of tasks, see `_sparse`.
@@ -577,7 +575,10 @@ class Page:
             pairs = [(p, ours, x) for p in panels for x in self.figure.panels[p]]
         having: dict[tuple[str, str], list[str]] = {}
         for panel, first, second in pairs:
-            if {(panel, first), (panel, second)} <= solved.keys() and first != second:
+            if {
+                (panel, first),
+                (panel, second),
+            } <= self._solved.keys() and first != second:
                 having.setdefault((first, second), []).append(panel)
         return having
 
@@ -591,20 +592,20 @@ class Page:
         """
         steps, panels = self._steps, self._sparse(kind)
         names = self.figure.names(panels)
-        rows = []
-        for panel in panels:
-            if not any((panel, name) in steps for name in names):
-                continue
-            cells = [panel.removeprefix("sparse:")]
-            for name in names:
-                until = steps.get((panel, name))
-                if until is None:
-                    cells.append("")
-                    continue
-                solved = np.isfinite(until)
-                median = f" ({np.median(until[solved]) / 1000:.0f})"
-                cells.append(f"{solved.mean():.2f}{median if solved.any() else ''}")
-            rows.append(cells)
+
+        def cell(panel: str, name: str) -> str:
+            if (panel, name) not in steps:
+                return ""
+            until = steps[panel, name]
+            solved = until[np.isfinite(until)]
+            median = f" ({np.median(solved) / 1000:.0f})" if len(solved) else ""
+            return f"{len(solved) / len(until):.2f}{median}"
+
+        rows = [
+            [panel.removeprefix("sparse:"), *(cell(panel, name) for name in names)]
+            for panel in panels
+            if any((panel, name) in steps for name in names)
+        ]
         mean = self.mean_shares(kind)
         means = ["mean", *(f"{mean[x]:.2f}" if x in mean else "" for x in names)]
         return markdown_table(["task", *names], [*rows, means] if rows else [])
@@ -648,23 +649,18 @@ class Page:
           kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
-        solved = self._solved
-        having = self._compared_on(solved, ours, kind)
+        solved, having = self._solved, self._compared_on(ours, kind)
         one = shares.compare(solved, [(p, *x) for x, ps in having.items() for p in ps])
-        mean = shares.family(
-            {
-                x: shares.overall(solved, on, x[0], other=x[1])
-                for x, on in having.items()
-            }
-        )
+        mean = judged({x: shares.overall(solved, on, x) for x, on in having.items()})
         lines = []
-        for (first, second), on in having.items():
-            lead = mean[first, second]
+        for (first, second), lead in mean.items():
+            on = having[first, second]
             verdicts = [one[panel, first, second].verdict for panel in on]
             if second in (others or [second]):
                 lines.append(
-                    f"- {first} against {second}: mean share {lead}, "
-                    f"{lead.verdict_in_words}; {counted(verdicts)} of {len(on)} tasks."
+                    f"- {first} against {second}: mean share {lead:+z.2f}, "
+                    f"{lead.verdict_in_words('.2f')}; {counted(verdicts)} of {len(on)} "
+                    "tasks."
                 )
         return "\n".join(lines)
 
@@ -678,19 +674,17 @@ class Page:
           kind: the kind of tasks, see `_sparse`.
           *others: the curves to list the comparisons with; default all.
         """
-        steps = self._steps
-        having = self._compared_on(steps, ours, kind)
-        every = shares.family(
-            {x: shares.sooner(steps, on, x[0], other=x[1]) for x, on in having.items()}
-        )
+        having = self._compared_on(ours, kind)
+        every = {x: shares.sooner(self._steps, on, x) for x, on in having.items()}
         lines = []
-        for (first, second), lead in every.items():
+        for (first, second), lead in judged(every).items():
             if second in (others or [second]):
-                middle, low, high = (0.5 + x for x in lead.middle_and_interval)
+                ends = lead.middle, lead.low, lead.high
+                share = "{:.2f} [{:.2f}, {:.2f}]".format(*(0.5 + x for x in ends))
                 lines.append(
-                    f"- {first} sooner than {second}: with probability {middle:.2f} "
-                    f"[{low:.2f}, {high:.2f}], {lead.verdict_in_words}, on "
-                    f"{len(having[first, second])} tasks."
+                    f"- {first} sooner than {second}: with probability {share}, "
+                    f"{lead.verdict_in_words('.2f')}, on {len(having[first, second])} "
+                    "tasks."
                 )
         return "\n".join(lines)
 
@@ -710,18 +704,16 @@ class Page:
                 both = (panel, f"{panel}_noisy")
                 if {(p, x) for p in both for x in (ours, other)} <= solved.keys():
                     tasks.setdefault(other, []).append(panel)
-        changes = shares.family(
-            {
-                other: shares.change(
-                    solved, on, [f"{panel}_noisy" for panel in on], pair=(other, ours)
-                )
-                for other, on in tasks.items()
-            }
-        )
+        changes = {
+            other: shares.change(
+                solved, on, [f"{panel}_noisy" for panel in on], pair=(other, ours)
+            )
+            for other, on in tasks.items()
+        }
         return "\n".join(
-            f"- {other}'s lead over {ours}: {change} with noise, "
-            f"{change.verdict_in_words}, on {len(tasks[other])} tasks."
-            for other, change in changes.items()
+            f"- {other}'s lead over {ours}: {change:+z.2f} with noise, "
+            f"{change.verdict_in_words('.2f')}, on {len(tasks[other])} tasks."
+            for other, change in judged(changes).items()
         )
 
     def chosen(self) -> str:

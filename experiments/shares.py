@@ -4,21 +4,19 @@ Where a task is either solved or not, this says more than a mean return. Verdict
 corrected by Holm's method for the number of comparisons in their family.
 """
 
-import dataclasses
 import functools
 import math
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
 from experiments.comparisons import (
-    LEVEL,
+    Difference,
+    Effect,
     bootstrap_p,
     corrected,
     share_of_more,
-    visible_effect,
 )
 from experiments.store import Record
 
@@ -26,6 +24,8 @@ from experiments.store import Record
 Solved = Mapping[tuple[str, str], np.ndarray]
 #: The results of `steps_until_solved`, (seeds,), by panel and curve.
 Steps = Mapping[tuple[str, str], np.ndarray]
+#: Our curve, and the other one.
+Pair = tuple[str, str]
 _DRAWS = 10_000
 
 
@@ -60,26 +60,6 @@ def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
     return sum(as_rare) / math.comb(seeds, solved)
 
 
-@dataclasses.dataclass(frozen=True)
-class Difference:
-    """A difference of shares.
-
-    Attributes:
-      middle: the difference.
-      p: its p-value, corrected.
-    """
-
-    middle: float
-    p: float
-
-    @property
-    def verdict(self) -> str:
-        """Better, worse or not clear."""
-        if self.p > LEVEL:
-            return "not clear"
-        return "better" if self.middle > 0 else "worse"
-
-
 def compare(
     solved: Solved, pairs: Sequence[tuple[str, str, str]]
 ) -> dict[tuple[str, str, str], Difference]:
@@ -94,51 +74,12 @@ def compare(
     return {k: Difference(middle[k], p) for k, p in corrected(p_values).items()}
 
 
-@dataclasses.dataclass(frozen=True)
-class Lead(Difference):
-    """A difference of shares that is averaged over panels.
-
-    Attributes:
-      drawn: its bootstrap samples over seeds, drawn within each panel, (draws,).
-      comparisons: the number of comparisons in its family.
-    """
-
-    drawn: np.ndarray
-    comparisons: int = 1
-
-    def __str__(self) -> str:
-        return "{:+z.2f} [{:+z.2f}, {:+z.2f}]".format(*self.middle_and_interval)
-
-    @property
-    def middle_and_interval(self) -> tuple[float, float, float]:
-        """The difference, and the ends of its 95% interval."""
-        low, high = np.percentile(self.drawn, [2.5, 97.5])
-        return self.middle, float(low), float(high)
-
-    @property
-    def verdict_in_words(self) -> str:
-        """The verdict; if it is not clear, with what would have been."""
-        if self.verdict != "not clear":
-            return self.verdict
-        visible = visible_effect(self.drawn, self.comparisons)
-        return f"not clear (visible from {visible:.2f} on)"
-
-
-def family(leads: Mapping[Any, Lead]) -> dict[Any, Lead]:
-    """Return the leads of a family with their p-values corrected."""
-    p_values = corrected({key: lead.p for key, lead in leads.items()})
-    count = len(leads)
-    return {
-        key: dataclasses.replace(lead, p=p_values[key], comparisons=count)
-        for key, lead in leads.items()
-    }
+def _generator(pair: Pair) -> np.random.Generator:
+    return np.random.default_rng(zlib.crc32("/".join(pair).encode()))
 
 
 def _mean_lead(
-    solved: Solved,
-    panels: Sequence[str],
-    pair: tuple[str, str],
-    rng: np.random.Generator,
+    solved: Solved, panels: Sequence[str], pair: Pair, rng: np.random.Generator
 ) -> tuple[float, np.ndarray]:
     """Return the mean over panels of a pair's difference, and its bootstrap draws."""
     middle, drawn = 0.0, np.zeros(_DRAWS)
@@ -150,60 +91,56 @@ def _mean_lead(
     return middle / len(panels), drawn / len(panels)
 
 
-def overall(solved: Solved, panels: Sequence[str], ours: str, *, other: str) -> Lead:
+def overall(solved: Solved, panels: Sequence[str], pair: Pair) -> Effect:
     """Return the mean difference over panels.
 
-    The p-value, not corrected, is that of a permutation of seeds within each panel.
+    The p-value is that of a permutation of seeds within each panel.
     """
-    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
-    middle, drawn = _mean_lead(solved, panels, (ours, other), rng)
+    rng = _generator(pair)
+    middle, drawn = _mean_lead(solved, panels, pair, rng)
     dealt = np.zeros(_DRAWS)
     for panel in panels:
-        first, second = solved[panel, ours], solved[panel, other]
+        first, second = (solved[panel, curve] for curve in pair)
         total = int(first.sum() + second.sum())
         left = len(first) + len(second) - total
         got = rng.hypergeometric(total, left, len(first), _DRAWS)
         dealt += got / len(first) - (total - got) / len(second)
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) * len(panels) - 1e-9))
-    return Lead(middle, (1 + as_far) / (1 + _DRAWS), drawn)
+    return Effect(middle, (1 + as_far) / (1 + _DRAWS), drawn)
 
 
 def change(
-    solved: Solved,
-    panels: Sequence[str],
-    others: Sequence[str],
-    *,
-    pair: tuple[str, str],
-) -> Lead:
+    solved: Solved, panels: Sequence[str], others: Sequence[str], *, pair: Pair
+) -> Effect:
     """Return how much a pair's mean difference is larger on other panels.
 
-    The p-value, not corrected, is that of the percentile bootstrap.
+    The p-value is that of the percentile bootstrap.
     """
-    rng = np.random.default_rng(zlib.crc32("/".join(pair).encode()))
+    rng = _generator(pair)
     before, after = (_mean_lead(solved, x, pair, rng) for x in (panels, others))
     drawn = after[1] - before[1]
-    return Lead(after[0] - before[0], bootstrap_p(drawn), drawn)
+    return Effect(after[0] - before[0], bootstrap_p(drawn), drawn)
 
 
-def sooner(steps: Steps, panels: Sequence[str], ours: str, *, other: str) -> Lead:
+def sooner(steps: Steps, panels: Sequence[str], pair: Pair) -> Effect:
     """Return how much more often than not a seed of ours is sooner.
 
     It is the probability that a random seed of ours solves its task in fewer steps than
     a random seed of the other curve, where equal ones count half, less one half,
-    averaged over panels. The p-value, not corrected, is that of a permutation of seeds
-    within each panel.
+    averaged over panels. The p-value is that of a permutation of seeds within each
+    panel.
     """
-    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
-    middle, dealt, drawn = 0.0, np.zeros(_DRAWS), np.zeros(_DRAWS)
+    rng, middle = _generator(pair), 0.0
+    dealt, drawn = np.zeros(_DRAWS), np.zeros(_DRAWS)
     for panel in panels:
-        pair = steps[panel, ours], steps[panel, other]
+        both = [steps[panel, curve] for curve in pair]
         # Ours is sooner where the other's steps are more.
-        middle += float(share_of_more(*pair[::-1])) - 0.5
-        all_seeds = np.tile(np.concatenate(pair), (_DRAWS, 1))
-        parts = np.split(rng.permuted(all_seeds, axis=1), [len(pair[0])], axis=1)
+        middle += float(share_of_more(*both[::-1])) - 0.5
+        all_seeds = np.tile(np.concatenate(both), (_DRAWS, 1))
+        parts = np.split(rng.permuted(all_seeds, axis=1), [len(both[0])], axis=1)
         dealt += share_of_more(*parts[::-1]) - 0.5
-        resampled = [rng.choice(x, (_DRAWS, len(x))) for x in pair]
+        resampled = [rng.choice(x, (_DRAWS, len(x))) for x in both]
         drawn += share_of_more(*resampled[::-1]) - 0.5
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
     p_value = (1 + as_far) / (1 + _DRAWS)
-    return Lead(middle / len(panels), p_value, drawn / len(panels))
+    return Effect(middle / len(panels), p_value, drawn / len(panels))

@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import plots, report
-from experiments.comparisons import number
 from experiments.curves import name_of
 from experiments.figures import FIGURES
 from experiments.report import Page
@@ -223,9 +222,7 @@ class Summary:
                 words = "not measured yet"
                 if key in compared:
                     one = compared[key]
-                    words = f"{one}, {one.verdict}"
-                    if one.verdict == "not clear":
-                        words += f" (visible from {number(one.visible)} on)"
+                    words = f"{one}, {one.verdict_in_words()}"
                 other = key[2].partition(" (")[0]
                 rows.setdefault((key[0], other), {})[protocol] = words
         return report.markdown_table(

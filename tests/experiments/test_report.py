@@ -381,7 +381,7 @@ def test_a_claim_is_only_judged_when_its_cases_decide(
     keys = [("panel", "ppo+gasil", f"other {i}") for i in range(3)]
     of = {"better": (1.0, 0.0), "worse": (-1.0, 0.0), "not clear": (1.0, 1.0)}
     results = {
-        key: comparisons.Comparison(of[verdict][0], 0.0, 0.0, of[verdict][1], 0.0)
+        key: comparisons.Comparison(*of[verdict], low=0.0, high=0.0, visible=0.0)
         for key, verdict in zip(keys, verdicts, strict=False)
     }
     monkeypatch.setattr(made.pages["matrix"], "comparisons", results)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from experiments import report, shares
+from experiments import comparisons, report, shares
 from experiments.figures import FIGURES
 from experiments.search import (
     SPARSE,
@@ -43,6 +43,10 @@ def test_a_seed_solves_a_task_with_half_of_a_successs_return():
     assert until(0, 0.4) == until(1, 0.49) == until(0, np.nan) == np.inf
 
 
+def alone_in_its_family(effect):
+    return comparisons.judged({"": effect})[""]
+
+
 def test_differences_are_corrected_and_the_mean_is_over_panels():
     some = lambda count: np.arange(20) < count
     solved = {(p, "a"): some(18) for p in "xyz"} | {(p, "b"): some(4) for p in "xyz"}
@@ -53,11 +57,11 @@ def test_differences_are_corrected_and_the_mean_is_over_panels():
     ]
     alone = shares.fisher_p(18, 20, 4, 20)
     assert result["x", "a", "b"].p == pytest.approx(3 * alone)
-    lead = shares.overall(solved, "xyz", "a", other="b")
-    middle, low, high = lead.middle_and_interval
-    assert middle == pytest.approx((14 + 14 + 1) / 60) and low < middle < high
-    assert lead.p < 0.001 and lead.verdict_in_words == "better"
-    assert shares.overall(solved, "xyz", "a", other="a").p == 1.0
+    lead = alone_in_its_family(shares.overall(solved, "xyz", ("a", "b")))
+    assert lead.middle == pytest.approx((14 + 14 + 1) / 60)
+    assert lead.low < lead.middle < lead.high
+    assert lead.p < 0.001 and lead.verdict_in_words() == "better"
+    assert shares.overall(solved, "xyz", ("a", "a")).p == 1.0
 
 
 def test_who_is_sooner_is_the_rank_sum_test():
@@ -73,17 +77,16 @@ def test_who_is_sooner_is_the_rank_sum_test():
         ours, other = steps[panel, "a"], steps[panel, "b"]
         wins = scipy.stats.mannwhitneyu(other, ours).statistic
         expected.append(wins / 15**2 - 0.5)
-    lead = shares.sooner(steps, "xy", "a", other="b")
-    middle, low, high = lead.middle_and_interval
-    assert middle == pytest.approx(np.mean(expected)) and 0.1 < middle < high
-    assert low < middle and lead.p < 0.01
+    lead = alone_in_its_family(shares.sooner(steps, "xy", ("a", "b")))
+    assert lead.middle == pytest.approx(np.mean(expected)) and lead.middle > 0.1
+    assert lead.low < lead.middle < lead.high and lead.p < 0.01
     # One task alone has SciPy's p-value, which is that of a normal distribution.
     exact = scipy.stats.mannwhitneyu(steps["x", "a"], steps["x", "b"]).pvalue
-    alone = shares.sooner(steps, "x", "a", other="b")
+    alone = shares.sooner(steps, "x", ("a", "b"))
     assert alone.p == pytest.approx(exact, abs=0.02)
-    back = shares.sooner(steps, "xy", "b", other="a")
-    assert back.middle == pytest.approx(-middle) and back.p < 0.01
-    same = shares.sooner(steps, "xy", "a", other="a")
+    back = shares.sooner(steps, "xy", ("b", "a"))
+    assert back.middle == pytest.approx(-lead.middle) and back.p < 0.01
+    same = shares.sooner(steps, "xy", ("a", "a"))
     assert same.middle == pytest.approx(0.0) and same.p == 1.0
 
 
@@ -91,11 +94,12 @@ def test_a_change_of_leads_has_the_spread_of_four_shares():
     some = lambda count: np.arange(20) < count
     solved = {("x", "a"): some(15), ("x", "b"): some(5)}
     solved |= {("noisy", "a"): some(8), ("noisy", "b"): some(10)}
-    change = shares.change(solved, "x", ["noisy"], pair=("a", "b"))
-    middle, low, high = change.middle_and_interval
-    assert middle == pytest.approx(-0.1 - 0.5)
+    effect = shares.change(solved, "x", ["noisy"], pair=("a", "b"))
+    change = alone_in_its_family(effect)
+    assert change.middle == pytest.approx(-0.1 - 0.5)
     deviation = np.sqrt(sum(x.mean() * (1 - x.mean()) / 20 for x in solved.values()))
-    assert (high - low) / 2 == pytest.approx(1.96 * deviation, rel=0.06)
+    half = (change.high - change.low) / 2
+    assert half == pytest.approx(1.96 * deviation, rel=0.06)
     normal_p = 2 * scipy.stats.norm.sf(0.6 / deviation)
     assert change.p == pytest.approx(normal_p, abs=5e-3)
     none = shares.change(solved, "x", "x", pair=("a", "b"))
@@ -103,11 +107,11 @@ def test_a_change_of_leads_has_the_spread_of_four_shares():
     # Of a single comparison, 1.96 + 0.84 deviations would be found.
     deviation = np.sqrt(2 * (0.75 * 0.25 + 0.25 * 0.75) / 20)
     words = f"not clear (visible from {2.80 * deviation:.2f} on)"
-    assert shares.family({"": none})[""].verdict_in_words == words
-    pair = shares.family({"changed": change, "none": none})
+    alone = alone_in_its_family(none)
+    assert alone.verdict_in_words(".2f") == words
+    pair = comparisons.judged({"changed": effect, "none": none})
     assert pair["changed"].p == pytest.approx(2 * change.p)
-    visible = [float(x.verdict_in_words.split()[-2]) for x in (none, pair["none"])]
-    assert visible[0] < visible[1]
+    assert alone.visible < pair["none"].visible
 
 
 def test_one_point_is_chosen_for_all_tasks(tmp_path):
