@@ -3,7 +3,7 @@
 import dataclasses
 import itertools
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.search import DELAY, PAPERS, Point, Search
@@ -30,10 +30,7 @@ class Curve:
       agent: name of the agent.
       changes: settings of the algorithm to change, by name.
       reward_delay: the task's reward delay, in steps.
-      obs_noise: standard deviation of the task's observation noise.
-      action_noise: noise on the task's actions, see `Settings`.
-      terminal_limits: whether the task's step limit terminates an episode.
-      observe_phase: whether the observation has the phase of the task's delay.
+      settings: other settings of the task, by name.
       base: the settings before the changes: a preset's, by its name; the defaults, by
         None; or what a search chose, by a function of task, agent and
         delay that returns the search.
@@ -46,10 +43,7 @@ class Curve:
     agent: str
     changes: Point = dataclasses.field(default_factory=dict)
     reward_delay: int = 1
-    obs_noise: float = 0.0
-    action_noise: float = 0.0
-    terminal_limits: bool = False
-    observe_phase: bool = False
+    settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     base: str | Callable[[str, str, int], Search] | None = "tuned"
     seeds: int = 10
     first_seed: int = 0
@@ -93,13 +87,7 @@ class Curve:
                 self.env, self.agent, self.base, reward_delay=self.reward_delay
             )
         algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
-        settings = Settings(
-            reward_delay=self.reward_delay,
-            obs_noise=self.obs_noise,
-            action_noise=self.action_noise,
-            terminal_limits=self.terminal_limits,
-            observe_phase=self.observe_phase,
-        )
+        settings = Settings(reward_delay=self.reward_delay, **self.settings)
         seeds = range(self.first_seed, self.first_seed + self.seeds)
         return tuple(Run(self.env, algorithm, seed, settings) for seed in seeds)
 
@@ -217,6 +205,13 @@ class Figure:
 def difference(panel: str, ours: str, other: str) -> Terms:
     """Return the terms of one curve less another of the same panel."""
     return ((1.0, panel, ours), (-1.0, panel, other))
+
+
+def differences(
+    panels: Iterable[str], pairs: Collection[tuple[str, str]]
+) -> Comparisons:
+    """Return the comparisons of pairs of curves, (ours, other), in each panel."""
+    return {(panel, *x): difference(panel, *x) for panel in panels for x in pairs}
 
 
 def name_of(env: str, reward_delay: int = 1) -> str:

@@ -23,6 +23,7 @@ from experiments.curves import (
     Panels,
     Terms,
     difference,
+    differences,
     grid,
     joined,
     name_of,
@@ -31,6 +32,7 @@ from experiments.search import (
     ADAPTIVE,
     CELLS,
     DELAY,
+    HUMANOID,
     NEW_TASKS,
     PAIR,
     PAPER_STEPS_OF,
@@ -102,12 +104,7 @@ _EFFECTS = joined(
     for delay in (1, DELAY)
     for name, values in _VALUES.items()
 )
-#: The paper's schedule of alpha for humanoid (appendix).
-_SCHEDULED = Arm(
-    "ppo+gasil-from-2M",
-    "ppo+gasil",
-    {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))},
-)
+_SCHEDULED = Arm("ppo+gasil-from-2M", "ppo+gasil", HUMANOID)
 
 
 def _adaptive(name: str, **changes: Any) -> Arm:
@@ -194,7 +191,7 @@ def _decomposition_panels(env: str, delay: int) -> Panels:
     return joined(
         [
             one(_CONTROLS, base="scaled"),
-            one([_SEES_PHASE], base="scaled", observe_phase=True),
+            one([_SEES_PHASE], base="scaled", settings={"observe_phase": True}),
             # Their coefficients are the defaults.
             one(imitating, base=None),
         ]
@@ -291,13 +288,14 @@ _EQUAL = joined(
 )
 
 
-def _equal_comparisons() -> Comparisons:
-    """Compare PPO+GASIL with each other agent that has the same values."""
-    gasil = _WITH_PPOS.format("ppo+gasil")
-    pairs = [(gasil, "ppo")]
-    pairs += [(gasil, _WITH_PPOS.format(x)) for x in ("ppo+bc", "ppo+sil")]
-    pairs += [("ppo+gasil", _WITH_GASILS.format("ppo"))]
-    return {(panel, *x): difference(panel, *x) for panel in _EQUAL for x in pairs}
+#: PPO+GASIL, and each other agent that has the same values.
+_EQUAL_PAIRS = [
+    *(
+        (_WITH_PPOS.format("ppo+gasil"), other)
+        for other in ("ppo", _WITH_PPOS.format("ppo+bc"), _WITH_PPOS.format("ppo+sil"))
+    ),
+    ("ppo+gasil", _WITH_GASILS.format("ppo")),
+]
 
 
 def _paper_panel(
@@ -338,15 +336,16 @@ _PROTOCOL = joined(
 )
 
 
+_LIMITED = [f"{agent} (terminal limits)" for agent in PAIR]
 _LIMITS = joined(
     grid(
         TASKS[:4],
-        [Arm(f"{x} (terminal limits)" if terminal else x, x) for x in PAIR],
+        [Arm(*x) for x in zip(names, PAIR)],
         (DELAY,),
         base=PaperSearch,
-        terminal_limits=terminal,
+        settings={"terminal_limits": terminal},
     )
-    for terminal in (False, True)
+    for names, terminal in ((PAIR, False), (_LIMITED, True))
 )
 
 
@@ -359,7 +358,7 @@ def _changes() -> Comparisons:
     pairs += [("cloning", centred), ("cloning", "ppo"), ("novel ties", "cloning")]
     pairs += [(x.name, "cloning") for x in _CAUSES if x.name.startswith("cloning,")]
     pairs += [("novelty", "ppo"), (both, "novelty"), (f"{both}, oldest of ties", both)]
-    return {(p, *x): difference(p, *x) for p in _CAUSE_TASKS for x in pairs}
+    return differences(_CAUSE_TASKS, pairs)
 
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
@@ -398,6 +397,12 @@ def _sparse_panels(
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
 _GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
 _CENTRED = {**_GASIL, "bonus": "centered"}
+#: What may differ in how a buffer is filled, by name.
+_BUFFERS: Mapping[str, Point] = {
+    "better episodes": {"admission": "better"},
+    "newest of ties": {"ties": "newest"},
+    "10,000 steps": {"buffer_steps": 10_000},
+}
 _CAUSES = [
     Arm("ppo", "ppo"),
     Arm("gasil, as the paper", "ppo+gasil", _GASIL),
@@ -406,22 +411,14 @@ _CAUSES = [
     Arm("gasil, centered", "ppo+gasil", _CENTRED),
     *(
         Arm(f"gasil, centered, {name}", "ppo+gasil", {**_CENTRED, **changes})
-        for name, changes in (
-            ("better episodes", {"admission": "better"}),
-            ("newest of ties", {"ties": "newest"}),
-            ("10,000 steps", {"buffer_steps": 10_000}),
-        )
+        for name, changes in _BUFFERS.items()
     ),
     Arm("cloning", "ppo+bc", _CLONED),
     *(
         Arm(f"cloning, {name}", "ppo+bc", {**_CLONED, **changes})
-        for name, changes in (
-            ("better episodes", {"admission": "better"}),
-            ("newest of ties", {"ties": "newest"}),
-            ("10,000 steps", {"buffer_steps": 10_000}),
-            ("one episode", {"buffer_episodes": 1}),
-        )
+        for name, changes in _BUFFERS.items()
     ),
+    Arm("cloning, one episode", "ppo+bc", {**_CLONED, "buffer_episodes": 1}),
     Arm("cloning, by the gap", "ppo+bc-adaptive", _CLONED),
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
@@ -494,14 +491,9 @@ FIGURES: Mapping[str, Figure] = {
         "The paper's own protocol with terminal time limits",
         "",
         _LIMITS,
-        comparisons={
-            (panel, ours, other): difference(panel, ours, other)
-            for panel in _LIMITS
-            for ours, other in (
-                *((f"{x} (terminal limits)", x) for x in PAIR),
-                tuple(f"{x} (terminal limits)" for x in PAIR[::-1]),
-            )
-        },
+        comparisons=differences(
+            _LIMITS, [*zip(_LIMITED, PAIR), (_LIMITED[1], _LIMITED[0])]
+        ),
     ),
     "delayed_rewards": Figure(
         "Delayed rewards: PPO on decomposed rewards beside all others",
@@ -604,14 +596,20 @@ FIGURES: Mapping[str, Figure] = {
         "The paper's agents with equal settings",
         "",
         _EQUAL,
-        comparisons=_equal_comparisons(),
+        comparisons=differences(_EQUAL, _EQUAL_PAIRS),
     ),
     "stochastic_walker2d": Figure(
         "Walker2d with noisy observations (paper, figure 6)",
         "The gap between PPO and PPO+GASIL is larger when Gaussian noise, of standard "
         "deviation 0.05, 0.1 and 0.5, is added to the observations.",
         joined(
-            grid(("walker2d",), PAIR, panel=f"noise {x:g}", obs_noise=x, base=Search)
+            grid(
+                ("walker2d",),
+                PAIR,
+                panel=f"noise {x:g}",
+                settings={"obs_noise": x},
+                base=Search,
+            )
             for x in _NOISES
         ),
         comparisons=_noise_comparisons(),
@@ -691,7 +689,7 @@ FIGURES: Mapping[str, Figure] = {
                     SPARSE_GRIDS,
                     [*SPARSE_SPACES],
                     panel="{env}_noisy",
-                    action_noise=0.1,
+                    settings={"action_noise": 0.1},
                     base=SparseSearch,
                     seeds=20,
                     total_steps=STEPS,
@@ -730,11 +728,7 @@ FIGURES: Mapping[str, Figure] = {
             seeds=20,
             total_steps=SPARSE_STEPS,
         ),
-        comparisons={
-            (panel, f"{agent} (raw)", agent): difference(panel, f"{agent} (raw)", agent)
-            for panel in _SEAS
-            for agent in SPARSE_SPACES
-        },
+        comparisons=differences(_SEAS, [(f"{x} (raw)", x) for x in SPARSE_SPACES]),
         solved_from=solved_from,
     ),
 }

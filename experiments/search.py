@@ -276,7 +276,7 @@ _PAPER_POINTS = 32
 
 #: The paper's rule for humanoid with dense rewards: alpha is 0 for 2M steps and then
 #: raised to 0.02 until 3M.
-_HUMANOID: Point = {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))}
+HUMANOID: Point = {"alpha": 0.02, "alpha_schedule": ((2e6, 0.0), (3e6, 1.0))}
 #: The steps of a run under the paper's protocol where they are not `STEPS`.
 PAPER_STEPS_OF = {"humanoid": 3_000_000}
 
@@ -313,7 +313,7 @@ class PaperSearch(SingleStage):
             stagger_episodes=False,
             normalize_rewards=self.normalize_rewards,
         )
-        return base.replace(**_HUMANOID) if self._has_schedule else base
+        return base.replace(**HUMANOID) if self._has_schedule else base
 
     @property
     def _has_schedule(self) -> bool:
@@ -323,7 +323,7 @@ class PaperSearch(SingleStage):
     def points(self, store: Store) -> tuple[Point, ...]:
         """Return all points of the search."""
         points = paper_points(self.agent)
-        own = {"alpha": _HUMANOID["alpha"]} if self._has_schedule else {}
+        own = {"alpha": HUMANOID["alpha"]} if self._has_schedule else {}
         return tuple({**point, **own} for point in points)
 
 
@@ -470,11 +470,7 @@ def importance(agent: str, store: Store) -> dict[str, float]:
             shares.append({name: share or 0.0 for name, share in explained.items()})
     if not shares:
         return {}
-
-    def mean(name: str) -> float:
-        return float(np.mean([x[name] for x in shares]))
-
-    return {name: max(0.0, mean(name)) for name in points[0]}
+    return {n: max(0.0, float(np.mean([x[n] for x in shares]))) for n in points[0]}
 
 
 def mean_ranks(
