@@ -134,19 +134,12 @@ class Results:
     """The stored runs of a curve, which may be only some of its seeds."""
 
     curve: Curve
-    point: Mapping[str, Any]
     records: Mapping[Run, Record]
 
     @property
     def complete(self) -> bool:
         """Whether the runs of all seeds are stored."""
         return len(self.records) == self.curve.seeds
-
-    @property
-    def seeds_in_words(self) -> str:
-        """The number of stored seeds as text, such as "8 of 10"."""
-        of = "" if self.complete else f" of {self.curve.seeds}"
-        return f"{len(self.records)}{of}"
 
     @property
     def final(self) -> np.ndarray:
@@ -158,18 +151,6 @@ class Results:
         """The mean returns of the last policies' mean actions, (evaluated seeds,)."""
         evaluations = [record.evaluation_return for record in self.records.values()]
         return np.array([returns[-1] for returns in evaluations if len(returns)])
-
-    @property
-    def evaluated_in_words(self) -> str:
-        """The interquartile mean of `evaluated` as text.
-
-        If not all stored seeds were evaluated, the number of evaluated ones follows.
-        """
-        if not len(self.evaluated):
-            return ""
-        count = len(self.evaluated)
-        of = "" if count == len(self.records) else f" ({count})"
-        return f"{number(float(interquartile_mean(self.evaluated)))}{of}"
 
     def provenance(self) -> str:
         """Return physics, versions, devices and commits of the seeds as text."""
@@ -239,8 +220,7 @@ class Page:
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
                 continue
-            point = curve.point(self.searched) or {}
-            results = Results(curve, point, {run: store[run] for run in runs})
+            results = Results(curve, {run: store[run] for run in runs})
             self.results[panel, label] = results
             if results.complete:
                 self.scores[panel, label] = results.final
@@ -262,8 +242,12 @@ class Page:
         head += [f"{favourite} ahead by", f"{favourite} is"] if favourite else []
         rows = []
         for (panel, label), results in self.results.items():
-            cells = [panel, label, results.seeds_in_words, interval(results.final)]
-            cells.append(results.evaluated_in_words)
+            count, evaluated = len(results.records), results.evaluated
+            seeds = f"{count}" + f" of {results.curve.seeds}" * (not results.complete)
+            cells = [panel, label, seeds, interval(results.final), ""]
+            if len(evaluated):
+                of = f" ({len(evaluated)})" * (len(evaluated) < count)
+                cells[-1] = f"{number(float(interquartile_mean(evaluated)))}{of}"
             if favourite:
                 rival = str(self.figure.rival(panel, label))
                 against = self.comparisons.get((panel, rival, label))
@@ -393,28 +377,21 @@ class Page:
         resampled. A curve without scores on all of the tasks is left out.
         """
         panels_of: dict[str, list[str]] = {}
+        unit_of, rows = {}, []
         for panel, curves in self.figure.panels.items():
             curve = next(iter(curves.values()))
-            if (name_of(curve.env), unit) in self.scores:
+            if (dense := (name_of(curve.env), unit)) in self.scores:
                 kind = "delayed" if curve.reward_delay > 1 else "dense"
                 panels_of.setdefault(kind, []).append(panel)
-        rows = []
+                unit_of[panel] = float(interquartile_mean(self.scores[dense]))
         for kind, panels in panels_of.items():
             for name in self.figure.names(panels):
-                having = [panel for panel in panels if (panel, name) in self.scores]
-                if having == panels:
-                    words = over_tasks(
-                        name, [self._relative(p, name, unit) for p in panels]
-                    )
+                if all((panel, name) in self.scores for panel in panels):
+                    relative = [self.scores[x, name] / unit_of[x] for x in panels]
+                    words = over_tasks(name, relative)
                     rows.append([kind, name, f"{len(panels)}", words])
         head = ["rewards", "agent", "tasks", f"return in units of dense {unit}'s"]
         return markdown_table(head, rows)
-
-    def _relative(self, panel: str, name: str, unit: str) -> np.ndarray:
-        """Return a curve's scores in units of a dense one's on the same task."""
-        env = next(iter(self.figure.panels[panel].values())).env
-        dense = self.scores[name_of(env), unit]
-        return self.scores[panel, name] / float(interquartile_mean(dense))
 
     def grids(self) -> str:
         """Return a table of the searches' grids and the values beyond them."""
@@ -736,7 +713,7 @@ class Page:
             if isinstance(results.curve.base, str):
                 words = point_in_words(changed(algorithm))
             else:
-                words = point_in_words(results.point)
+                words = point_in_words(results.curve.point(self.searched) or {})
                 is_normalized = algorithm.settings["normalize_rewards"]
                 words += ", rewards normalized" if is_normalized else ""
             rows.append([*names, words, results.provenance()])
