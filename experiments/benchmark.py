@@ -248,14 +248,11 @@ def training_row(
     count = np.int32(options.iterations)
     newest = [jax.block_until_ready(advance(states, count, batch.data))[0]]
 
-    def run() -> float:
-        began = time.perf_counter()
-        newest.append(
-            jax.block_until_ready(advance(newest.pop(), count, batch.data))[0]
-        )
-        steps = options.iterations * batch_steps * seeds
-        return steps / (time.perf_counter() - began)
+    def train() -> Any:
+        newest.append(advance(newest.pop(), count, batch.data)[0])
+        return newest
 
+    run = functools.partial(_speed, train, options.iterations * batch_steps * seeds)
     name = f"ppo+gasil, {variant}"
     return Row(env_name, name, seeds * num_envs, run, compile_seconds)
 

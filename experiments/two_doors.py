@@ -120,38 +120,42 @@ class Cloning(PPOBC):
         return jnp.zeros_like(advantages[..., 0]), {}
 
 
-#: The agents by name, each with its settings.
-_LEARNING: Point = {**SPARSE_BASE, "entropy_coefficient": 0.01}
 _CLONING = {"behavior_cloning_coefficient": 1.0}
+#: Agents that learn from the reward and their own buffer, by name.
+_LEARNING: Mapping[str, tuple[str, Point]] = {
+    title: (name, {**SPARSE_BASE, "entropy_coefficient": 0.01, **own})
+    for title, name, own in (
+        ("ppo+bc", "ppo+bc", _CLONING),
+        ("ppo+bc+novelty", "ppo+bc+novelty", _CLONING),
+        ("ppo+gasil, centered", "ppo+gasil", {"alpha": 0.1, "bonus": "centered"}),
+    )
+}
+#: All agents by name, each with its settings. Where it is shared, episodes of one way
+#: share their return in the buffer.
 AGENTS_OF: Mapping[str, tuple[str, Point]] = {
     "cloning of given episodes": (
         Cloning.name,
         {
-            **{"num_epochs": 1, "behavior_cloning_updates": 100, **_CLONING},
+            "num_epochs": 1,
             "learning_rate": 1e-3,
+            "behavior_cloning_updates": 100,
+            **_CLONING,
         },
     ),
     "gail": (
         "gail",
         {
-            **{"alpha": 1.0, "bonus": "centered", "discriminator_updates": 20},
-            **{"discriminator_learning_rate": 3e-4, "entropy_coefficient": 0.01},
+            "alpha": 1.0,
+            "bonus": "centered",
+            "discriminator_updates": 20,
+            "discriminator_learning_rate": 3e-4,
+            "entropy_coefficient": 0.01,
         },
     ),
-    "ppo+bc": ("ppo+bc", {**_LEARNING, **_CLONING}),
-    "ppo+bc+novelty": ("ppo+bc+novelty", {**_LEARNING, **_CLONING}),
-    "ppo+gasil, centered": (
-        "ppo+gasil",
-        {**_LEARNING, "alpha": 0.1, "bonus": "centered"},
-    ),
-}
-# The same with a buffer in which episodes of one way share their return.
-AGENTS_OF = {
-    **AGENTS_OF,
+    **_LEARNING,
     **{
         f"{title}, shared": (name, {**point, "sharing_distance": 0.5})
-        for title, (name, point) in AGENTS_OF.items()
-        if _LEARNING.keys() <= point.keys()
+        for title, (name, point) in _LEARNING.items()
     },
 }
 
@@ -202,10 +206,6 @@ def ways_of_buffer(env: Any, buffer: GoodTrajectories | None) -> np.ndarray:
     return np.array([np.mean(np.array(sides) == x) for x in (-1, 1)])
 
 
-def _agent(name: str) -> Any:
-    return Cloning() if name == Cloning.name else AGENTS[name]()
-
-
 def count(options: Options, title: str, components: int) -> list[dict[str, Any]]:
     """Train an agent's seeds, and return what is counted of each as a row."""
     env, (name, changes) = gasil_jax.make_env(ENV), AGENTS_OF[title]
@@ -216,7 +216,8 @@ def count(options: Options, title: str, components: int) -> list[dict[str, Any]]
             with output_file.atomic(expert) as partial, partial.open("wb") as file:
                 np.savez(file, observation=observation, action=action)
         changes = {**changes, "expert": str(expert)}
-    algorithm = gasil_jax.Algorithm(_agent(name)).replace(
+    agent = Cloning() if name == Cloning.name else AGENTS[name]()
+    algorithm = gasil_jax.Algorithm(agent).replace(
         **{**changes, "total_steps": options.total_steps},
         policy_components=components,
     )

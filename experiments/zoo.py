@@ -112,13 +112,6 @@ def table() -> str:
     return report.markdown_table(head, rows)
 
 
-def write_table() -> None:
-    """Write the table into docs/zoo.md."""
-    text = report.fill_blocks(TABLE.read_text(), lambda name: {"zoo": table}[name]())
-    with output_file.atomic(TABLE) as partial:
-        partial.write_text(text)
-
-
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
     command_line.check_minimum(options, episodes=1)
@@ -126,5 +119,7 @@ def run(options: Options) -> None:
         raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:
         print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
-    write_table()
+    text = report.fill_blocks(TABLE.read_text(), lambda _: table())
+    with output_file.atomic(TABLE) as partial:
+        partial.write_text(text)
     print(f"in {TABLE}")
