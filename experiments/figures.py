@@ -367,6 +367,12 @@ _NOISY_ROBOTS = [f"{env}_noisy" for env in SPARSE_ROBOTS]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
+#: The control of PPO+GASIL, with the weight and the entropy that its search chose.
+_SPARSE_BONUS = Arm(
+    "ppo+bonus (PPO+GASIL's values)",
+    "ppo+bonus",
+    {**SPARSE_BASE, "entropy_coefficient": 0.01, "alpha": 0.1},
+)
 #: It differs from `ppo+novelty` in cloning alone.
 _CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty")
 
@@ -684,6 +690,13 @@ FIGURES: Mapping[str, Figure] = {
             [
                 *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
                 *_sparse_panels((*SPARSE_ROBOTS, *_NOISY_ROBOTS), SPARSE_ROBOTS, STEPS),
+                grid(
+                    SPARSE_ROBOTS,
+                    [_SPARSE_BONUS],
+                    base=None,
+                    seeds=20,
+                    total_steps=STEPS,
+                ),
                 *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
                 grid(
                     SPARSE_GRIDS,
