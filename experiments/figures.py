@@ -371,7 +371,12 @@ _SPARSE_SHARED = [
 _SPARSE_BONUS = Arm(
     "ppo+bonus (PPO+GASIL's values)",
     "ppo+bonus",
-    {**SPARSE_BASE, "entropy_coefficient": 0.01, "alpha": 0.1},
+    {
+        **SPARSE_BASE,
+        "total_steps": STEPS,
+        "entropy_coefficient": 0.01,
+        "alpha": 0.1,
+    },
 )
 #: It differs from `ppo+novelty` in cloning alone.
 _CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty")
@@ -690,13 +695,7 @@ FIGURES: Mapping[str, Figure] = {
             [
                 *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
                 *_sparse_panels((*SPARSE_ROBOTS, *_NOISY_ROBOTS), SPARSE_ROBOTS, STEPS),
-                grid(
-                    SPARSE_ROBOTS,
-                    [_SPARSE_BONUS],
-                    base=None,
-                    seeds=20,
-                    total_steps=STEPS,
-                ),
+                grid(SPARSE_ROBOTS, [_SPARSE_BONUS], base=None, seeds=20),
                 *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
                 grid(
                     SPARSE_GRIDS,
