@@ -719,13 +719,16 @@ FIGURES: Mapping[str, Figure] = {
     "sparse_causes": Figure(
         "Sparse rewards: why imitation with a discriminator fails",
         "",
-        grid(
-            _CAUSE_TASKS,
-            _CAUSES,
-            base=None,
-            changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
-            seeds=20,
-            total_steps=SPARSE_STEPS,
+        joined(
+            grid(
+                (env,),
+                _CAUSES,
+                base=None,
+                changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+                seeds=seeds,
+                total_steps=SPARSE_STEPS,
+            )
+            for env, seeds in zip(_CAUSE_TASKS, (20, 10, 10), strict=True)
         ),
         comparisons=_changes(),
         solved_from=solved_from,
