@@ -552,10 +552,8 @@ class Page:
             pairs = [(p, ours, x) for p in panels for x in self.figure.panels[p]]
         having: dict[tuple[str, str], list[str]] = {}
         for panel, first, second in pairs:
-            if {
-                (panel, first),
-                (panel, second),
-            } <= self._solved.keys() and first != second:
+            both = {(panel, first), (panel, second)}
+            if len(both) == 2 and both <= self._solved.keys():
                 having.setdefault((first, second), []).append(panel)
         return having
 
