@@ -7,13 +7,13 @@ import dataclasses
 import functools
 import math
 import statistics
-import zlib
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from experiments.curves import Comparisons
+from experiments.search import generator
 from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: Significance level of a family of verdicts.
@@ -100,7 +100,7 @@ def judged(effects: Mapping[Any, Effect]) -> dict[Any, Comparison]:
 
 @functools.cache
 def _draws(name: str, scores: tuple[float, ...]) -> np.ndarray:
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    rng = generator(name)
     rows = rng.integers(len(scores), size=(_DRAWS, len(scores)))
     return interquartile_mean(np.array(scores)[rows], axis=1)
 
@@ -211,7 +211,7 @@ def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str)
     al. 2021). The 95% percentile bootstrap interval is over seeds, drawn within each
     panel. A NaN, the score of a seed that ended no episode, is below all other scores.
     """
-    rng = np.random.default_rng(zlib.crc32(f"{ours}/{other}".encode()))
+    rng = generator(f"{ours}/{other}")
 
     def resampled(values: np.ndarray) -> np.ndarray:
         return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
@@ -262,7 +262,7 @@ def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
       scores: the scores of each task, (seeds,), in one unit.
     """
     most = math.lcm(*map(len, scores))
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    rng = generator(name)
     drawn = [
         [rng.choice(x, len(x)).repeat(most // len(x)) for x in scores]
         for _ in range(_DRAWS // 10)

@@ -102,13 +102,18 @@ def draw(agent: str) -> tuple[Point, ...]:
     return _drawn(SPACES[agent], _POINTS, agent)
 
 
+def generator(name: str) -> np.random.Generator:
+    """Return a generator of random numbers that a name seeds."""
+    return np.random.default_rng(zlib.crc32(name.encode()))
+
+
 def _drawn(space: Space, count: int, name: str) -> tuple[Point, ...]:
     """Return points of a space, all different and the same for the same name.
 
     Each value of a hyperparameter occurs equally often, or once more than another. The
     combinations are random.
     """
-    rng = np.random.default_rng(zlib.crc32(name.encode()))
+    rng = generator(name)
     rows: list[tuple[Any, ...]] = []
     while len(set(rows)) < count:
         columns = [

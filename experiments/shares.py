@@ -6,7 +6,6 @@ corrected by Holm's method for the number of comparisons in their family.
 
 import functools
 import math
-import zlib
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -18,6 +17,7 @@ from experiments.comparisons import (
     corrected,
     share_of_more,
 )
+from experiments.search import generator
 from experiments.store import Record
 
 #: Which seeds solve a panel's task, bool (seeds,), by panel and curve.
@@ -74,10 +74,6 @@ def compare(
     return {k: Difference(middle[k], p) for k, p in corrected(p_values).items()}
 
 
-def _generator(pair: Pair) -> np.random.Generator:
-    return np.random.default_rng(zlib.crc32("/".join(pair).encode()))
-
-
 def _mean_lead(
     solved: Solved, panels: Sequence[str], pair: Pair, rng: np.random.Generator
 ) -> tuple[float, np.ndarray]:
@@ -96,7 +92,7 @@ def overall(solved: Solved, panels: Sequence[str], pair: Pair) -> Effect:
 
     The p-value is that of a permutation of seeds within each panel.
     """
-    rng = _generator(pair)
+    rng = generator("/".join(pair))
     middle, drawn = _mean_lead(solved, panels, pair, rng)
     dealt = np.zeros(_DRAWS)
     for panel in panels:
@@ -116,7 +112,7 @@ def change(
 
     The p-value is that of the percentile bootstrap.
     """
-    rng = _generator(pair)
+    rng = generator("/".join(pair))
     before, after = (_mean_lead(solved, x, pair, rng) for x in (panels, others))
     drawn = after[1] - before[1]
     return Effect(after[0] - before[0], bootstrap_p(drawn), drawn)
@@ -130,7 +126,7 @@ def sooner(steps: Steps, panels: Sequence[str], pair: Pair) -> Effect:
     averaged over panels. The p-value is that of a permutation of seeds within each
     panel.
     """
-    rng, middle = _generator(pair), 0.0
+    rng, middle = generator("/".join(pair)), 0.0
     dealt, drawn = np.zeros(_DRAWS), np.zeros(_DRAWS)
     for panel in panels:
         both = [steps[panel, curve] for curve in pair]
