@@ -719,16 +719,13 @@ FIGURES: Mapping[str, Figure] = {
     "sparse_causes": Figure(
         "Sparse rewards: why imitation with a discriminator fails",
         "",
-        joined(
-            grid(
-                (env,),
-                _CAUSES,
-                base=None,
-                changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
-                seeds=seeds,
-                total_steps=SPARSE_STEPS,
-            )
-            for env, seeds in zip(_CAUSE_TASKS, (20, 10, 10), strict=True)
+        grid(
+            _CAUSE_TASKS,
+            _CAUSES,
+            base=None,
+            changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+            seeds=20,
+            total_steps=SPARSE_STEPS,
         ),
         comparisons=_changes(),
         solved_from=solved_from,
