@@ -5,8 +5,6 @@ import os
 import pathlib
 import shutil
 import signal
-import subprocess
-import sys
 import threading
 import time
 
@@ -350,25 +348,9 @@ def test_processes_train_what_is_missing_until_nothing_is(tmp_path, trained):
         engine.train_in_processes(missing, store, many)
 
 
-#: ``python -m experiments`` with a figure of two small runs.
-PROGRAM = """
-import sys
-
-if __name__ == "__main__":
-    from experiments import __main__
-    from experiments.curves import Curve, Figure
-    from experiments.figures import FIGURES
-
-    small = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
-    curve = Curve("point_mass", "ppo", small, seeds=2, total_steps=1000 * 256)
-    FIGURES["matrix"] = Figure("Toy", "", {"a": {"x": curve}})
-    sys.exit(__main__.main())
-"""
-
-
-def processes_of(parent):
-    """Return the processes that train, which are the parent's children."""
-    pids = pathlib.Path(f"/proc/{parent.pid}/task/{parent.pid}/children").read_text()
+def processes_that_train():
+    """Return the processes that this one's main thread has started to train."""
+    pids = pathlib.Path(f"/proc/self/task/{os.getpid()}/children").read_text()
     commands = {
         int(x): pathlib.Path(f"/proc/{x}/cmdline").read_text() for x in pids.split()
     }
@@ -376,41 +358,37 @@ def processes_of(parent):
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
-def test_processes_end_and_save_when_their_parent_is_interrupted(tmp_path):
-    (tmp_path / "program.py").write_text(PROGRAM)
-    options = "--processes 2 --members 1 --evaluate-episodes 0 --runs runs --results ."
-    command = [sys.executable, "program.py", "matrix", *options.split()]
-    how = {"cwd": tmp_path, "text": True, "stderr": subprocess.PIPE}
-    how |= {"env": {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}}
-
-    def wait_until(condition):
-        while not condition():
-            assert parent.poll() is None
-            time.sleep(0.05)
-
-    parent = subprocess.Popen(command, **how)
-    wait_until(lambda: len(processes_of(parent)) == 2)
-    first, other = processes_of(parent)
-    # Ctrl-C goes to all processes of a terminal; here it is not the parent's.
-    for child in (first, other):
-        os.kill(child, signal.SIGINT)
+def test_processes_end_and_save_when_their_parent_is_interrupted(tmp_path, capsys):
+    store = Store(tmp_path / "store")
+    setup = Setup(tmp_path / "runs", evaluate_episodes=0, processes=2, members=1)
+    runs = [run(seed, total_steps=1000 * 256) for seed in range(2)]
     logs = lambda: [x.read_text() for x in tmp_path.glob("runs/*/*.log")]
-    wait_until(lambda: sum(": compiling" in log for log in logs()) == 2)
-    # A cluster sends its signal to all, and then the first gets it twice.
-    for process in (first, parent.pid):
-        os.kill(process, signal.SIGTERM)
-    _, error = parent.communicate()
-    assert parent.returncode == 128 + signal.SIGTERM
-    assert error.splitlines() == [
-        engine._ENDING,
-        "interrupted by SIGTERM; all that was done is saved",
-        "continue with: the same command and --resume",
-    ]
-    assert not any(pathlib.Path(f"/proc/{child}").exists() for child in (first, other))
+    children = []
+
+    def interrupt():
+        while len(processes_that_train()) < 2:
+            time.sleep(0.05)
+        children.extend(processes_that_train())
+        # Ctrl-C goes to all processes of a terminal; here it is not the parent's.
+        for child in children:
+            os.kill(child, signal.SIGINT)
+        while sum(": compiling" in log for log in logs()) < 2:
+            time.sleep(0.05)
+        # A cluster sends its signal to all, and then the first gets it twice.
+        for process in (children[0], os.getpid()):
+            os.kill(process, signal.SIGTERM)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(Interrupted) as interrupted:
+        engine.train_in_processes(lambda: store.missing(runs), store, setup)
+    assert interrupted.value.signal == signal.SIGTERM
+    assert interrupted.value.__notes__ == [engine._HOW_TO_CONTINUE]
+    assert capsys.readouterr().err == f"{engine._ENDING}\n"
+    assert not any(pathlib.Path(f"/proc/{child}").exists() for child in children)
     assert len(list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))) == 2
     assert not list(tmp_path.glob("runs/*/*/training.json"))
-    assert subprocess.run([*command, "--resume"], **how).returncode == 0
-    assert "Not trained yet" not in (tmp_path / "matrix.md").read_text()
+    engine.train_missing(runs, store, dataclasses.replace(setup, resume=True))
+    assert not store.missing(runs)
 
 
 def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():

@@ -59,7 +59,7 @@ def wait_for(condition, child, seconds=120):
     while not condition():
         assert child.poll() is None, child.communicate()
         assert time.monotonic() < deadline
-        time.sleep(0.0005)
+        time.sleep(0.005)
 
 
 def finish(child, seconds=200):
