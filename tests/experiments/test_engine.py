@@ -358,10 +358,14 @@ def processes_that_train():
 
 
 @pytest.mark.skipif(len(os.sched_getaffinity(0)) < 2, reason="needs two cores")
-def test_processes_end_and_save_when_their_parent_is_interrupted(tmp_path, capsys):
-    store = Store(tmp_path / "store")
-    setup = Setup(tmp_path / "runs", evaluate_episodes=0, processes=2, members=1)
-    runs = [run(seed, total_steps=1000 * 256) for seed in range(2)]
+def test_processes_end_and_save_when_their_parent_is_interrupted(
+    tmp_path, capsys, monkeypatch
+):
+    changes = {**SMALL, "total_steps": 1000 * 256}
+    curve = Curve("point_mass", "ppo", changes, seeds=2)
+    monkeypatch.setitem(FIGURES, "matrix", Figure("Toy", "", {"a": {"x": curve}}))
+    folders = ["--runs", f"{tmp_path}/runs", "--results", f"{tmp_path}"]
+    command = ["matrix", *folders, "--members", "1", "--evaluate-episodes", "0"]
     logs = lambda: [x.read_text() for x in tmp_path.glob("runs/*/*.log")]
     children = []
 
@@ -379,16 +383,18 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(tmp_path, capsy
             os.kill(process, signal.SIGTERM)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(Interrupted) as interrupted:
-        engine.train_in_processes(lambda: store.missing(runs), store, setup)
-    assert interrupted.value.signal == signal.SIGTERM
-    assert interrupted.value.__notes__ == [engine._HOW_TO_CONTINUE]
-    assert capsys.readouterr().err == f"{engine._ENDING}\n"
+    status = __main__.main([*command, "--processes", "2"])
+    assert status == 128 + signal.SIGTERM
+    assert capsys.readouterr().err.splitlines() == [
+        engine._ENDING,
+        "interrupted by SIGTERM; all that was done is saved",
+        "continue with: the same command and --resume",
+    ]
     assert not any(pathlib.Path(f"/proc/{child}").exists() for child in children)
     assert len(list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))) == 2
     assert not list(tmp_path.glob("runs/*/*/training.json"))
-    engine.train_missing(runs, store, dataclasses.replace(setup, resume=True))
-    assert not store.missing(runs)
+    assert __main__.main([*command, "--resume"]) == 0
+    assert "Not trained yet" not in (tmp_path / "matrix.md").read_text()
 
 
 def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
