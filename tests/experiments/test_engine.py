@@ -1,12 +1,12 @@
 """Missing runs are trained, continue where they were stopped, and are stored."""
 
+import contextlib
 import dataclasses
 import os
 import pathlib
 import shutil
 import signal
 import threading
-import time
 
 import jax
 import numpy as np
@@ -193,6 +193,25 @@ def test_rows_are_means_over_equal_parts_of_training():
     assert len(record.evaluation_steps) == len(record.evaluation_return) == 0
 
 
+@contextlib.contextmanager
+def beside(waiting):
+    """Advance a generator ten times a second until the block ends, in a thread."""
+    ended = threading.Event()
+
+    def advance():
+        for _ in waiting:
+            if ended.wait(0.1):
+                return
+
+    thread = threading.Thread(target=advance)
+    thread.start()
+    try:
+        yield
+    finally:
+        ended.set()
+        thread.join()
+
+
 def test_interrupted_training_is_continued_on_request_only(tmp_path):
     store, setup = Store(tmp_path / "store"), Setup(tmp_path / "runs")
     runs = [run(total_steps=10**9)]
@@ -204,12 +223,11 @@ def test_interrupted_training_is_continued_on_request_only(tmp_path):
 
     def interrupt(before):
         while size() <= before:
-            time.sleep(0.2)
+            yield
         os.kill(os.getpid(), signal.SIGTERM)
 
     for resume in (False, True):
-        threading.Thread(target=interrupt, args=(size(),), daemon=True).start()
-        with pytest.raises(Interrupted) as interrupted:
+        with beside(interrupt(size())), pytest.raises(Interrupted) as interrupted:
             engine.train_missing(runs, store, dataclasses.replace(setup, resume=resume))
         assert "--resume" in interrupted.value.__notes__[0]
         assert list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))
@@ -371,19 +389,19 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
 
     def interrupt():
         while len(processes_that_train()) < 2:
-            time.sleep(0.05)
+            yield
         children.extend(processes_that_train())
         # Ctrl-C goes to all processes of a terminal; here it is not the parent's.
         for child in children:
             os.kill(child, signal.SIGINT)
         while sum(": compiling" in log for log in logs()) < 2:
-            time.sleep(0.05)
+            yield
         # A cluster sends its signal to all, and then the first gets it twice.
         for process in (children[0], os.getpid()):
             os.kill(process, signal.SIGTERM)
 
-    threading.Thread(target=interrupt, daemon=True).start()
-    status = __main__.main([*command, "--processes", "2"])
+    with beside(interrupt()):
+        status = __main__.main([*command, "--processes", "2"])
     assert status == 128 + signal.SIGTERM
     assert capsys.readouterr().err.splitlines() == [
         engine._ENDING,
