@@ -695,7 +695,12 @@ FIGURES: Mapping[str, Figure] = {
             [
                 *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
                 *_sparse_panels((*SPARSE_ROBOTS, *_NOISY_ROBOTS), SPARSE_ROBOTS, STEPS),
-                grid(SPARSE_ROBOTS, [_SPARSE_BONUS], base=None, seeds=20),
+                grid(
+                    (*SPARSE_ROBOTS, *_NOISY_ROBOTS),
+                    [_SPARSE_BONUS],
+                    base=None,
+                    seeds=20,
+                ),
                 *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
                 grid(
                     SPARSE_GRIDS,
