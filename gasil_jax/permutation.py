@@ -37,11 +37,14 @@ def permutation(key: jax.Array, size: int) -> jax.Array:
 def _by_packed_keys(key: jax.Array, size: int) -> jax.Array:
     # The same number of rounds as in JAX; several make equal keys unimportant.
     rounds = math.ceil(3.0 * math.log(size) / math.log(2**32 - 1))
-    numbers = jnp.arange(size, dtype=jnp.int32)
-    for _ in range(rounds):
+
+    def shuffle(_: int, carry: tuple[jax.Array, jax.Array]) -> Any:
+        key, numbers = carry
         key, round_key = jax.random.split(key)
-        numbers = numbers[argsort(jax.random.bits(round_key, (size,)))]
-    return numbers
+        return key, numbers[argsort(jax.random.bits(round_key, (size,)))]
+
+    numbers = jnp.arange(size, dtype=jnp.int32)
+    return jax.lax.fori_loop(0, rounds, shuffle, (key, numbers))[1]
 
 
 def argsort(keys: jax.Array) -> jax.Array:

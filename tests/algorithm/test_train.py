@@ -275,6 +275,10 @@ def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
     bad = {"weights": jnp.array([5.0, jnp.inf]), "count": jnp.int32(4)}
     healthy, kept = learner.keep_if_finite(bad, old)
     assert not healthy and kept["weights"].tolist() == [1.0, 2.0] and kept["count"] == 3
+    # What the update did not touch is not its fault, and is not copied.
+    buffer = {"buffer": jnp.array([jnp.nan])}
+    healthy, kept = learner.keep_if_finite({**fine, **buffer}, {**old, **buffer})
+    assert healthy and kept["buffer"] is buffer["buffer"] and kept["count"] == 4
 
 
 def test_metrics_of_one_name_are_refused():
