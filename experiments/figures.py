@@ -371,12 +371,7 @@ _SPARSE_SHARED = [
 _SPARSE_BONUS = Arm(
     "ppo+bonus (PPO+GASIL's values)",
     "ppo+bonus",
-    {
-        **SPARSE_BASE,
-        "total_steps": STEPS,
-        "entropy_coefficient": 0.01,
-        "alpha": 0.1,
-    },
+    {**SPARSE_BASE, "entropy_coefficient": 0.01, "alpha": 0.1},
 )
 #: It differs from `ppo+novelty` in cloning alone.
 _CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty")

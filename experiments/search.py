@@ -360,11 +360,7 @@ SPARSE_SPACES: Mapping[str, Space] = {
 }
 SPARSE_STEPS = 500_000
 #: What does not differ between agents on the sparse tasks.
-SPARSE_BASE: Point = {
-    "total_steps": SPARSE_STEPS,
-    "num_envs": 16,
-    "normalize_rewards": True,
-}
+SPARSE_BASE: Point = {"num_envs": 16, "normalize_rewards": True}
 
 
 #: How the searches of the sparse tasks choose, for the page.
@@ -393,7 +389,7 @@ class SparseSearch(SingleStage):
     def _base(self) -> Algorithm:
         own = {"behavior_cloning_coefficient": 1.0}
         own = own if self.agent == "ppo+bc+novelty" else {}
-        return algorithm(self.agent, **SPARSE_BASE, **own)
+        return algorithm(self.agent, total_steps=SPARSE_STEPS, **SPARSE_BASE, **own)
 
     def points(self, store: Store) -> tuple[Point, ...]:
         """Return all points of the search."""

@@ -218,8 +218,7 @@ def count(options: Options, title: str, components: int) -> list[dict[str, Any]]
         changes = {**changes, "expert": str(expert)}
     agent = Cloning() if name == Cloning.name else AGENTS[name]()
     algorithm = gasil_jax.Algorithm(agent).replace(
-        **{**changes, "total_steps": options.total_steps},
-        policy_components=components,
+        **changes, total_steps=options.total_steps, policy_components=components
     )
     folder = options.runs / f"{title.replace(', ', '-').replace(' ', '-')}-{components}"
     states = gasil_jax.fit(
