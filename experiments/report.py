@@ -40,8 +40,9 @@ from experiments.search import (
     SEEDS,
     SPACES,
     SPARSE,
+    SPARSE_GRIDS,
     SPARSE_PROTOCOL,
-    SPARSE_STEPS,
+    SPARSE_ROBOTS,
     TASKS,
     importance,
     mean_ranks,
@@ -527,16 +528,17 @@ class Page:
         """Return the panels of a kind of tasks.
 
         Args:
-          kind: words: "noisy" for tasks with noise, and "long" for those that are
-            trained longer than the others; default those without either.
+          kind: words: "noisy" for tasks with noise, "robots" or "navix" for those that
+            are trained longer; default those without any of it.
         """
-        return [
-            panel
-            for panel, curves in self.figure.panels.items()
-            if panel.endswith("_noisy") == ("noisy" in kind)
-            and (next(iter(curves.values())).total_steps > SPARSE_STEPS)
-            == ("long" in kind)
-        ]
+
+        def words(panel: str) -> set[str]:
+            task, is_noisy = panel.removesuffix("_noisy"), panel.endswith("_noisy")
+            robots, navix = task in SPARSE_ROBOTS, task in SPARSE_GRIDS
+            own = {"noisy": is_noisy, "robots": robots, "navix": navix}
+            return {word for word, holds in own.items() if holds}
+
+        return [x for x in self.figure.panels if words(x) == set(kind.split())]
 
     def _compared_on(self, ours: str, kind: str) -> dict[tuple[str, str], list[str]]:
         """Return the panels on which two complete curves are compared, by these curves.

@@ -187,18 +187,18 @@ def test_longer_tasks_are_told_apart_and_without_their_package(tmp_path, monkeyp
         (run, *_) = runs = figure.panels[env]["ppo"].runs(store)
         assert run.algorithm.config.total_steps == 500_000
         store.add(dict.fromkeys(runs, record(*[solved_from(env)] * 10)))
-    assert page().mean_shares()["ppo"] == 1.0 and page().mean_shares("long") == {}
+    assert page().mean_shares()["ppo"] == 1.0
+    assert page().mean_shares("robots") == page().mean_shares("navix") == {}
     for env in (*SPARSE_ROBOTS, *SPARSE_GRIDS):
         (run, *_) = runs = figure.panels[env]["ppo"].runs(store)
         assert run.algorithm.config.total_steps == 1_000_000
         best = solved_from(env) * (env in SPARSE_GRIDS)
         store.add(dict.fromkeys(runs, record(*[best] * 10)))
-    share = len(SPARSE_GRIDS) / len((*SPARSE_ROBOTS, *SPARSE_GRIDS))
-    assert page().mean_shares("long")["ppo"] == pytest.approx(share)
-    assert page().mean_shares()["ppo"] == 1.0
+    for kind, share in (("", 1.0), ("robots", 0.0), ("navix", 1.0)):
+        assert page().mean_shares(kind)["ppo"] == share
     for panel, noise in ((SPARSE_GRIDS[0], 0.0), (f"{SPARSE_GRIDS[0]}_noisy", 0.1)):
         runs = figure.panels[panel]["ppo+bc"].runs(store)
         assert {run.settings.action_noise for run in runs} == {noise}
-    table = page().shares("long")
+    table = page().shares("robots")
     assert "| halfcheetah | 0.00 |" in table and "maze" not in table
-    assert page().shares("long noisy") == ""  # Nothing of it is stored.
+    assert page().shares("robots noisy") == ""  # Nothing of it is stored.
