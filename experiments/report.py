@@ -319,15 +319,20 @@ class Page:
         if rewards not in ("", "delayed", "dense"):
             raise self._no_slot("better", rewards, ours, *others)
         panels = self._chosen(*filter(None, [rewards]))
-        parts = []
+        names: dict[str, list[str]] = {}
         for other in others:
             on = [panel for panel in panels if other in self.figure.panels[panel]]
             verdicts = _verdicts(self.comparisons, on, (ours, other))
             measured = "" if len(verdicts) == len(on) else " measured"
             better = [*verdicts.values()].count("better")
-            parts.append(
-                f"than {other.upper()} on {better} of {len(verdicts)}{measured} tasks"
-            )
+            tasks = f"{better} of {len(verdicts)}{measured} tasks"
+            names.setdefault(tasks, []).append(other.upper())
+        parts = [
+            f"than {', '.join(x[:-1])} and {x[-1]} on {tasks} each"
+            if len(x) > 1
+            else f"than {x[0]} on {tasks}"
+            for tasks, x in names.items()
+        ]
         return f"better {', '.join(parts)}"
 
     def evaluated(self) -> str:

@@ -203,6 +203,8 @@ def test_a_table_and_a_tally(page):
     assert report.fill("so {{tally two}}", page.value) == f"so {two}"
     words = "better than OTHER on 1 of 2 tasks"
     assert page.value("better", "", "ours", "other") == words
+    words = "better than OTHER and OTHER on 1 of 2 tasks each"
+    assert page.better("", "ours", "other", "other") == words
     del page.comparisons["two", "ours", "other"]
     words = "better than OTHER on 1 of 1 measured tasks"
     assert page.better("", "ours", "other") == words
