@@ -77,7 +77,8 @@ def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
     pairs = zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
     made = [x for x, y in pairs if x is not y]
     # One vector is checked by a tenth of the operations of many arrays.
-    numbers = [jnp.ravel(x) for x in made if jnp.issubdtype(x.dtype, jnp.inexact)]
+    floats = [x for x in made if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
+    numbers = [jnp.ravel(x) for x in floats]
     healthy = jnp.all(jnp.isfinite(jnp.concatenate([jnp.zeros(1), *numbers])))
 
     def keep(x: jax.Array, y: jax.Array) -> jax.Array:

@@ -279,6 +279,9 @@ def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
     buffer = {"buffer": jnp.array([jnp.nan])}
     healthy, kept = learner.keep_if_finite({**fine, **buffer}, {**old, **buffer})
     assert healthy and kept["buffer"] is buffer["buffer"] and kept["count"] == 4
+    # An agent of the user's may return Python's own numbers.
+    healthy, kept = learner.keep_if_finite({"loss": 2.0}, {"loss": jnp.float32(1)})
+    assert healthy and kept["loss"] == 2.0
 
 
 def test_metrics_of_one_name_are_refused():
