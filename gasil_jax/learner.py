@@ -56,15 +56,21 @@ def descend(
 
 
 def select(condition: jax.Array, new: Any, old: Any) -> Any:
-    """Return the pytree `new` where the condition, bool (), holds, else `old`."""
-    return jax.tree.map(lambda x, y: jnp.where(condition, x, y), new, old)
+    """Return the pytree `new` where the condition, bool (), holds, else `old`.
+
+    Leaves that are the same array in both, such as a buffer, are not copied.
+    """
+
+    def either(x: Any, y: Any) -> Any:
+        return x if x is y else jnp.where(condition, x, y)
+
+    return jax.tree.map(either, new, old)
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
     """Undo an update that is not finite.
 
-    Leaves that the update did not touch, such as a buffer, are the same array before
-    and after it; they are neither read nor copied.
+    Leaves that the update did not touch are neither read nor copied, see `select`.
 
     Args:
       new: a pytree after the update.
@@ -80,8 +86,4 @@ def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
     floats = [x for x in made if jnp.issubdtype(jnp.result_type(x), jnp.inexact)]
     numbers = [jnp.ravel(x) for x in floats]
     healthy = jnp.all(jnp.isfinite(jnp.concatenate([jnp.zeros(1), *numbers])))
-
-    def keep(x: jax.Array, y: jax.Array) -> jax.Array:
-        return x if x is y else jnp.where(healthy, x, y)
-
-    return healthy, jax.tree.map(keep, new, old)
+    return healthy, select(healthy, new, old)
