@@ -363,7 +363,8 @@ def _changes() -> Comparisons:
 
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
-_NOISY_ROBOTS = [f"{env}_noisy" for env in SPARSE_ROBOTS]
+#: The sparse robots, without and with noise.
+_ROBOTS = [*SPARSE_ROBOTS, *(f"{env}_noisy" for env in SPARSE_ROBOTS)]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
@@ -689,13 +690,8 @@ FIGURES: Mapping[str, Figure] = {
         joined(
             [
                 *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
-                *_sparse_panels((*SPARSE_ROBOTS, *_NOISY_ROBOTS), SPARSE_ROBOTS, STEPS),
-                grid(
-                    (*SPARSE_ROBOTS, *_NOISY_ROBOTS),
-                    [_SPARSE_BONUS],
-                    base=None,
-                    seeds=20,
-                ),
+                *_sparse_panels(_ROBOTS, SPARSE_ROBOTS, STEPS),
+                grid(_ROBOTS, [_SPARSE_BONUS], base=None, seeds=20),
                 *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
                 grid(
                     SPARSE_GRIDS,

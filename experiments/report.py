@@ -538,10 +538,13 @@ class Page:
         """
 
         def words(panel: str) -> set[str]:
-            task, is_noisy = panel.removesuffix("_noisy"), panel.endswith("_noisy")
-            robots, navix = task in SPARSE_ROBOTS, task in SPARSE_GRIDS
-            own = {"noisy": is_noisy, "robots": robots, "navix": navix}
-            return {word for word, holds in own.items() if holds}
+            task = panel.removesuffix("_noisy")
+            of = {
+                "noisy": task != panel,
+                "robots": task in SPARSE_ROBOTS,
+                "navix": task in SPARSE_GRIDS,
+            }
+            return {word for word, holds in of.items() if holds}
 
         return [x for x in self.figure.panels if words(x) == set(kind.split())]
 
