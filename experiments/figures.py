@@ -361,6 +361,8 @@ def _changes() -> Comparisons:
     return differences(_CAUSE_TASKS, pairs)
 
 
+_GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
+_CENTRED = {**_GASIL, "bonus": "centered"}
 #: The sparse tasks that are also tried with noise, and those of the ablation.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
 #: The sparse robots, without and with noise.
@@ -368,12 +370,17 @@ _ROBOTS = [*SPARSE_ROBOTS, *(f"{env}_noisy" for env in SPARSE_ROBOTS)]
 _SPARSE_SHARED = [
     Arm(_WITH_PPOS.format(x), x) for x in ("ppo+bc", "ppo+sil", "ppo+bc+novelty")
 ]
-#: The control of PPO+GASIL, with the weight and the entropy that its search chose.
-_SPARSE_BONUS = Arm(
-    "ppo+bonus (PPO+GASIL's values)",
-    "ppo+bonus",
-    {**SPARSE_BASE, "entropy_coefficient": 0.01, "alpha": 0.1},
-)
+#: On the sparse robots: the control of PPO+GASIL, with the entropy that its search
+#: chose and bonuses of several sizes, of which that search chose 0.1; and PPO+GASIL
+#: without pay for staying.
+_SPARSE_VALUES = {**SPARSE_BASE, "entropy_coefficient": 0.01}
+_SPARSE_CONTROLS = [
+    *(
+        Arm(f"ppo+bonus ({alpha:g})", "ppo+bonus", {**_SPARSE_VALUES, "alpha": alpha})
+        for alpha in (0.02, 0.1, 0.3)
+    ),
+    Arm("ppo+gasil (centered)", "ppo+gasil", {**_SPARSE_VALUES, **_CENTRED}),
+]
 #: It differs from `ppo+novelty` in cloning alone.
 _CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty")
 
@@ -402,8 +409,6 @@ def _sparse_panels(
 
 
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
-_GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
-_CENTRED = {**_GASIL, "bonus": "centered"}
 #: What may differ in how a buffer is filled, by name.
 _BUFFERS: Mapping[str, Point] = {
     "better episodes": {"admission": "better"},
@@ -691,7 +696,7 @@ FIGURES: Mapping[str, Figure] = {
             [
                 *_sparse_panels((*SPARSE, *_NOISY), SPARSE, SPARSE_STEPS),
                 *_sparse_panels(_ROBOTS, SPARSE_ROBOTS, STEPS),
-                grid(_ROBOTS, [_SPARSE_BONUS], base=None, seeds=20),
+                grid(_ROBOTS, _SPARSE_CONTROLS, base=None, seeds=20),
                 *_sparse_panels(SPARSE_GRIDS, SPARSE_GRIDS, STEPS),
                 grid(
                     SPARSE_GRIDS,
@@ -719,7 +724,7 @@ FIGURES: Mapping[str, Figure] = {
             _CAUSE_TASKS,
             _CAUSES,
             base=None,
-            changes={**SPARSE_BASE, "entropy_coefficient": 0.01},
+            changes=_SPARSE_VALUES,
             seeds=20,
             total_steps=SPARSE_STEPS,
         ),
