@@ -69,6 +69,30 @@ def total(x: jax.Array, axis: int = 0) -> jax.Array:
     return add(jax.lax.index_in_dim(x, i, axis, False) for i in range(x.shape[axis]))
 
 
+def fold(
+    function: Callable[[jax.Array, jax.Array], jax.Array], rows: jax.Array
+) -> jax.Array:
+    """Combine the rows of an array, one after the other: (N, ..., B) -> (..., B).
+
+    On a CPU it serves as a reduction that is computed for a whole vector of the batch
+    at once, as `total` is, but is compiled for size.
+    """
+    return jax.lax.fori_loop(
+        1, rows.shape[0], lambda i, done: function(done, rows[i]), rows[0]
+    )
+
+
+def stacked(parts: Iterable[Any], axis: int = 0) -> jax.Array:
+    """Stack arrays; on a CPU each of them is computed by itself before.
+
+    A CPU's kernel that computes and stacks at once asks for each number which part it
+    is of, and so computes one number after the other.
+    """
+    if not on_cpu():
+        return jnp.stack(tuple(parts), axis)
+    return materialize(jnp.stack(materialize(tuple(parts)), axis))
+
+
 def take(x: jax.Array, index: Iterable[int]) -> jax.Array:
     """Return rows of the first axis by their constant indices, without a gather."""
     rows = [x[int(i)] for i in index]

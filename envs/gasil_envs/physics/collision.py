@@ -23,7 +23,7 @@ import mujoco
 import numpy as np
 
 from gasil_envs.physics import tree
-from gasil_envs.physics.batching import materialize, take, total
+from gasil_envs.physics.batching import materialize, stacked, take, total
 
 _PLANE, _SPHERE, _CAPSULE = (
     int(mujoco.mjtGeom.mjGEOM_PLANE),
@@ -126,7 +126,7 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
             half.append(tree.rotate(columns, matrix[2::3] * model.geom_size[geom, 1]))
         else:
             half.append(jnp.zeros_like(origin))
-    return Segments(*materialize((jnp.stack(middle), jnp.stack(half))))
+    return Segments(*materialize((stacked(middle), stacked(half))))
 
 
 @jax.named_scope("collision")

@@ -19,7 +19,7 @@ from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import collision, newton, tree
-from gasil_envs.physics.batching import add, materialize, take, total
+from gasil_envs.physics.batching import add, fold, materialize, on_cpu, take, total
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
@@ -334,14 +334,18 @@ def contact_rows(
     gap = distance - constants.margin
     active = gap < 0.0
     arm = (position - at.com)[:, None]
-    torque = tree.cross(*jnp.broadcast_arrays(arm, axes))
-    wrench = jnp.concatenate([torque, jnp.broadcast_to(axes, torque.shape)], axis=2)
-    wrench = materialize(wrench)
+    axes = jnp.asarray(axes)
+    torque = materialize(tree.cross(arm, axes))
     # cdof is (rotation, translation) of the point at the centre of mass.
-    along = add(wrench[:, :, k, None] * at.cdof[:, k] for k in range(6))
+    along = add(
+        x[:, :, k, None] * at.cdof[:, first + k]
+        for x, first in ((torque, 0), (axes, 3))
+        for k in range(3)
+    )
     along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
-    scale = [along[:, :1], along[:, 1:] * constants.friction[:, None, None]]
-    along = materialize(jnp.concatenate(scale, axis=1))  # (C, A, V, B)
+    is_normal = np.arange(along.shape[1])[:, None, None] == 0
+    scale = jnp.where(is_normal, 1.0, constants.friction[:, None, None])
+    along = materialize(along * scale)  # (C, A, V, B)
     speed = materialize(total(along * qvel, 2))
     signs = np.array([(1, *signs) for signs in edges], np.float32)[..., None]
     speed = total(speed[:, None] * signs, 2)  # (C, edges, B)
@@ -394,7 +398,9 @@ MOST_IN_PLAY = 8
 def num_in_play(contacts: Contacts) -> jax.Array:
     """Return how many contacts of a group are in play, (B,)."""
     in_play = contacts.touch.distance < contacts.constants.margin
-    return jnp.sum(in_play, axis=0, dtype=jnp.int32)
+    if not on_cpu():
+        return jnp.sum(in_play, axis=0, dtype=jnp.int32)
+    return fold(jnp.add, in_play.astype(jnp.int32))
 
 
 @jax.named_scope("constraint_rows")
@@ -410,7 +416,8 @@ def gather(contacts: Contacts) -> Contacts:
     number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
     index, left = [], jnp.where(in_play, number, num_contacts)
     for _ in range(MOST_IN_PLAY):
-        first = jnp.min(left, axis=0)
+        left = materialize(left)
+        first = fold(jnp.minimum, left) if on_cpu() else jnp.min(left, axis=0)
         index.append(first)
         left = jnp.where(left == first, num_contacts, left)
     chosen = materialize(jnp.stack(index))  # (P, B)

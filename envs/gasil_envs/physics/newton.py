@@ -32,7 +32,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs.physics import newton_kernel
-from gasil_envs.physics.batching import add, materialize, on_cpu, on_gpu, total
+from gasil_envs.physics.batching import add, fold, materialize, on_cpu, on_gpu, total
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges.
@@ -361,9 +361,11 @@ def solve_many(
         return each(lambda d: d < 0.0, jaref)
 
     def changes(a: Any, b: Any) -> jax.Array:
-        return functools.reduce(
-            jnp.logical_or, (jnp.any(x != y) for x, y in zip(a, b, strict=True))
-        )
+        pairs = zip(a, b, strict=True)
+        if not on_cpu():
+            return functools.reduce(jnp.logical_or, (jnp.any(x != y) for x, y in pairs))
+        rows = [fold(jnp.logical_or, flat(x != y)) for x, y in pairs]
+        return jnp.any(functools.reduce(jnp.logical_or, rows))
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth

@@ -10,6 +10,7 @@ all bodies that move, of one tree or more; a rotation matrix is the list of its 
 (3, B) each.
 """
 
+import operator
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import add, materialize, take, total
+from gasil_envs.physics.batching import add, materialize, stacked, take, total
 
 FREE, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -74,9 +75,14 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
     """Cross product along the axis before the last: (..., 3, B)."""
+    return stacked(_cross(a, b), -2)
+
+
+def _cross(a: jax.Array, b: jax.Array) -> list[jax.Array]:
+    """Cross product of arrays (..., 3, B), as three arrays (..., B)."""
     a1, a2, a3 = (a[..., i, :] for i in range(3))
     b1, b2, b3 = (b[..., i, :] for i in range(3))
-    return jnp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-2)
+    return [a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1]
 
 
 def rotate(columns: Sequence[jax.Array], vector: np.ndarray) -> jax.Array:
@@ -172,16 +178,17 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
         xpos.append(materialize(position))
         columns.append(turned)
     places = zip(xpos, columns, model.body_ipos, strict=True)
-    xipos = jnp.stack([x + rotate(turned, local) for x, turned, local in places])
+    xipos = stacked([x + rotate(turned, local) for x, turned, local in places])
     mass = model.body_mass.astype(np.float32)[:, None]
     # What does not move is not counted: it may be heavy, and far away.
     moving = mass * (model.body_weldid > 0)[:, None]
     com = add(m * x for m, x in zip(moving[:, 0], xipos, strict=True)) / moving.sum()
     xipos, com = materialize((xipos, com))
     cinert = _inertia(model, columns, xipos - com, mass=mass)
-    axis, anchor, translation = map(jnp.stack, zip(*dofs, strict=True))
-    translation = translation + cross(axis, com - anchor)
-    cdof = jnp.concatenate([axis, translation], axis=1)
+    axis, anchor, translation = map(stacked, zip(*dofs, strict=True))
+    turning = _cross(axis, com - anchor)
+    moved = [translation[:, i] + turning[i] for i in range(3)]
+    cdof = stacked([*(axis[:, i] for i in range(3)), *moved], 1)
     cinert, cdof = materialize((cinert, cdof))
     return Kinematics(columns, jnp.stack(xpos), xipos, com, cinert, cdof)
 
@@ -194,7 +201,8 @@ def _inertia(
     mass: np.ndarray,
 ) -> jax.Array:
     """Return the bodies' inertia about a point `offset` away: (N, 10, B)."""
-    rotation = materialize(jnp.stack([jnp.stack(x) for x in columns]))  # (N, k, i, B)
+    rotation = materialize(stacked([column for x in columns for column in x]))
+    rotation = rotation.reshape(-1, 3, *rotation.shape[1:])  # (N, k, i, B)
     local = np.stack(
         [
             _matrix(quaternion) * inertia @ _matrix(quaternion).T
@@ -211,7 +219,7 @@ def _inertia(
         return add(half[:, k, i] * rotation[:, k, j] for k in range(3))
 
     x, y, z = (offset[:, i] for i in range(3))
-    return jnp.stack(
+    return stacked(
         [
             entry(0, 0) + mass * (y * y + z * z),
             entry(1, 1) + mass * (x * x + z * z),
@@ -224,7 +232,7 @@ def _inertia(
             mass * z,
             jnp.broadcast_to(mass, x.shape),
         ],
-        axis=1,
+        1,
     )
 
 
@@ -237,41 +245,29 @@ def _momentum(inertia: jax.Array, motion: jax.Array) -> jax.Array:
         motion[..., :3, :],
         motion[..., 3:, :],
     )
-    turned = jnp.stack(
-        [xx * a + xy * b + xz * c, xy * a + yy * b + yz * c, xz * a + yz * b + zz * c],
-        axis=-2,
-    )
-    return jnp.concatenate(
-        [
-            turned + cross(offset, translation),
-            mass[..., None, :] * translation - cross(offset, rotation),
-        ],
-        axis=-2,
-    )
+    turned = [
+        x * a + y * b + z * c for x, y, z in ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    ]
+    moved = [mass * translation[..., i, :] for i in range(3)]
+    rows = [
+        *map(operator.add, turned, _cross(offset, translation)),
+        *map(operator.sub, moved, _cross(offset, rotation)),
+    ]
+    return stacked(rows, -2)
 
 
 def _cross_motion(a: jax.Array, b: jax.Array) -> jax.Array:
     """Change of motion b that moves with motion a: (..., 6, B)."""
-    turn = a[..., :3, :]
-    return jnp.concatenate(
-        [
-            cross(turn, b[..., :3, :]),
-            cross(a[..., 3:, :], b[..., :3, :]) + cross(turn, b[..., 3:, :]),
-        ],
-        axis=-2,
-    )
+    turn, turned = a[..., :3, :], b[..., :3, :]
+    moved = (_cross(a[..., 3:, :], turned), _cross(turn, b[..., 3:, :]))
+    return stacked([*_cross(turn, turned), *map(operator.add, *moved)], -2)
 
 
 def _cross_force(a: jax.Array, f: jax.Array) -> jax.Array:
     """Change of force f that moves with motion a: (..., 6, B)."""
-    turn = a[..., :3, :]
-    return jnp.concatenate(
-        [
-            cross(turn, f[..., :3, :]) + cross(a[..., 3:, :], f[..., 3:, :]),
-            cross(turn, f[..., 3:, :]),
-        ],
-        axis=-2,
-    )
+    turn, pushed = a[..., :3, :], f[..., 3:, :]
+    torque = (_cross(turn, f[..., :3, :]), _cross(a[..., 3:, :], pushed))
+    return stacked([*map(operator.add, *torque), *_cross(turn, pushed)], -2)
 
 
 def _sum_down(model: mujoco.MjModel, of_dof: jax.Array) -> tuple[jax.Array, jax.Array]:
