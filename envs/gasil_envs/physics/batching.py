@@ -69,14 +69,14 @@ def total(x: jax.Array, axis: int = 0) -> jax.Array:
     return add(jax.lax.index_in_dim(x, i, axis, False) for i in range(x.shape[axis]))
 
 
-def fold(
-    function: Callable[[jax.Array, jax.Array], jax.Array], rows: jax.Array
-) -> jax.Array:
-    """Combine the rows of an array, one after the other: (N, ..., B) -> (..., B).
+def fold(function: Any, rows: jax.Array) -> jax.Array:
+    """Combine rows by one of jax.numpy's ufuncs: (N, ..., B) -> (..., B).
 
-    On a CPU it serves as a reduction that is computed for a whole vector of the batch
-    at once, as `total` is, but is compiled for size.
+    On a CPU it is computed for a whole vector of the batch at once, as `total` is, but
+    is compiled for size.
     """
+    if not on_cpu():
+        return function.reduce(rows, axis=0)
     return jax.lax.fori_loop(
         1, rows.shape[0], lambda i, done: function(done, rows[i]), rows[0]
     )

@@ -19,7 +19,7 @@ from flax import struct
 from mujoco import mjx
 
 from gasil_envs.physics import collision, newton, tree
-from gasil_envs.physics.batching import add, fold, materialize, on_cpu, take, total
+from gasil_envs.physics.batching import add, fold, materialize, take, total
 
 _PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
@@ -398,8 +398,6 @@ MOST_IN_PLAY = 8
 def num_in_play(contacts: Contacts) -> jax.Array:
     """Return how many contacts of a group are in play, (B,)."""
     in_play = contacts.touch.distance < contacts.constants.margin
-    if not on_cpu():
-        return jnp.sum(in_play, axis=0, dtype=jnp.int32)
     return fold(jnp.add, in_play.astype(jnp.int32))
 
 
@@ -414,12 +412,11 @@ def gather(contacts: Contacts) -> Contacts:
         return contacts
     in_play = contacts.touch.distance < contacts.constants.margin  # (C, B)
     number = jnp.arange(num_contacts, dtype=jnp.int32)[:, None]
-    index, left = [], jnp.where(in_play, number, num_contacts)
+    index, last = [], jnp.int32(-1)
     for _ in range(MOST_IN_PLAY):
-        left = materialize(left)
-        first = fold(jnp.minimum, left) if on_cpu() else jnp.min(left, axis=0)
-        index.append(first)
-        left = jnp.where(left == first, num_contacts, left)
+        left = jnp.where(in_play & (number > last), number, num_contacts)
+        last = fold(jnp.minimum, left)
+        index.append(last)
     chosen = materialize(jnp.stack(index))  # (P, B)
     safe = jnp.minimum(chosen, num_contacts - 1)
 

@@ -362,10 +362,8 @@ def solve_many(
 
     def changes(a: Any, b: Any) -> jax.Array:
         pairs = zip(a, b, strict=True)
-        if not on_cpu():
-            return functools.reduce(jnp.logical_or, (jnp.any(x != y) for x, y in pairs))
-        rows = [fold(jnp.logical_or, flat(x != y)) for x, y in pairs]
-        return jnp.any(functools.reduce(jnp.logical_or, rows))
+        parts = [fold(jnp.logical_or, flat(x != y)) for x, y in pairs]
+        return jnp.any(functools.reduce(jnp.logical_or, parts))
 
     def cost(qacc: jax.Array) -> jax.Array:
         away = qacc - qacc_smooth
