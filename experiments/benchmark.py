@@ -31,7 +31,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
-from experiments import peers
+from experiments import measured, peers
 from experiments.comparisons import interval
 from experiments.search import TASKS
 from gasil_envs import wrappers
@@ -66,6 +66,7 @@ class Options:
       seeds: number of seeds to train; in the scaling table on each device.
       training_envs: number of environments per seed; default the paper preset's.
       iterations: training iterations in a repeat; in the table peers, of each training.
+      page: write the tables into docs/performance.md too, below the same command.
     """
 
     tables: tuple[str, ...] = ("physics", "training")
@@ -77,6 +78,7 @@ class Options:
     seeds: int = 10
     training_envs: int | None = None
     iterations: int = 2
+    page: bool = False
 
 
 @dataclasses.dataclass
@@ -91,6 +93,7 @@ class Row:
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
       returns: what trained policies return, (seeds,); None if it is not measured.
+      speed: steps per second, the median of the repeats, once it is measured.
     """
 
     env: str
@@ -100,6 +103,7 @@ class Row:
     compile_seconds: float = 0.0
     error: float | None = None
     returns: np.ndarray | None = None
+    speed: float = 0.0
 
 
 def _make(env_name: str, variant: str) -> Any:
@@ -374,6 +378,7 @@ def measure(rows: Sequence[Row], repeats: int) -> None:
     """Time the rows of a task in turn and print them."""
     speeds = np.median([[row.run() for row in rows] for _ in range(repeats)], axis=0)
     for row, speed in zip(rows, speeds, strict=True):
+        row.speed = speed
         error = "" if row.error is None else f"{row.error:17.1e}"
         error += "" if row.returns is None else f"  {interval(row.returns)}"
         print(
@@ -381,6 +386,30 @@ def measure(rows: Sequence[Row], repeats: int) -> None:
             f"{speed / speeds[0]:6.2f} {row.compile_seconds:9.1f}{error}",
             flush=True,
         )
+
+
+def for_page(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
+    """Return the head and the lines of a table: a line per task, or per row of one."""
+    tasks: dict[str, list[Row]] = {}
+    for row in rows:
+        tasks.setdefault(row.env, []).append(row)
+    if len(tasks) == 1:
+        head = [rows[0].env, "environments", "steps/s", "compile s"]
+        return head, [
+            [x.name, f"{x.num_envs:,}", f"{x.speed:,.0f}", f"{x.compile_seconds:.0f}"]
+            for x in rows
+        ]
+    first, *_ = tasks.values()
+    several = len({x.name for x in first}) < len(first)
+    names = [f"{x.num_envs:,}: {x.name}" if several else x.name for x in first]
+    lines, head = [], ["steps/s", *names, "compile s"]
+    for env, each in tasks.items():
+        speeds = [f"{x.speed:,.0f}" for x in each]
+        seconds = ", ".join(f"{x.compile_seconds:.0f}" for x in each)
+        lines.append([env, *speeds, seconds])
+        if first[0].error is not None:
+            lines[-1].append(", ".join(f"{x.error:.0e}" for x in each))
+    return [*head, *["errors of a step"] * (len(lines[0]) > len(head))], lines
 
 
 TABLES = {
@@ -405,13 +434,16 @@ def run(options: Options) -> None:
     )
     if "peers" in options.tables:
         peers.check()
+    if options.page:
+        measured.find("benchmark", options)
     count = options.devices or available_cores()
     prepare(Settings(physics="mujoco"), count)
     jax.config.update("jax_num_cpu_devices", count)
     jax.config.update("jax_default_matmul_precision", "highest")
-    devices, versions = jax.devices(), metrics_files.versions()
-    print(f"{len(devices)} x {devices[0].device_kind}, {available_cores()} cores")
+    print(measured.machine())
+    versions = metrics_files.versions()
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
+    every: list[Row] = []
     for table in options.tables:
         print(
             f"{table:54}  envs     steps/s  ratio compile s  error of a step, or return"
@@ -419,3 +451,6 @@ def run(options: Options) -> None:
         for env_name in peers.ENVS if table == "peers" else options.envs:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)
+                every += rows
+    if options.page:
+        measured.write("benchmark", options, *for_page(every))

@@ -3,7 +3,8 @@
 One iteration of the program that `gasil_jax.run` trains with is traced. XLA records the
 named scopes of each operation, which say to which part it belongs. An operation's time
 is its median duration times its number of executions, so other processes have little
-effect. Tracing makes tiny operations look longer, above all those of physics.
+effect. Tracing makes tiny operations look longer. On a CPU a step of physics is one
+operation; on a GPU its parts are told apart.
 
 All seeds are on one device. To measure one CPU core, start it with ``taskset -c 0``.
 """
@@ -22,6 +23,7 @@ import numpy as np
 import tyro
 
 import gasil_envs
+from experiments import measured
 from gasil_envs.registry import Settings
 from gasil_jax import presets
 from gasil_jax.host import command_line, devices, metrics_files
@@ -33,7 +35,7 @@ PARTS: Mapping[str, str] = {
     "physics: constraint rows": "constraint_rows",
     "physics: collision": "collision",
     "physics: smooth dynamics": "smooth_dynamics",
-    "physics: the rest": "physics",
+    "physics": "physics",
     "environments: starts": "reset",
     "environments: the rest": "environment",
     "policy": "policy",
@@ -48,6 +50,8 @@ PARTS: Mapping[str, str] = {
 }
 _REST = "the rest"
 _CONTROL = ("while", "call", "conditional")
+#: In the line of a call that is one kernel: on a CPU, a step of physics.
+_KERNEL = "xla_cpu_small_call"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Options:
       seeds: number of seeds.
       iterations: number of iterations before the one that is traced.
       repeats: number of times that a whole iteration is timed.
+      page: write the table into docs/performance.md too, below the same command.
       settings: settings of the environment.
     """
 
@@ -70,6 +75,7 @@ class Options:
     seeds: int = 5
     iterations: int = 10
     repeats: int = 5
+    page: bool = False
     settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
         default_factory=Settings
     )
@@ -85,7 +91,7 @@ def operations(program: str) -> dict[str, str]:
     for line in program.splitlines():
         if row := re.match(r"\s+(?:ROOT )?%?([\w.-]+) = .*?\s([\w-]+)\(", line):
             scopes = re.search(r'op_name="([^"]*)"', line)
-            if row[2] not in _CONTROL:
+            if row[2] not in _CONTROL or _KERNEL in line:
                 blocks[-1][row[1]] = scopes and scopes[1]
         elif line.endswith("{"):
             blocks.append({})
@@ -145,6 +151,8 @@ def trace(call: Any, program: str) -> dict[str, float]:
 def run(options: Options) -> None:
     """Print the table."""
     command_line.check_minimum(options, seeds=1, iterations=1, repeats=1)
+    if options.page:
+        measured.find("profile", options)
     devices.use_devices(options.settings, 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
@@ -184,6 +192,13 @@ def run(options: Options) -> None:
     steps, total = options.seeds * algorithm.config.batch_steps, sum(totals.values())
     rows = {**totals, "sum": total, "an iteration without trace": np.median(seconds)}
     print(f"{options.env}, {options.agent}, {options.seeds} seeds: us/env step  share")
-    for part, of_part in rows.items():
-        if of_part:
-            print(f"{part:30} {of_part / steps * 1e6:9.2f} {of_part / total:9.3f}")
+    shown = [
+        (part, f"{of_part / steps * 1e6:.2f}", f"{of_part / total:.3f}")
+        for part, of_part in rows.items()
+        if of_part
+    ]
+    for part, time_of_step, share in shown:
+        print(f"{part:30} {time_of_step:>9} {share:>9}")
+    if options.page:
+        head = [f"{options.env}, {options.agent}", "us a step", "share"]
+        measured.write("profile", options, head, shown)

@@ -313,6 +313,8 @@ def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, caps
         (("report", "--help-me"), "option --help-me is unknown: see --help"),
         (("benchmark", "--tables", "speed"), "tables has 'speed': allowed physics"),
         (("benchmark", "--repeats", "0"), "repeats is 0: it must be 1 or more"),
+        (("benchmark", "--repeats", "9", "--page"), "page is set, but "),
+        (("profile", "--repeats", "9", "--page"), "page is set, but "),
         (
             # JAX is running with two devices.
             "benchmark --devices 2 --tables scaling --training-envs 100".split(),

@@ -6,7 +6,7 @@ import jax
 import pytest
 
 from experiments import __main__ as experiments
-from experiments import profile
+from experiments import benchmark, measured, profile
 
 
 @pytest.fixture
@@ -17,10 +17,30 @@ def cache_settings():
     jax.config.update(name, before)
 
 
-def test_every_part_of_an_iteration_is_in_the_table(cache_settings, capsys):
-    toy = "--env point_mass --seeds 2 --iterations 1 --repeats 1"
-    assert experiments.main(["profile", *toy.split()]) == 0
+@pytest.fixture
+def page(tmp_path, monkeypatch):
+    """A function that puts a command into a page of its own, and returns the page."""
+
+    def having(command):
+        path = tmp_path / "performance.md"
+        table = f"$ {command}\n```\n\n<!-- begin -->\nbefore\n<!-- end -->"
+        other = table.replace(command, "python -m experiments profile --seeds 7")
+        path.write_text(f"{other}\n\n{table}\n")
+        monkeypatch.setattr(measured, "PAGE", path)
+        return path
+
+    return having
+
+
+def test_every_part_of_an_iteration_is_in_the_table(cache_settings, page, capsys):
+    toy = "profile --env point_mass --seeds 2 --iterations 1 --repeats 1"
+    written = page(f"taskset -c 0 python -m experiments {toy}")
+    assert experiments.main([*toy.split(), "--page"]) == 0
     title, *lines = capsys.readouterr().out.splitlines()
+    other, ours = written.read_text().split(toy)
+    assert "before" in other and "before" not in ours
+    for line in lines:
+        assert f"| {line[:30].strip()} | {' | '.join(line[30:].split())} |\n" in ours
     assert title.startswith("point_mass, ppo+gasil, 2 seeds")
     rows = {line[:30].strip(): [float(x) for x in line[30:].split()] for line in lines}
     for part in (*profile.PARTS, "host: metrics.csv"):
@@ -62,6 +82,9 @@ def test_operations_belong_to_the_scopes_that_they_were_written_in():
 
 ENTRY %main (x: f32[]) -> f32[] {
   %while.1 = f32[] while(%x), body=%body, metadata={op_name="jit(f)/ppo/while"}
+  %call.1 = f32[] call(%x), to_apply=%g, metadata={op_name="jit(f)/ppo/jit(g)"}
+  %step.1 = f32[] call(%x), to_apply=%s, frontend_attributes={inlineable="false",\
+xla_cpu_small_call="true"}, metadata={op_name="jit(f)/vmap(physics)/jit(tiled)"}
   %sort.1 = f32[] sort(%x), metadata={op_name="jit(f)/ppo/permutation/sort"}
   ROOT %add.1 = f32[] add(%x, %x), metadata={op_name="jit(f)/add"}
 }
@@ -69,6 +92,27 @@ ENTRY %main (x: f32[]) -> f32[] {
     assert profile.operations(program) == {
         "dot.1": "PPO: minibatches",
         "copy.1": "PPO: minibatches",
+        "step.1": "physics",
         "sort.1": "PPO: permutations",
         "add.1": "the rest",
     }
+
+
+def test_what_a_benchmark_measured_is_a_line_for_each_task():
+    row = lambda env, name, num_envs, speed: benchmark.Row(
+        *(env, name, num_envs, None), compile_seconds=speed / 100, speed=speed
+    )
+    rows = [row("ant", "mjx", 8, 1e3), row("ant", "ours", 8, 2e3)]
+    head, lines = benchmark.for_page(rows)
+    assert head == ["ant", "environments", "steps/s", "compile s"]
+    assert lines == [["mjx", "8", "1,000", "10"], ["ours", "8", "2,000", "20"]]
+    more = [row("hopper", "mjx", 8, 3e3), row("hopper", "ours", 8, 4e3)]
+    head, lines = benchmark.for_page([*rows, *more])
+    assert head == ["steps/s", "mjx", "ours", "compile s"]
+    assert lines[1] == ["hopper", "3,000", "4,000", "30, 40"]
+    for one in (*rows, *more):
+        one.error = one.speed * 1e-10
+    head, lines = benchmark.for_page([*rows, *more])
+    assert head[-1] == "errors of a step" and lines[1][-1] == "3e-07, 4e-07"
+    many = [row(env, "ours", n, n) for env in ("ant", "hopper") for n in (8, 2048)]
+    assert benchmark.for_page(many)[0][1:3] == ["8: ours", "2,048: ours"]

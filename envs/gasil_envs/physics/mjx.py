@@ -153,7 +153,8 @@ class MjxPhysics:
 
             # Tiles take half as long again to compile, which a single simulation, for a
             # picture or an adapter, would not earn back.
-            return batch_last(many, in_tiles(many))((state, control))
+            with jax.named_scope("physics"):
+                return batch_last(many, in_tiles(many))((state, control))
         data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
             lambda data, _: (mjx.step(self._mjx_model, data), None),
