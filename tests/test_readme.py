@@ -64,7 +64,7 @@ def commands():
     """Return every console command of the documents once.
 
     A line starts with $ and continues after a backslash. && separates commands, and
-    variables that are set before a command are left out.
+    variables and a core that are set before a command are left out.
     """
     text = "\n".join(path.read_text() for path in DOCUMENTS)
     unique = {}
@@ -72,7 +72,7 @@ def commands():
         for line in block.replace("\\\n", " ").splitlines():
             if line.startswith("$ "):
                 for command in line[2:].split(" && "):
-                    command = re.sub(r"^[A-Z_]+=\S+ ", "", command)
+                    command = re.sub(r"^([A-Z_]+=\S+|taskset -c 0) ", "", command)
                     unique[shlex.join(shlex.split(command, comments=True))] = None
     return list(unique)
 
