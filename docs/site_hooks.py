@@ -40,6 +40,11 @@ def _mathml(match: re.Match[str]) -> str:
     return written
 
 
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Let pages of results, which are beside ``docs`` in a checkout, link into it."""
+    return markdown.replace("](../../docs/", "](../")
+
+
 def on_page_content(content: str, page: Any, **_: Any) -> str:
     """Turn a page's TeX into MathML, and link each picture to its file.
 

@@ -1,4 +1,4 @@
-"""Figures and tables of the paper, one module each; run from the project's folder."""
+"""Figures and tables of the paper, and what else is measured, of a checkout."""
 
 from gasil_jax.host import interruption
 

@@ -363,7 +363,7 @@ def _changes() -> Comparisons:
 
 _GASIL, _CLONED = {"alpha": 0.1}, {"behavior_cloning_coefficient": 1.0}
 _CENTRED = {**_GASIL, "bonus": "centered"}
-#: The sparse tasks that are also tried with noise, and those of the ablation.
+#: The sparse tasks that are also tried with noise.
 _NOISY = [f"{SPARSE[i]}_noisy" for i in (0, 2, 6, 7)]
 #: The sparse robots, without and with noise.
 _ROBOTS = [*SPARSE_ROBOTS, *(f"{env}_noisy" for env in SPARSE_ROBOTS)]
@@ -408,6 +408,7 @@ def _sparse_panels(
     ]
 
 
+#: The sparse tasks of the ablation.
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
 #: What may differ in how a buffer is filled, by name.
 _BUFFERS: Mapping[str, Point] = {

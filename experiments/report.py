@@ -83,9 +83,11 @@ _READING = """## How to read this
 
 _SHARES = """## How to read this
 
-- **A seed solves a task** if its final return is at least half of that of a success.
-  The final return is the mean, over the iterations of the last tenth of training, of
-  the mean return of the episodes that end in an iteration, with the acting policy.
+- **A seed solves a task** if its final return is at least half of what makes an episode
+  a success: half of 1, of 10 with a treasure, of 0.9 in deep sea, of 80 for the car, of
+  500 for a robot, which is paid 1 a step. The final return is the mean, over the
+  iterations of the last tenth of training, of the mean return of the episodes that end
+  in an iteration, with the acting policy.
 - **In brackets** are the thousands of steps until the mean return is that high, the
   median over the seeds that solve the task.
 - **Sooner:** the probability that a random seed of the first curve solves its task in
@@ -309,7 +311,7 @@ class Page:
         return panels or tuple(self.figure.panels)
 
     def better(self, rewards: str, ours: str, *others: str) -> str:
-        """Return on how many tasks a curve is better than others, as half a sentence.
+        """Return where a curve is better, and worse, than others, as half a sentence.
 
         Args:
           rewards: "delayed" or "dense"; empty for all panels.
@@ -324,8 +326,9 @@ class Page:
             on = [panel for panel in panels if other in self.figure.panels[panel]]
             verdicts = _verdicts(self.comparisons, on, (ours, other))
             measured = "" if len(verdicts) == len(on) else " measured"
-            better = [*verdicts.values()].count("better")
-            tasks = f"{better} of {len(verdicts)}{measured} tasks"
+            better, worse = map([*verdicts.values()].count, ("better", "worse"))
+            tasks = f"{better}{f' (worse on {worse})' if worse else ''}"
+            tasks += f" of {len(verdicts)}{measured} tasks"
             names.setdefault(tasks, []).append(other.upper())
         parts = [
             f"than {', '.join(x[:-1])} and {x[-1]} on {tasks} each"
@@ -613,14 +616,15 @@ class Page:
     def means(self, kind: str, *names: str) -> str:
         """Return `mean_shares` of some curves as text, those that are complete.
 
-        What stands in brackets in a curve's name is for the text around it to say.
+        What stands in brackets in a curve's name, but for a number, is for the text
+        around it to say.
 
         Args:
           kind: the kind of tasks, see `_sparse`.
           *names: the curves.
         """
         mean = self.mean_shares(kind)
-        plain = {x: x.partition(" (")[0].upper() for x in names if x in mean}
+        plain = {x: re.sub(r" \(\D.*", "", x).upper() for x in names if x in mean}
         return ", ".join(f"{words} {mean[x]:.2f}" for x, words in plain.items())
 
     def lead(self, ours: str = "", kind: str = "", *others: str) -> str:

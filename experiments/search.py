@@ -1,12 +1,13 @@
-"""The searches of hyperparameters, and how many of all planned runs are stored.
+"""The searches of hyperparameters.
 
-Episodes are staggered and rewards are normalized. Every agent is searched with the same
-number of points on every task, dense and delayed, with two seeds. If the best point has
-a value at an end of its grid, the next value beyond is tried too. The best of all these
-points are trained with more seeds before one is chosen, because two seeds decide little
-on tasks with bimodal outcomes. So the same runs give the best point of each task, which
-is the paper's protocol, and the best single point for all delayed tasks. Figures train
-the chosen points with other seeds than the searches.
+Episodes are staggered and rewards are normalized, but not in the paper's own protocol.
+Every agent is searched with the same number of points on every task, dense and delayed,
+with two seeds. If the best point has a value at an end of its grid, the next value
+beyond is tried too. The best of all these points are trained with more seeds before one
+is chosen, because two seeds decide little on tasks with bimodal outcomes. So the same
+runs give the best point of each task, which is the paper's protocol, and the best
+single point for all delayed tasks. Figures train the chosen points with other seeds
+than the searches.
 """
 
 import dataclasses

@@ -38,8 +38,8 @@ ZOO, ZOO_PREFIX = pathlib.Path(__file__).with_name("zoo"), "zoo:"
 CLIP = 10.0
 
 _PER_SEED = ("seeds", "final_return", "mean", "scale", "log_std")
-#: The arrays that are the same for all seeds of a file.
 OWN_NETWORK = "the policy's network is a Flax module of your own, which needs JAX"
+#: The arrays that are the same for all seeds of a file.
 SHARED = (
     *("low", "high", "num_actions", "policy_components"),
     *("activation_relu", "activation_swish"),

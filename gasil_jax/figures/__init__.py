@@ -1,1 +1,1 @@
-"""Curves and statistics of finished runs."""
+"""Curves of finished runs."""

@@ -212,13 +212,13 @@ class _Tables:
         del self._returns[1:]
         if self.evaluation is None:
             return record | {"score": float(returns.mean()) if returns.size else None}
-        return record | self.evaluation.record() | {"score": self.score}
+        return record | self.evaluation.writer.record() | {"score": self.score}
 
     def close(self) -> None:
         """Close the files and the trackers."""
         self._metrics.close()
         if self.evaluation is not None:
-            self.evaluation.close()
+            self.evaluation.writer.close()
         for tracker in self._trackers:
             tracker.close()
 
@@ -273,23 +273,6 @@ def _restored(
         with command_line.input_checked():
             states = newest.restore(members.shapes())
     return _Training(members, states, newest.iteration), newest.record
-
-
-def _save(
-    checkpoints: PeriodicCheckpoints,
-    training: _Training,
-    tables: _Tables,
-    *,
-    progress: Progress,
-) -> None:
-    """Write the tables to the disk, and a checkpoint if any are kept."""
-    with progress.aside("saving a checkpoint"):
-        checkpoints.save(
-            training.done,
-            training.states,
-            record=tables.record(),
-            score=tables.score,
-        )
 
 
 def drive(
@@ -349,6 +332,12 @@ def drive(
     def steps_of(done: int) -> int:
         return steps_before + members.env_steps(done)
 
+    def save() -> None:
+        with progress.aside("saving a checkpoint"):
+            done, states = training.done, training.states
+            record = tables.record()
+            checkpoints.save(done, states, record=record, score=tables.score)
+
     started = time.monotonic()
     if training.left:
         progress.phase("compiling", steps_of(first))
@@ -376,13 +365,13 @@ def drive(
             )
         scores = tables.evaluate(training, progress)
         if checkpoints.is_due(training.done, tables.score):
-            _save(checkpoints, training, tables, progress=progress)
+            save()
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
     train_seconds = time.monotonic() - started
     unsaved = None
     try:
-        _save(checkpoints, training, tables, progress=progress)
+        save()
     except checkpoint.WriteError as error:
         unsaved = error
     with progress.aside("closing the trackers"):

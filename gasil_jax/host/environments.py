@@ -1,21 +1,13 @@
-"""Make environments by name; the registry of ``gasil_envs`` is used only here."""
+"""What the host needs of ``gasil_envs``: to make environments, and what they are."""
 
 from typing import Any
 
-from gasil_envs import pictures
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
-from gasil_envs.registry import (
-    Settings,
-    check,
-    made_with,
-    make,
-    prepare,
-    without_effect,
-)
+from gasil_envs.pictures import can_draw as can_be_drawn
+from gasil_envs.registry import Settings, check, made_with, prepare, without_effect
+from gasil_envs.registry import make as make_env
 from gasil_envs.wrappers import is_discrete
-
-make_env = make
 
 __all__ = [
     "Settings",
@@ -40,8 +32,3 @@ def ends_early(env: Any) -> bool:
 def is_locomotion(env: Any) -> bool:
     """Return whether an environment, wrapped or not, is one of the MuJoCo tasks."""
     return isinstance(env.unwrapped, Locomotion)
-
-
-def can_be_drawn(env: Any) -> bool:
-    """Return whether there are pictures of an environment, wrapped or not."""
-    return pictures.can_draw(env)

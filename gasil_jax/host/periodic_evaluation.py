@@ -92,7 +92,7 @@ class PeriodicEvaluation:
         self._members, self._trackers = members, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
-        self._writer = metrics_files.MetricsWriter(
+        self.writer = metrics_files.MetricsWriter(
             path, labels, checkpoint, columns=COLUMNS
         )
 
@@ -126,16 +126,8 @@ class PeriodicEvaluation:
             "max": returns.max(axis=1),
             "length": length.mean(axis=1),
         }
-        self._writer.write({name: x[:, None] for name, x in scores.items()})
+        self.writer.write({name: x[:, None] for name, x in scores.items()})
         for tracker in self._trackers:
             tracker.log(int(scores["env_steps"][0]), {"evaluation": scores["mean"]})
         self.seconds += time.monotonic() - started
         return scores
-
-    def record(self) -> dict[str, Any]:
-        """Write everything to the disk; return what a checkpoint records of it."""
-        return self._writer.record()
-
-    def close(self) -> None:
-        """Close evaluations.csv."""
-        self._writer.close()

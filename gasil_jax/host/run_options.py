@@ -51,10 +51,11 @@ class Options:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
         humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
         brax:NAME, gymnax:NAME, navix:NAME or playground:NAME, for example
-        gymnax:CartPole-v1; or your own as MODULE:NAME.
-      agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
-        ppo+bonus, gail, or your own as MODULE:CLASS. Each has its own settings: this
-        help shows those of the one that is named beside it.
+        gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
+      agent: the agent: ppo, ppo+bc, ppo+bc-adaptive, ppo+sil, gasil, ppo+gasil,
+        ppo+gasil-adaptive, ppo+bonus, ppo+novelty, ppo+bc+novelty, gail, or your own as
+        MODULE:CLASS. Each has its own settings: this help shows those of the one that
+        is named beside it.
       seeds: number of seeds to train.
       first_seed: number of the first seed. A seed's random numbers depend only on
         its number.
@@ -73,11 +74,10 @@ class Options:
       evaluate_episodes: episodes per seed in each evaluation; default 10.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
       preset: the settings to start from: tuned, searched for each environment and
-        agent; decomposed, searched for PPO on decomposed delayed rewards; scaled, one
-        rule of PPO for all locomotion tasks; gymnax, one setting for discrete actions;
-        or paper, the paper's own protocol, with one environment per seed. Options
-        override them. The defaults that this help shows are the preset's if --env is
-        named beside --help.
+        agent; scaled, one rule of PPO for all locomotion tasks; gymnax, one setting for
+        discrete actions; or paper, the paper's own protocol, with one environment per
+        seed. Options override them. The defaults that this help shows are the preset's
+        if --env is named beside --help.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -318,9 +318,9 @@ def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     The parser of all options reports what is wrong with their values.
     """
 
-    def delay(text: str | None) -> int:
-        with contextlib.suppress(ValueError, TypeError, OverflowError):
-            return max(1, command_line.whole_number(text or ""))
+    def delay(text: str) -> int:
+        with contextlib.suppress(ValueError):
+            return max(1, command_line.whole_number(text))
         return 1
 
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)

@@ -205,6 +205,11 @@ def test_a_table_and_a_tally(page):
     assert page.value("better", "", "ours", "other") == words
     words = "better than OTHER and OTHER on 1 of 2 tasks each"
     assert page.better("", "ours", "other", "other") == words
+    one = page.comparisons["one", "ours", "other"]
+    behind = dataclasses.replace(one, middle=-one.middle)
+    page.comparisons["two", "ours", "other"] = behind
+    words = "better than OTHER on 1 (worse on 1) of 2 tasks"
+    assert page.better("", "ours", "other") == words
     del page.comparisons["two", "ours", "other"]
     words = "better than OTHER on 1 of 1 measured tasks"
     assert page.better("", "ours", "other") == words

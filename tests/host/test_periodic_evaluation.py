@@ -280,7 +280,7 @@ def scored(tmp_path, seeds, devices, times=1):
     )
     for _ in range(times):
         evaluation.score(states, 1)
-    evaluation.close()
+    evaluation.writer.close()
     with path.open() as file:
         table = list(csv.DictReader(file))
     return {

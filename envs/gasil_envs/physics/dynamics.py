@@ -113,20 +113,20 @@ class _Evaluation(NamedTuple):
     fields: Fields
 
 
+def _fields(dynamics: Dynamics, at: tree.Kinematics, *others: jax.Array) -> Fields:
+    """Return the fields to return; `others` are those from "cvel" on, in order."""
+    every = zip(FIELDS, (at.xpos, at.xipos, at.cinert, *others), strict=True)
+    return {name: x for name, x in every if name in dynamics.fields}
+
+
 def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
     """Return the fields at `state`, with all forces 0."""
     model, size = dynamics.model, state.qpos.shape[-1]
     at = tree.kinematics(model, state.qpos)
-    fields = {
-        "xpos": at.xpos,
-        "xipos": at.xipos,
-        "cinert": at.cinert,
-        "cvel": tree.velocity(model, at.cdof, state.qvel),
-        "qfrc_actuator": jnp.zeros((model.nv, size), jnp.float32),
-        "qfrc_constraint": jnp.zeros((model.nv, size), jnp.float32),
-        "cfrc_ext": jnp.zeros((model.nbody, 6, size), jnp.float32),
-    }
-    return {name: fields[name] for name in dynamics.fields}
+    cvel = tree.velocity(model, at.cdof, state.qvel)
+    no_force = jnp.zeros((model.nv, size), jnp.float32)
+    of_bodies = jnp.zeros((model.nbody, 6, size), jnp.float32)
+    return _fields(dynamics, at, cvel, no_force, no_force, of_bodies)
 
 
 def forward(
@@ -169,21 +169,8 @@ def forward(
         return solution.qacc, solution.constraint_force, of_bodies
 
     qacc, constraint_force, of_bodies = _with_contacts_in_play(constrain, contacts)
-    fields = {
-        "xpos": at.xpos,
-        "xipos": at.xipos,
-        "cinert": at.cinert,
-        "cvel": smooth.cvel,
-        "qfrc_actuator": actuation,
-        "qfrc_constraint": constraint_force,
-        "cfrc_ext": of_bodies,
-    }
-    return _Evaluation(
-        smooth.inertia,
-        force + constraint_force,
-        qacc,
-        {name: fields[name] for name in dynamics.fields},
-    )
+    fields = _fields(dynamics, at, smooth.cvel, actuation, constraint_force, of_bodies)
+    return _Evaluation(smooth.inertia, force + constraint_force, qacc, fields)
 
 
 # On a GPU a branch waits for the host, which pays from this many possible contacts on.

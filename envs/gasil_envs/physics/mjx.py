@@ -1,7 +1,7 @@
 """MuJoCo physics in pure JAX: our own implementation, or MJX's."""
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -21,15 +21,8 @@ _LOGGER = logging.getLogger(__name__)
 #: The solvers that `MjxPhysics` offers.
 SOLVERS = ("small", "mjx")
 
-_FIELDS: dict[str, Callable[[mjx.Data], jax.Array]] = {
-    "xpos": lambda data: data.xpos,
-    "xipos": lambda data: data.xipos,
-    "cinert": lambda data: data._impl.cinert,
-    "cvel": lambda data: data.cvel,
-    "qfrc_actuator": lambda data: data.qfrc_actuator,
-    "qfrc_constraint": lambda data: data.qfrc_constraint,
-    "cfrc_ext": lambda data: data._impl.cfrc_ext,
-}
+#: The fields that MJX keeps among what depends on its implementation.
+_OF_IMPLEMENTATION = ("cinert", "cfrc_ext")
 
 #: Parts of a model that MJX leaves out without a word, and the arrays that have them.
 _LEFT_OUT = {
@@ -118,7 +111,10 @@ class MjxPhysics:
         )
 
     def _pick(self, data: mjx.Data) -> Fields:
-        return {name: _FIELDS[name](data) for name in self._fields}
+        return {
+            name: getattr(data._impl if name in _OF_IMPLEMENTATION else data, name)
+            for name in self._fields
+        }
 
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
