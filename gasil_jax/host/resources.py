@@ -12,6 +12,7 @@ import jax
 from gasil_envs import wrappers
 from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Config
 
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
@@ -190,20 +191,20 @@ def _padded(count: int, devices: Sequence[jax.Device]) -> int:
 
 
 def check_memory(
-    env: Any, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
+    one: Need, config: Config, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
     """Check that training fits the devices' memory.
 
     Args:
-      env: one environment.
-      algorithm: the algorithm of the runs.
+      one: what one run needs.
+      config: PPO's settings of the runs.
       num_members: number of members that are trained at once.
       devices: the devices that they are sharded over, at most one for each member.
 
     Raises:
       ValueError: if it does not fit; the message gives the sizes.
     """
-    one, used = need(env, algorithm), devices[:num_members]
+    used = devices[:num_members]
     required = _padded(num_members, used) * one.memory + len(used) * one.shared
     if (free := available(used)) is not None and required > free:
         # Each device trains the same number of members.
@@ -214,7 +215,6 @@ def check_memory(
                 f"a single seed needs about {alone} of memory, and "
                 f"{_in_words(free)} are free: most is for {one.largest_part}"
             )
-        config = algorithm.config
         sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
         raise ValueError(
             f"seeds are {num_members} (over all points): they need about "
@@ -256,8 +256,7 @@ def check_episodes(
 
 
 def check_disk(
-    env: Any,
-    runs: Sequence[tuple[Algorithm, int]],
+    sizes: Sequence[tuple[int, int]],
     folder: pathlib.Path,
     num_checkpoints: int,
     *,
@@ -266,8 +265,7 @@ def check_disk(
     """Check that the checkpoints fit the disk.
 
     Args:
-      env: one environment.
-      runs: each algorithm with the number of its members.
+      sizes: of each program the bytes of a member's checkpoint, and the members.
       folder: the folder of the checkpoints; it need not exist.
       num_checkpoints: number of checkpoints to keep of each member.
       written: bytes of the runs' earlier checkpoints, which new ones replace.
@@ -277,12 +275,12 @@ def check_disk(
     """
     while not folder.exists():
         folder = folder.parent
-    sizes = [need(env, algorithm).state * count for algorithm, count in runs]
+    programs = [size * count for size, count in sizes]
     # While a checkpoint is being written there is one more.
-    required = num_checkpoints * sum(sizes) + max(sizes, default=0)
+    required = num_checkpoints * sum(programs) + max(programs, default=0)
     free = _free_disk(folder)
     if free is not None and required > free + written:
-        members = sum(num_members for _, num_members in runs)
+        members = sum(count for _, count in sizes)
         raise ValueError(
             f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
             f"{num_checkpoints} checkpoints of {members} seeds (over all points), and "

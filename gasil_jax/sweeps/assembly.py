@@ -46,8 +46,9 @@ def prepare(options: Options, jobs: Sequence[Program]) -> Any:
     with announced(options.env, "starting the devices"):
         every = jax.devices()
     with command_line.input_checked():
-        for algorithm, count in sizes:
-            resources.check_memory(env, algorithm, count, every)
+        needs = [resources.need(env, algorithm) for algorithm, _ in sizes]
+        for one, (algorithm, count) in zip(needs, sizes, strict=True):
+            resources.check_memory(one, algorithm.config, count, every)
             if schedule is not None:
                 resources.check_episodes(
                     env,
@@ -57,8 +58,7 @@ def prepare(options: Options, jobs: Sequence[Program]) -> Any:
                     option="evaluate_episodes",
                 )
         resources.check_disk(
-            env,
-            sizes,
+            [(one.state, count) for one, (_, count) in zip(needs, sizes, strict=True)],
             options.out or pathlib.Path("runs"),
             # One more, because the best checkpoint is kept too.
             options.keep_checkpoints + 1,

@@ -60,7 +60,7 @@ def test_an_expert_counts_in_the_memory_that_a_run_needs(tmp_path, monkeypatch):
     ):
         monkeypatch.setattr(resources, "available", lambda _, free=free: free)
         with pytest.raises(ValueError, match=message) if message else nullcontext():
-            resources.check_memory(env, algorithm, 4, devices)
+            resources.check_memory(one, algorithm.config, 4, devices)
 
 
 def test_an_expert_is_an_argument_of_a_training_function(tmp_path):

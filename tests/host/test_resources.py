@@ -56,10 +56,9 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
         gasil_jax.make_env("point_mass"), gasil_jax.algorithm()
     ).state
     monkeypatch.setattr(resources, "_free_disk", lambda folder: 9 * state)
-    env, members = gasil_jax.make_env("point_mass"), (gasil_jax.algorithm(), 2)
-    resources.check_disk(env, [members], tmp_path, 3)
+    resources.check_disk([(state, 2)], tmp_path, 3)
     with pytest.raises(ValueError, match="3 checkpoints of 4 seeds"):
-        resources.check_disk(env, [members, members], tmp_path, 3)
+        resources.check_disk([(state, 2), (state, 2)], tmp_path, 3)
 
 
 @pytest.mark.parametrize(
@@ -96,26 +95,23 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
 def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
     algorithm = gasil_jax.algorithm(agent, **changes)
+    one = resources.need(gasil_jax.make_env("point_mass"), algorithm)
     with pytest.raises(ValueError, match=f"most is for {re.escape(part)}"):
-        env = gasil_jax.make_env("point_mass")
-        resources.check_memory(env, algorithm, 1, jax.devices()[:1])
+        resources.check_memory(one, algorithm.config, 1, jax.devices()[:1])
 
 
 def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
-    state = resources.need(
-        gasil_jax.make_env("point_mass"), gasil_jax.algorithm()
-    ).state
+    state = 1000
     monkeypatch.setattr(resources, "_free_disk", lambda folder: state)
-    env, members = gasil_jax.make_env("point_mass"), [(gasil_jax.algorithm(), 1)]
     with pytest.raises(ValueError, match="3 checkpoints of 1 seeds"):
-        resources.check_disk(env, members, tmp_path, 3)
+        resources.check_disk([(state, 1)], tmp_path, 3)
     for iteration in ("10", "20", "30"):
         folder = tmp_path / "checkpoints" / iteration / "state"
         folder.mkdir(parents=True)
         (folder / "array").write_bytes(bytes(state))
     written = resources.size_of_checkpoints(tmp_path)
     assert written == 3 * state
-    resources.check_disk(env, members, tmp_path, 3, written=written)
+    resources.check_disk([(state, 1)], tmp_path, 3, written=written)
     assert resources.size_of_checkpoints(tmp_path / "none") == 0
     # The checkpoints of folders below do not count.
     assert resources.size_of_checkpoints(tmp_path.parent) == 0
@@ -170,16 +166,14 @@ class Device:
         return {"bytes_limit": 100_000, "bytes_in_use": self.used}
 
 
-def test_members_have_equal_shares_of_the_devices_that_are_used(monkeypatch):
+def test_members_have_equal_shares_of_the_devices_that_are_used():
     """One that is larger than a device does not fit eight, nor nine half as large."""
     devices = [Device(20_000), *[Device(10_000)] * 7]
     assert resources.available(devices) == 8 * 80_000
     assert resources.available(devices[1:2]) == 90_000
-    fits = lambda size, count: (
-        monkeypatch.setattr(
-            resources, "need", lambda *_: resources.Need(0, size, "networks")
-        ),
-        resources.check_memory(None, gasil_jax.algorithm(), count, devices),
+    config = gasil_jax.algorithm().config
+    fits = lambda size, count: resources.check_memory(
+        resources.Need(0, size, "networks"), config, count, devices
     )
     fits(80_000, 8)
     fits(40_000, 16)
