@@ -157,12 +157,13 @@ PRESETS: Mapping[str, Preset] = {
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
         {
-            **_searched("paper dense"),
-            # Alpha is 0 for 2M steps and then raised to 0.02 until 3M.
+            # Until its search is complete: alpha is 0 for 2M steps and then raised to
+            # 0.02 until 3M.
             ("humanoid", "ppo+gasil"): {
                 "alpha": 0.02,
                 "alpha_schedule": ((2e6, 0.0), (3e6, 1.0)),
             },
+            **_searched("paper dense"),
         },
         _searched("paper delayed"),
         # The paper's horizon is 2,048 steps of one environment. Staggering would only
