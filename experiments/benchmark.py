@@ -402,14 +402,16 @@ def for_page(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     first, *_ = tasks.values()
     several = len({x.name for x in first}) < len(first)
     names = [f"{x.num_envs:,}: {x.name}" if several else x.name for x in first]
-    lines, head = [], ["steps/s", *names, "compile s"]
+    has_errors = first[0].error is not None
+    head = ["steps/s", *names, "compile s", *["errors of a step"] * has_errors]
+    lines = []
     for env, each in tasks.items():
         speeds = [f"{x.speed:,.0f}" for x in each]
         seconds = ", ".join(f"{x.compile_seconds:.0f}" for x in each)
         lines.append([env, *speeds, seconds])
-        if first[0].error is not None:
+        if has_errors:
             lines[-1].append(", ".join(f"{x.error:.0e}" for x in each))
-    return [*head, *["errors of a step"] * (len(lines[0]) > len(head))], lines
+    return head, lines
 
 
 TABLES = {

@@ -200,7 +200,6 @@ def _with_contacts_in_play(
     )
 
 
-@jax.named_scope("physics")
 def step(
     dynamics: Dynamics, state: PhysicsState, control: jax.Array, frame_skip: int
 ) -> tuple[PhysicsState, Fields]:
