@@ -640,15 +640,29 @@ FIGURES: Mapping[str, Figure] = {
         "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
         "where the reward is delayed.",
         joined(
-            grid(("humanoid",), arms, (delay,), base=base, total_steps=3_000_000)
-            for arms, delay, base in (
-                ([*(Arm(x, x) for x in PAIR), _SCHEDULED], 1, Search),
+            grid(
+                ("humanoid",),
+                arms,
+                (delay,),
+                panel=panel,
+                base=base,
+                total_steps=3_000_000,
+            )
+            for panel, arms, delay, base in (
+                ("{task}", [*(Arm(x, x) for x in PAIR), _SCHEDULED], 1, Search),
                 (
+                    _WITH_PPOS.format("{task}"),
+                    [*(Arm(x, x) for x in PAPERS), _SCHEDULED],
+                    1,
+                    functools.partial(Search, chooser="ppo"),
+                ),
+                (
+                    "{task}",
                     [Arm("ppo (decomposed)", "ppo")],
                     DELAY,
                     functools.partial(Search, decompose_rewards=True),
                 ),
-                ([_BY_ROOT], DELAY, "scaled"),
+                ("{task}", [_BY_ROOT], DELAY, "scaled"),
             )
         ),
     ),

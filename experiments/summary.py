@@ -3,6 +3,7 @@
 A claim's verdict is computed from the comparisons on its figure's page.
 """
 
+import dataclasses
 import itertools
 import json
 import pathlib
@@ -19,9 +20,11 @@ from experiments.report import Page
 from experiments.search import (
     ADAPTIVE,
     DELAY,
+    PAIR,
     PAPERS,
     TASKS,
     PaperSearch,
+    Point,
     Search,
     SparseSearch,
     best_of,
@@ -30,6 +33,7 @@ from experiments.store import RESULTS, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
+from gasil_jax.statistics import interquartile_mean
 
 #: The pages that tell of several figures.
 SUMMARIES = ("README", "when_self_imitation_helps", "comparisons")
@@ -278,6 +282,22 @@ class Summary:
         """Return a note, such as a page of `SUMMARIES`, with its slots filled in."""
         return report.fill((report.NOTES / f"{note}.md").read_text(), self.value)
 
+    def _point(self, search: Search, searched: Store) -> Point | None:
+        """Return the best values for a search's agent: its own, or another search's.
+
+        The other searches are those of PPO and of PPO+GASIL; the final returns on the
+        pages decide. The result is None if the agent's search is not complete.
+        """
+        final = {
+            results.curve.search: float(interquartile_mean(results.final))
+            for name in ("matrix", "ppo_values")
+            for results in self.pages[name].results.values()
+            if results.complete
+        }
+        others = [dataclasses.replace(search, chooser=x) for x in PAIR]
+        best = max([search, *others], key=lambda x: final.get(x, -np.inf))
+        return best.chosen(searched)
+
     def tuned(self) -> str:
         """Return the tuned presets as JSON, updated by what complete searches chose."""
         rows = json.loads(presets.TUNED.read_text())
@@ -293,7 +313,7 @@ class Summary:
                 is_own = kind == "delayed" and search.env in ("ant", "humanoid")
                 single = search.agent == ADAPTIVE and not is_own
                 single |= isinstance(search, SparseSearch)
-                point = search.chosen(page.searched)
+                point = self._point(search, page.searched)
                 if point is None or single or other:
                     continue
                 settings = report.changed(search.algorithm(point))
