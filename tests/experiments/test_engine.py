@@ -381,7 +381,7 @@ def processes_that_train():
 def test_processes_end_and_save_when_their_parent_is_interrupted(
     tmp_path, capsys, monkeypatch
 ):
-    changes = {**SMALL, "total_steps": 1000 * 256}
+    changes = {**SMALL, "total_steps": 20 * 256}
     curve = Curve("point_mass", "ppo", changes, seeds=2)
     monkeypatch.setitem(FIGURES, "matrix", Figure("Toy", "", {"a": {"x": curve}}))
     folders = ["--runs", f"{tmp_path}/runs", "--results", f"{tmp_path}"]
