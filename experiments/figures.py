@@ -665,6 +665,19 @@ FIGURES: Mapping[str, Figure] = {
                 ("{task}", [_BY_ROOT], DELAY, "scaled"),
             )
         ),
+        comparisons={
+            **differences(
+                ("humanoid",), [("ppo+gasil", x) for x in ("ppo", _SCHEDULED.name)]
+            ),
+            **differences(
+                (_WITH_PPOS.format("humanoid"),),
+                [
+                    (ours, other)
+                    for ours in ("ppo+gasil", _SCHEDULED.name)
+                    for other in PAPERS[:-1]
+                ],
+            ),
+        },
     ),
     "delays": Figure(
         "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
