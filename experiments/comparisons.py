@@ -171,8 +171,8 @@ def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
 
     Args:
       drawn: bootstrap samples of the effect, (draws,).
-      comparisons: the number of comparisons in the family, of whose smallest p-value
-        the level is that of the test.
+      comparisons: n, the number of comparisons in the family. The level of the test is
+        `LEVEL` / n, as in Holm's method for the smallest p-value.
     """
     quantile = statistics.NormalDist().inv_cdf
     errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)

@@ -208,7 +208,7 @@ _LONG_HISTORY = Arm(
     "ppo",
     {"decomposition_history_episodes": 4},
 )
-#: The last is the whole episode.
+#: Delays in steps; 1000 is a whole episode of these tasks.
 _DELAYS = (1, 5, DELAY, 100, 1000)
 _NOT_CLIPPED = [
     Arm(f"{agent} (rewards not clipped)", agent, {"reward_clip": 1e9}) for agent in PAIR

@@ -383,8 +383,8 @@ class SparseSearch(SingleStage):
 
     The point with the highest mean progress, over the tasks of the search and two
     seeds, is chosen.
-    The progress is the return over the last fifth of training as a share of that from
-    which on the task is solved, between 0 and 1.
+    The progress is the return over the last fifth of training divided by `solved_from`,
+    the return that counts as a success, and clipped to [0, 1].
     """
 
     def _base(self) -> Algorithm:

@@ -161,7 +161,12 @@ def check(algorithm: Algorithm) -> None:
 
 
 def _check_functions(part: Any, what: str) -> None:
-    """Raise `ValueError` if what takes the place of a function is none."""
+    """Check what a part defines in place of its base class's functions and numbers.
+
+    Raises:
+      ValueError: if a value in place of a function can't be called, or if an agent's
+        `num_streams` or `history_episodes` is not a whole number in its range.
+    """
     for base in type(part).__mro__[1:]:
         for name, function in vars(base).items():
             if inspect.isfunction(function) and not name.startswith("_"):
@@ -200,7 +205,7 @@ def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> N
         if name not in names_:
             if name in algorithm.settings:
                 raise ValueError(
-                    f"{name} is not traced: it is a setting of the program"
+                    f"{name} is not traced: change it with algorithm.replace instead"
                 )
             raise ValueError(algorithm.why_not(name))
     changed = algorithm.replace(**hyperparameters)

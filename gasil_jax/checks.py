@@ -30,7 +30,8 @@ def check_environment(env: Any) -> None:
 def check(env: Any, algorithm: Algorithm) -> None:
     """Raise `ValueError` if the algorithm can't train in the environment.
 
-    Nothing is traced or compiled.
+    Nothing is compiled, and the environment is not traced. Of the agent, only networks
+    of the user's own are traced.
     """
     _check_interface(env)
     algorithms.check(algorithm)
@@ -145,7 +146,10 @@ def check_state(state: Any) -> None:
 
 
 def check_key(key: Any) -> None:
-    """Raise `ValueError` unless this is one random key, typed or of the older kind."""
+    """Raise `ValueError` unless this is a single random key.
+
+    A key of the older kind, uint32 (2,), is accepted too; its shape is not checked.
+    """
     dtype = getattr(key, "dtype", None)
     typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
     if not typed and dtype != jnp.uint32:

@@ -1,4 +1,4 @@
-"""Refuse, on import, other systems, and releases of jaxlib with wrong numbers."""
+"""Raise `ImportError` on Windows, and for a jaxlib that computes wrong numbers."""
 
 import contextlib
 import importlib.metadata

@@ -91,15 +91,15 @@ def number(
     excludes_low: bool = False,
     traced: bool = True,
 ) -> Any:
-    """Declare a number that the runs of one compiled program may have different.
+    """Declare a number; if it is traced, runs of one program may have different values.
 
     Args:
       default: the default value.
       low: the lowest value.
       high: the highest value.
       excludes_low: whether the value must be more than `low`.
-      traced: whether the number is a traced leaf. Otherwise it is a constant of the
-        program, which may then decide what is computed.
+      traced: whether the number is a traced leaf of the pytree. Otherwise it is a
+        constant when a program is compiled, and Python code may branch on it.
     """
     return _field(default, traced, range=Range(low, high, excludes_low))
 
@@ -153,11 +153,11 @@ class Config(struct.PyTreeNode):
       num_epochs: passes of PPO over a batch.
       minibatch_size: steps in one gradient step of PPO.
       hidden_sizes: widths of the hidden layers, in the policy and in the value.
-      activation: what follows each of these layers: tanh, relu or swish.
-      layer_norm: whether layer normalization comes before it.
-      policy_components: number of Gaussians that the policy's distribution of actions
-        is a mixture of, with weights and means that depend on the state. One can hold
-        one way to succeed; several can hold several. Not for discrete actions.
+      activation: activation function of the hidden layers: tanh, relu or swish.
+      layer_norm: whether each hidden layer is normalized before its activation.
+      policy_components: number of Gaussians in the policy. If it is more than 1, the
+        policy is a mixture whose weights and means depend on the state. A mixture can
+        keep several ways to succeed. Only 1 for discrete actions.
       stagger_episodes: whether each environment's first episode begins at a random age,
         so that a batch holds steps from all parts of an episode. Otherwise all begin at
         age 0 and, if none ends early, a batch holds the same few steps of each episode.
@@ -331,7 +331,7 @@ def validate_number(
         raise refusal(name, value, "a number")
     most = most if allowed.whole else _LARGEST_FLOAT
     if (_as_float(value) or 0.0) > most and math.isinf(allowed.high):
-        raise refusal(name, value, f"{allowed}, at most {most:g}")
+        raise refusal(name, value, f"{allowed}, at most {most}")
     if value not in allowed:
         raise refusal(name, value, allowed)
 

@@ -57,14 +57,14 @@ class Context(struct.PyTreeNode):
       normalizer: the normalizer of observations that the policy used in the batch.
       reward_scale: float32 (), the number that the rollout's rewards were divided by; 1
         if they are not normalized.
-      action_range: the lowest and the highest action of the environment; 0 and 1 where
-        actions are discrete.
+      action_range: the lowest and the highest action of the environment, each a number
+        or an array (action,); 0 and 1 where actions are discrete.
       config: the settings of the loop and of PPO, with their numbers in this iteration.
       policy: (params, normalized observation) -> the parameters of the actions'
         distribution.
       distribution: the distribution of actions, such as
         ``distribution.log_prob(parameters, action)``.
-      value: (params, normalized observation) -> value.
+      value: (params, normalized observation (..., obs)) -> value, float32 (...).
       data: what the agent's `data` returns.
     """
 

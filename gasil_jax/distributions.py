@@ -1,8 +1,9 @@
 """The distributions of actions: Gaussians, or a categorical where they are discrete.
 
-Each is a small table of pure functions. `of` chooses one where a policy is made, and
-nothing else asks whether actions are discrete: everything but the environment sees a
-discrete action as a one-hot vector, float32 (num_actions,).
+Each is a small table of pure functions, and `of` returns the one for an environment. So
+PPO and the agents need not distinguish discrete actions from vectors: in training a
+discrete action is a one-hot vector, float32 (num_actions,), and only the environment's
+step gets it as an int32.
 """
 
 from collections.abc import Callable

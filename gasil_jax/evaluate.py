@@ -67,7 +67,8 @@ class Options:
 
     Attributes:
       run: folder of the run or sweep, or zoo:NAME, one of the package's policies.
-      point: number of a sweep's point in results.csv; default the best by mean.
+      point: number of a sweep's point in results.csv; default the one with the
+        highest mean final return, of those whose seeds all stayed finite.
       checkpoint: checkpoint of the policies: last, or best, which has the best
         evaluation or, without evaluations, the best mean return in training.
       seed: evaluate only this seed; default all seeds.

@@ -40,11 +40,11 @@ def evaluate(
       deterministic: whether to act with the policy's mean; else actions are drawn.
 
     Returns:
-      "episode_return" and "episode_length", (num_episodes,) each.
+      "episode_return", float32, and "episode_length", int32, (num_episodes,) each.
 
     Raises:
-      ValueError: if the key is no single random key, or if the number of episodes is no
-        whole number from 1 on.
+      ValueError: if the state is a batch of states, if the key is no single random key,
+        or if the number of episodes is not a whole number, 1 or more.
     """
     return run_episodes(
         env,

@@ -53,7 +53,8 @@ class Options:
       run: folder of the run or sweep, which need not be finished.
       name: name of the new data set, NAMESPACE/DATASET-vVERSION.
       seed: export only this seed's episodes; default all seeds', in their order.
-      point: number of a sweep's point in results.csv; default the best by mean.
+      point: number of a sweep's point in results.csv; default the one with the
+        highest mean final return, of those whose seeds all stayed finite.
       checkpoint: checkpoint of the buffer: last, or best, which has the best
         evaluation or, without evaluations, the best mean return in training.
     """
@@ -84,7 +85,7 @@ def episodes(buffer: GoodTrajectories, max_episode_steps: int) -> list[Episode]:
 
     Args:
       buffer: the buffer of one run.
-      max_episode_steps: length of a full episode, which is complete in any case.
+      max_episode_steps: the step limit; an episode of this length can't have been cut.
     """
     size = int(buffer.size)
     bounds = [*np.flatnonzero(np.asarray(buffer.time[:size]) == 0), size]

@@ -5,8 +5,10 @@ is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, 
 undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
 steps that were ever offered are ordered by (return descending, episode, time), and the
 first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
-a tie the older episode stays. All functions are pure and work under jit, vmap and
-shard_map; an empty buffer is a normal state.
+a tie the older episode stays. That is the paper's buffer; `insert` can also limit the
+number of episodes, prefer the newer one on a tie, and rank by other numbers, such as
+`shared_returns`. All functions are pure and work under jit, vmap and shard_map; an
+empty buffer is a normal state.
 """
 
 from typing import Any
@@ -29,8 +31,8 @@ class GoodTrajectories(struct.PyTreeNode):
       return_: float32 (C,), the return of the step's episode; 0 where empty.
       time: int32 (C,), the step's index in its episode.
       size: int32 (), number of filled steps; they are the first ones.
-      terminated: bool (C,), whether the step's episode ended and has no future value;
-        None if it is not kept.
+      terminated: bool (C,), whether the step's episode terminated, and was not
+        truncated; None if the buffer does not keep it.
     """
 
     observation: jax.Array
@@ -85,7 +87,7 @@ class Episodes(struct.PyTreeNode):
       length: int32 (E,), number of steps.
       env: int32 (E,), index of the environment that the episode ran in.
       last: int32 (E,), index of its last step in that environment's ring.
-      terminated: bool (E,), whether the episode has no future value.
+      terminated: bool (E,), whether the episode terminated, and was not truncated.
     """
 
     return_: jax.Array
@@ -102,7 +104,17 @@ def init(
     *,
     keep_terminated: bool = False,
 ) -> GoodTrajectories:
-    """Return an empty buffer; `keep_terminated`: it keeps how episodes ended."""
+    """Return an empty buffer.
+
+    Args:
+      capacity: C, the largest number of steps.
+      observation_size: dimension of an observation.
+      action_size: dimension of an action; for discrete actions, their number.
+      keep_terminated: whether the buffer has the field `terminated`.
+
+    Raises:
+      ValueError: if the capacity is below 1.
+    """
     if capacity < 1:
         raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
     return GoodTrajectories(
@@ -252,13 +264,13 @@ def shared_returns(
     scale: jax.Array,
     distance: float,
 ) -> jax.Array:
-    """Return what `insert` ranks episodes by if similar ones share their return.
+    """Return the numbers by which `insert` ranks episodes that share their returns.
 
-    An episode's return, above the lowest of all, is divided by 1 + n, where n is the
-    number of episodes before it by return that are within a distance of it (fitness
-    sharing, Goldberg and Richardson 1987). So episodes that succeed in another way come
-    before ever more of the same way. Two episodes are as far apart as the means of
-    their observations: the root mean square of the scaled differences.
+    An episode's number is its return minus the lowest return, divided by 1 + n. Here n
+    is the number of similar episodes that come before it by return (fitness sharing,
+    Goldberg and Richardson 1987). So the buffer keeps episodes that succeed in
+    different ways. Episodes are similar if the means of their scaled observations
+    differ by less than `distance` (root mean square over the entries).
 
     Args:
       good_trajectories: the buffer before the insertion.
@@ -268,8 +280,9 @@ def shared_returns(
       distance: the distance below which two episodes are similar.
 
     Returns:
-      float32 (C + E,), of the entries of the buffer and the offered ones. Beyond the
-      best 256 episodes it is their return above the lowest, divided by 257.
+      float32 (C + E,): first the buffer's episodes, each at its first step and 0 at its
+      other steps, then the offered ones. Only the best 256 episodes are compared; for
+      all others n is 256.
     """
 
     def means(rows: jax.Array, env: Any, *, end: jax.Array, length: Any) -> jax.Array:

@@ -86,9 +86,10 @@ class MLP(nn.Module):
 
 
 class _Policy(nn.Module):
-    """The layers of a policy, or a module in their place; the last starts at 0.01.
+    """The layers of a policy, or the module `own` instead of them.
 
-    So the initial policy is nearly the same in every state (OpenAI baselines, ppo1).
+    The initial weights of the last layer have scale 0.01, so that the initial policy is
+    nearly the same in every state (OpenAI baselines, ppo1).
     """
 
     hidden_sizes: Sequence[int]
@@ -202,6 +203,6 @@ class StepReward(nn.Module):
 
     @nn.compact
     def __call__(self, *step: jax.Array) -> jax.Array:
-        """What is seen of a step, (..., size) each -> (...)."""
+        """Return the rewards, (...), of steps' inputs, (..., size) each."""
         x = jnp.concatenate(step, axis=-1)
         return MLP(self.hidden_sizes, 1, 0.01)(x)[..., 0]

@@ -11,13 +11,16 @@
     about (), JSON, only in the zoo: see `about`
 
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
-the last is followed by tanh; the output is the mean of a Gaussian. With
-policy_components () it has the means of that many Gaussians, one after the other, and
-then the logits of their weights; the policy is a mixture of them. Where actions are
-discrete the file has num_actions () in place of log_std, low and high, the output is
-the actions' logits, and an action is an int. With activation_relu () or
-activation_swish () that function takes the place of tanh. With norm_scale_0 (S, width),
-norm_bias_0, norm_scale_1 ... layer normalization comes before it.
+the last is followed by tanh; the output is the mean of a Gaussian. Further arrays
+change this:
+
+- policy_components (): the policy is a mixture of that many Gaussians. The output has
+  their means, one after the other, and then the logits of their weights.
+- num_actions (), instead of log_std, low and high: actions are discrete, numbers from 0
+  on. The output is their logits.
+- activation_relu () or activation_swish (): this activation is used instead of tanh.
+- norm_scale_0 (S, width), norm_bias_0, norm_scale_1 ...: layer normalization comes
+  before the activation.
 """
 
 import json
@@ -211,10 +214,10 @@ def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
 
 
 def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
-    """Return the mean of the policy's actions, or their logits, (..., action).
+    """Return the output of the policy's network.
 
-    Of a mixture it is what `components` splits.
-
+    It is the mean of the actions, or the logits of discrete ones, (..., action). For a
+    mixture it is (..., component * (action + 1)); `components` splits it.
     Args:
       weights: the arrays from `read`.
       observation: (..., obs), not normalized.
@@ -266,7 +269,10 @@ def probabilities(weights: Mapping[str, Any], observation: Any) -> np.ndarray:
         another size than the policy's.
     """
     if not is_discrete(weights):
-        raise ValueError("the policy's actions are not discrete: it has a mean")
+        raise ValueError(
+            "the policy's actions are not discrete, so they have no probabilities: use "
+            "numpy_policy.output for their mean"
+        )
     logits = output(weights, observation)
     exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
     return exponentials / exponentials.sum(axis=-1, keepdims=True)

@@ -33,7 +33,8 @@ class Options:
     Attributes:
       runs: folders of runs and sweeps. Each is a separate curve, even if they differ
         only in their seeds.
-      point: number of a sweep's point in results.csv; default the best by mean.
+      point: number of a sweep's point in results.csv; default the one with the
+        highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
       labels: labels of the runs; default "ENVIRONMENT, AGENT".
     """
@@ -120,9 +121,9 @@ def _saved(
 def _read_tables(
     saved: Sequence[_Members], name: str, column: str
 ) -> dict[str, np.ndarray]:
-    """Return the columns of tables for all members, as far as all of them have come.
+    """Return the columns of tables for all members, up to the last row that all have.
 
-    They are none if a table is missing or has no rows yet.
+    The result is empty if a table is missing or has no rows yet.
 
     Raises:
       InputError: if a table is damaged.
@@ -149,9 +150,9 @@ def _read_tables(
 
 
 def _check_recorded(path: pathlib.Path) -> None:
-    """Check a table against what the newest checkpoint has seen of it.
+    """Check a table against what the newest checkpoint recorded of it.
 
-    Rows that are missing are told; the others can be drawn.
+    If rows are missing, a note is printed; the others can still be drawn.
 
     Raises:
       InputError: if rows have changed.

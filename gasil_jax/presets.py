@@ -205,8 +205,8 @@ def preset(
         is no locomotion task of ours.
 
     Returns:
-      The defaults, overridden by what the preset has for all tasks and by its row. For
-      "tuned" the preset may have neither.
+      The defaults, overridden by what the preset has for all tasks and by its row. If
+      "tuned" has no row for the agent on the task, the result is the defaults.
 
     Raises:
       ValueError: if the environment, the agent or the preset is unknown, if the delay

@@ -50,7 +50,8 @@ class Options:
         of eight pictures in two rows) or, for locomotion only, .html (to turn and zoom
         in a browser).
       seed: seed of the policy; default the run's first seed.
-      point: number of a sweep's point in results.csv; default the best by mean.
+      point: number of a sweep's point in results.csv; default the one with the
+        highest mean final return, of those whose seeds all stayed finite.
       checkpoint: checkpoint of the policy: last, or best, which has the best
         evaluation or, without evaluations, the best mean return in training.
       steps: largest number of steps.

@@ -24,9 +24,10 @@ class Rollout(struct.PyTreeNode):
         it was drawn.
       reward: float32 (time, env), the reward that the environment gives, which may be
         delayed; in an agent's `Context`, what the reward models make of it.
-      terminated: bool (time, env), whether the episode ended and has no future value.
-      truncated: bool (time, env), whether the episode was cut off; its value is then
-        bootstrapped.
+      terminated: bool (time, env), whether the episode terminated with this step: the
+        value after it is 0.
+      truncated: bool (time, env), whether the episode was cut off with this step: the
+        value after it is bootstrapped.
       episode_return: float32 (time, env), the episode's sum of undelayed rewards up to
         this step.
       discounted_return: float32 (time, env), the episode's sum of gamma^t reward up to

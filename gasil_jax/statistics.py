@@ -60,7 +60,7 @@ def bootstrap_interval(
 
 
 class Estimate(NamedTuple):
-    """What seeds tell of a score.
+    """An interquartile mean over seeds, with its interval.
 
     Attributes:
       interquartile_mean: the mean of the middle half; None if no score is finite.
@@ -81,7 +81,10 @@ class Estimate(NamedTuple):
 
 
 def estimate(scores: np.ndarray) -> Estimate:
-    """Return what seeds' scores tell, (seeds,); those that are NaN do not count."""
+    """Return the interquartile mean of scores, (seeds,), and its interval.
+
+    Scores that are not finite are left out.
+    """
     finite = scores[np.isfinite(scores)]
     if not finite.size:
         return Estimate(None, None)

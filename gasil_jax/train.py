@@ -79,8 +79,8 @@ def init(
       env: one environment with Brax's interface, not wrapped to reset itself.
       algorithm: how to learn.
       key: random key; consumed.
-      hyperparameters: numbers by name, which may be traced; the algorithm has the
-        others.
+      hyperparameters: values that replace numbers of the algorithm, by name, such as
+        ``{"alpha": 0.2}``; they may be traced.
 
     Raises:
       ValueError: if the algorithm can't train in the environment, if the key is no
@@ -94,9 +94,10 @@ def init(
 
 
 def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
-    """Return what `init` does, of an algorithm that need not be able to train here.
+    """Return the same state as `init`, without checking the arguments.
 
-    The expert of a run that has been trained may be gone, for example.
+    So a stored run can be loaded where it could not be trained, for example because its
+    expert's file is gone.
 
     Args:
       env: one environment.
@@ -216,18 +217,21 @@ def _init_actor_critic(
 
 
 def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
-    """Raise `ValueError` where arrays would be broadcast, or steps lost, unnoticed."""
+    """Raise `ValueError` if the state's arrays do not fit the algorithm.
+
+    JAX would broadcast such arrays, or leave out steps, without an error.
+    """
     checks.check_state(state)
     check_numbers(algorithm, state.hyperparameters)
     key = jax.random.key(0)
     needed = jax.eval_shape(lambda: _init_memory(env, algorithm, key, rewards_key=key))
-    needed["hyperparameters"] = dict.fromkeys(
-        algorithm.hyperparameters, state.iteration
-    )
-    needed["num_envs"] = jax.ShapeDtypeStruct((algorithm.config.num_envs,), jnp.int32)
+    number = jax.ShapeDtypeStruct((), jnp.float32)
+    needed["hyperparameters"] = dict.fromkeys(algorithm.hyperparameters, number)
+    lengths = jax.ShapeDtypeStruct((algorithm.config.num_envs,), jnp.int32)
+    needed["environments.episode_length"] = lengths
     given = {name: getattr(state, name) for name in ("history", "rewards", "agent")}
-    given["hyperparameters"] = dict.fromkeys(state.hyperparameters, state.iteration)
-    given["num_envs"] = state.environments.episode_length
+    given["hyperparameters"] = dict.fromkeys(state.hyperparameters, number)
+    given["environments.episode_length"] = state.environments.episode_length
     if change := own_code.first_change(needed, given):
         path, expected, actual = change
         part, rest = path.removeprefix("['").split("']", 1)
@@ -270,7 +274,16 @@ def iterate(
 
 
 class Keys(NamedTuple):
-    """The random keys of an iteration; each is consumed once."""
+    """The random keys of an iteration; each is consumed once.
+
+    Attributes:
+      state: the key of the next state.
+      act: draws the policy's actions and the environments' new starts.
+      agent: for the agent's `update_and_reward`.
+      ppo: shuffles PPO's minibatches.
+      policy: for the agent's `update_policy`.
+      rewards: for the models of rewards.
+    """
 
     state: jax.Array
     act: jax.Array
@@ -338,7 +351,8 @@ def collect(
             after, context, is_sound, own = model.update(before, context, key)
             states.append(after)
             healthy &= is_sound
-            metrics = merge_metrics(type(model).__name__, metrics, own)
+            name = f"reward model {type(model).__name__}"
+            metrics = merge_metrics(name, metrics, own)
     return Experience(
         batch, context, environments, history, tuple(states), healthy, metrics
     )
@@ -403,7 +417,7 @@ def learn(
         iteration=state.iteration + 1,
     )
     return state, merge_metrics(
-        algorithm.agent.name,
+        f"agent {algorithm.agent.name!r}",
         metrics,
         experience.metrics,
         agent_metrics,
@@ -512,7 +526,9 @@ def advantages(
         log_prob=flat(batch.log_prob),
         advantage=flat(mixed),
         returns=flat(returns),
-    ), merge_metrics(agent.name, {"explained_variance": jnp.mean(explained)}, metrics)
+    ), merge_metrics(
+        f"agent {agent.name!r}", {"explained_variance": jnp.mean(explained)}, metrics
+    )
 
 
 @jax.named_scope("update_policy")
@@ -554,7 +570,9 @@ def update_policy(
     agent_state, actor_critic, own_metrics = agent.update_policy(
         agent_state, actor_critic, context, own_key
     )
-    metrics = merge_metrics(agent.name, ppo_metrics, advantage_metrics, own_metrics)
+    metrics = merge_metrics(
+        f"agent {agent.name!r}", ppo_metrics, advantage_metrics, own_metrics
+    )
     return actor_critic, agent_state, metrics
 
 
@@ -576,8 +594,13 @@ def rollout_metrics(batch: Rollout) -> Metrics:
     }
 
 
-def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
+def merge_metrics(source: str, metrics: Metrics, *more: Metrics) -> Metrics:
     """Return several groups of metrics as one, float32 scalars by name.
+
+    Args:
+      source: what computed the metrics, for the error message, such as "agent 'ppo'".
+      metrics: the first group.
+      *more: the other groups.
 
     Raises:
       ValueError: if two metrics have the same name, or one is not a single number.
@@ -585,13 +608,13 @@ def merge_metrics(agent: str, metrics: Metrics, *more: Metrics) -> Metrics:
     for own in more:
         if taken := metrics.keys() & own.keys():
             raise ValueError(
-                f"metrics of agent {agent!r} have names that other metrics have: "
+                f"metrics of {source} have names that other metrics have: "
                 f"{', '.join(sorted(taken))}"
             )
         metrics = {**metrics, **own}
     numbers: dict[str, jax.Array] = {}
     for name, value in metrics.items():
-        what = f"metric {shown(name)} of agent {agent!r}"
+        what = f"metric {shown(name)} of {source}"
         if not isinstance(name, str):
             raise ValueError(f"{what}: its name must be a string")
         try:
@@ -627,8 +650,8 @@ def make_train(env: Any, algorithm: Algorithm) -> Train:
 
     Returns:
       ``train(key, hyperparameters=None, data=None) -> (TrainState, Metrics)``. The key
-      is consumed; hyperparameters are numbers by name, such as ``{"alpha": 0.2}``, and
-      the algorithm has the others; data is as in `iterate`; metrics are float32
+      is consumed; hyperparameters are values that replace numbers of the algorithm, by
+      name, such as ``{"alpha": 0.2}``; data is as in `iterate`; metrics are float32
       (iterations,) each.
 
     Raises:

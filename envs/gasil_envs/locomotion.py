@@ -197,7 +197,7 @@ def _reward_of_pusher(
 def _start_of_pusher(key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The object is to the left of the goal, more than 0.17 m from it."""
     position_key, velocity_key = jax.random.split(key)
-    # 0.6 of all places are far enough. Of 32 the first one is taken that is.
+    # 60% of all places are far enough away. The first such place of 32 is taken.
     low, high = jnp.array([-0.3, -0.2]), jnp.array([0.0, 0.2])
     places = jax.random.uniform(position_key, (32, 2), minval=low, maxval=high)
     place = places[jnp.argmax(jnp.linalg.norm(places, axis=1) > 0.17)]
@@ -376,9 +376,10 @@ INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
 
 
 def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
-    """Return the model of a file or text; raise `ValueError`, in one line, if none is.
+    """Return the model in a file or an XML text.
 
-    What MuJoCo says of a fault has several lines.
+    Raises:
+      ValueError: if MuJoCo can't load it; its message is joined into one line.
     """
     is_text = str(xml).lstrip().startswith("<")
     load = mujoco.MjModel.from_xml_string if is_text else mujoco.MjModel.from_xml_path
@@ -390,7 +391,7 @@ def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
 
 
 def _check(task: Task, model: mujoco.MjModel) -> None:
-    """Raise `ValueError` if a task and its model do not fit each other, or us."""
+    """Raise `ValueError` if a task and its model do not fit or are not supported."""
     if not model.nu:
         raise ValueError("the model has no actuators: it must have one or more")
     entries = range(model.nq)
@@ -421,7 +422,7 @@ def _check(task: Task, model: mujoco.MjModel) -> None:
             f"actuator {name!r} of the model has no ctrlrange: it must have one, which "
             "is the range of its actions"
         )
-    # They would be lost between two steps.
+    # A state holds positions and velocities only, so these would be lost.
     for size, what in (("na", "activations"), ("nhistory", "delays")):
         if getattr(model, size):
             raise ValueError(
@@ -439,7 +440,8 @@ class Locomotion(Env):
     Args:
       task: the task, or the name of one in `TASKS`.
       physics: "mjx", in pure JAX, or "mujoco", in C on the host's cores.
-      solver: solver of MJX's constraints, see `MjxPhysics`.
+      solver: implementation of physics "mjx": "small", our own, or "mjx", MJX's own
+        step, which is slower; see `MjxPhysics`.
       integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
 

@@ -127,8 +127,8 @@ _FAR_KEY = (
     "#......T#K#",
     "###########",
 )
-#: A way leads around either side of a wall, and the mean of both into its dead end.
-#: Steps are long: after one the ways are apart, and the start is all that they share.
+#: Two ways lead to the goal, one around each side of a wall. Their mean leads into the
+#: dead end inside the wall. Steps are so long that the two ways share only the start.
 _TWO_DOORS = (
     "#########",
     "#...G...#",
@@ -300,7 +300,8 @@ class DeepSea:
 class MountainCar:
     """A car in a valley that must swing up to get out, and pays for each push.
 
-    The continuous mountain car: position and velocity, force from -1 to 1. Leaving on
+    This is the continuous mountain car. Observation, float32 (2,): the position, and
+    ten times the velocity. Action, float32 (1,): the force, from -1 to 1. Leaving on
     the right pays 100 and ends the episode, and each step costs 0.1 times its force
     squared.
     """
@@ -387,7 +388,7 @@ def _enlarged(
     return picture
 
 
-#: How far each robot must go, in metres.
+#: The distance beyond which each robot is paid, in metres.
 ROBOTS: Mapping[str, float] = {
     "hopper": 1.0,
     "halfcheetah": 12.0,
@@ -396,7 +397,8 @@ ROBOTS: Mapping[str, float] = {
     "ant": 3.0,
     "humanoid": 0.6,
 }
-#: The tasks without noise, by name.
+#: The tasks without noise, by name: a maze has its `Layout`, deep sea the size of its
+#: grid, mountain car None, and a robot the distance that it must go, in metres.
 TASKS: Mapping[str, Any] = {
     "u_maze": Layout(_U, 150),
     "u_maze_short": Layout(_U, 100),
@@ -415,7 +417,9 @@ TASKS: Mapping[str, Any] = {
     "two_doors": Layout(_TWO_DOORS, 25, speed=1.0),
     **ROBOTS,
 }
-_NOISY, _NOISE = "_noisy", {"point": 0.5, "discrete": 0.1}
+#: The suffix of tasks with noise on the actions, and `wrappers.ActionNoise.scale` for
+#: actions that are vectors and for discrete ones.
+_NOISY, _NOISE = "_noisy", {"vector": 0.5, "discrete": 0.1}
 
 
 def names() -> tuple[str, ...]:
@@ -440,5 +444,5 @@ def build(name: str) -> Any:
         env = MountainCar() if task is None else DeepSea(task)
     if not name.endswith(_NOISY):
         return env
-    kind = "discrete" if wrappers.is_discrete(env) else "point"
+    kind = "discrete" if wrappers.is_discrete(env) else "vector"
     return wrappers.ActionNoise(env, _NOISE[kind])

@@ -25,7 +25,7 @@ def missing(env: Any) -> str | None:
         if not hasattr(env, name):
             return name
     if not (hasattr(env, "action_size") or hasattr(env, "num_actions")):
-        return "action_size, and for discrete actions no num_actions"
+        return "action_size (or num_actions, if its actions are discrete)"
     return None
 
 

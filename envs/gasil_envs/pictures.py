@@ -1,8 +1,9 @@
 """Draw states of an episode.
 
-MuJoCo draws locomotion, Matplotlib the point mass, and another environment itself, with
-a function ``draw(state, size)`` of its `pipeline_state`, as NumPy arrays, and the width
-and height of a picture, which returns the picture, uint8 (height, width, 3).
+MuJoCo draws locomotion, and Matplotlib the point mass. Any other environment must have
+a function ``draw(state, size)``. It gets the environment's `pipeline_state`, as NumPy
+arrays, and the width and height of a picture in pixels, and returns the picture, uint8
+(height, width, 3).
 """
 
 from collections.abc import Sequence

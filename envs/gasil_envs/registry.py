@@ -32,8 +32,9 @@ class Settings:
         also given when the episode ends (paper, section 5.4). 1 means no delay.
       obs_noise: standard deviation of Gaussian noise on the observations (paper,
         section 5.3); 0 means no noise.
-      action_noise: standard deviation of Gaussian noise on the actions, in halves of
-        their range; of discrete actions this share is replaced by random ones.
+      action_noise: standard deviation of Gaussian noise on the actions, in units of
+        half their range; for discrete actions, the probability that an action is
+        replaced by a random one. 0 means no noise.
       physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
         host's cores.
       solver: implementation of the JAX physics: small, our own dynamics and solver, or
@@ -181,7 +182,9 @@ def check(name: str, settings: Settings) -> None:
         for field in ("physics", "solver", "integrator"):
             value = getattr(settings, field)
             if value != getattr(Settings, field):
-                raise ValueError(f"{field} is {value!r}: {name} has its own")
+                raise ValueError(
+                    f"{field} is {value!r}: leave it out, {name} has its own physics"
+                )
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
     _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)

@@ -30,10 +30,11 @@ def is_sound(x: jax.Array) -> jax.Array:
 
 
 def step_is_sound(observation: jax.Array, stepped: State) -> jax.Array:
-    """Return whether the physics of a step has not failed, bool (...).
+    """Return whether the physics of a step is sound, bool (...).
 
-    It has if `is_sound` is false for a number in the observation before or after the
-    step, for a reward, given or held back, or for what says that the episode ended.
+    The physics has failed if `is_sound` is false for any number in the observations
+    before and after the step, in the reward (given, true or held back), in ``done`` or
+    in the truncation.
 
     Args:
       observation: (..., obs), before the step.
@@ -101,7 +102,7 @@ class ActionNoise(Wrapper):
         return state.replace(info={**state.info, "action_noise_key": key})
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take a step with another action."""
+        """Add noise to the action, then take a step."""
         key, first, second = jax.random.split(state.info["action_noise_key"], 3)
         if is_discrete(self.env):
             other = jax.random.randint(first, (), 0, self.env.num_actions)
@@ -118,8 +119,9 @@ class ActionNoise(Wrapper):
 class EpisodeLimit(Wrapper):
     """End an episode after `episode_length` steps.
 
-    If `terminal` is true, an episode that ends there counts as terminated. No episode
-    ends with its reset, whatever the environment's says.
+    If `terminal` is true, an episode that reaches this limit counts as terminated, not
+    as truncated. The state after a reset has ``done`` 0, even if the environment's own
+    reset sets it to 1.
 
     Adds ``info["steps"]`` (int32) and ``info["truncation"]`` (float32, 1 where the
     limit and not the environment ended the episode, or where the environment sets it).
@@ -203,10 +205,10 @@ class RewardDelay(Wrapper):
 
 
 class DelayPhase(Wrapper):
-    """Add to the observation how far the next payout of a `RewardDelay` is.
+    """Append the phase of a `RewardDelay` to the observation.
 
-    The number is the share of the delay that has passed since the last payout, from 0
-    up to but not 1.
+    The phase is the share of the delay that has passed since the last payout, at least
+    0 and below 1.
     """
 
     @property
@@ -268,7 +270,8 @@ class FaultyStepEnds(Wrapper):
     The physics fails if an observation or a reward is not `is_sound`. The step then has
     reward 0 and the observation of the step before. If the first observation of an
     episode is not sound, it is replaced by zeros, and the episode ends with its first
-    step. `gasil_jax` does the same in its own rollout.
+    step. The rollout of `gasil_jax` does the same, but there the observation after a
+    failed step is zeros.
     """
 
     def reset(self, rng: jax.Array) -> State:

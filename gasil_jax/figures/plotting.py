@@ -100,7 +100,7 @@ def label_ends(
 
     Args:
       axes: where the lines are, which must all be drawn.
-      ends: where each line ends, in the order of the ends, the highest first.
+      ends: the y value at which each line ends, by its name, the highest first.
       color_of: the color of each name.
     """
     low, high = axes.get_ylim()
@@ -251,7 +251,7 @@ def marginals(
     figure.legend(handles, labels, frameon=False, **above)
     text = "point: mean over its seeds; mean: over the points of each value"
     if any(len(groups(x)) < len(set(x)) for x in values.values()):
-        text += ", or of neighbouring values where most differ"
+        text += ", or of neighbouring values with fewer than two points each"
     if any(share is not None for share in importance.values()):
         text += "; importance: share of the points' variance that these means explain, "
         text += "corrected for their number"

@@ -105,7 +105,10 @@ def _chain(error: BaseException | None) -> list[str]:
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Return whether a message is not of an array of which Orbax did not wait."""
+    """Return false for an operating system's error of a single array.
+
+    Orbax raises the first such error itself, so its threads need not log the others.
+    """
     return "os_error_code" not in record.getMessage()
 
 
@@ -342,7 +345,7 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 
 def newest_record(root: pathlib.Path) -> Record:
-    """Return the record of the newest checkpoint; nothing without one that is read."""
+    """Return the record of the newest readable checkpoint; empty if there is none."""
     records = map(_record, reversed(_folders(root)))
     return next(filter(None, records), Record())
 

@@ -192,7 +192,7 @@ def _check_flags(
 
 
 def _similar(name: str, names: Sequence[str]) -> list[str]:
-    """Return up to three names that have the given word or initials, or its letters."""
+    """Return up to three names that contain, abbreviate to or resemble a word."""
 
     def singular(word: str) -> str:
         return word.removesuffix("s")
@@ -307,8 +307,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
     The status is 1 if a folder or file can't be read or written, or if a program that
     it started failed; 2 for bad input, which includes a file name that is too long; and
     128 plus the signal's number if it was interrupted, or if nobody reads its output to
-    the end. Without an error it is what `main` returns. Code of the user's that exits,
-    in whatever it is called, is bad input.
+    the end. Without an error it is what `main` returns. If the user's own code, such as
+    an environment or an agent, calls `sys.exit`, that counts as bad input.
     """
 
     @functools.wraps(main)
@@ -333,7 +333,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
         except HelpShown:
             raise
         except SystemExit as exit_:
-            print(f"error: code of yours exits: {in_a_line(exit_)}", file=sys.stderr)
+            why = f"your own code ended the program: {in_a_line(exit_)}"
+            print(f"error: {why}", file=sys.stderr)
             return 2
         except Interrupted as interrupted:
             print(interrupted, *interrupted.__notes__, sep="\n", file=sys.stderr)

@@ -44,8 +44,8 @@ def find_agent(name: Any) -> type[Agent]:
     # In config.json it has its own name.
     if agent.name != name:
         raise ValueError(
-            f"agent {name!r} has the name {agent.name!r}: it must have the same, "
-            "MODULE:CLASS"
+            f"agent {name!r} calls itself {agent.name!r}: name the module that "
+            "defines the class, or remove the class's attribute `name`"
         )
     with own_code.refused(f"agent {name!r} can't be made", passing=ValueError):
         check(Algorithm(agent()))

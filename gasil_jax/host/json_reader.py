@@ -32,9 +32,9 @@ def digest(content: Any) -> str:
 
 @contextlib.contextmanager
 def blamed(path: pathlib.Path) -> Iterator[None]:
-    """Turn what content that can't be used raises into an `InputError` with its file.
+    """Turn an error about a file's content into an `InputError` that names the file.
 
-    `NotImportable` is raised as it is: the file may be used elsewhere.
+    `NotImportable` is not changed: on another machine the file may be usable.
     """
     try:
         yield

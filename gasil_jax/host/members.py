@@ -313,7 +313,8 @@ def make_members(
       env: one environment.
       algorithm: the algorithm that the members share.
       seeds: absolute seed number of each member. Its key is ``jax.random.key(seed)``.
-      hyperparameters: numbers of each member by name; the algorithm has the others.
+      hyperparameters: for each member, values that replace numbers of the algorithm, by
+        name; default none.
       devices: the devices to shard over, default all. At most one for each member is
         used.
 

@@ -103,8 +103,9 @@ class MetricsWriter:
     Args:
       path: the file.
       labels: columns that identify the members, (members,) each: "seed" and others.
-      checkpoint: the record of the checkpoint that training continues from; None at its
-        beginning. What an existing file has more is moved to a new file beside it.
+      checkpoint: the record of the checkpoint that training continues from; None if
+        training begins. Rows of an existing file that are not in the record are moved
+        to a new file beside it.
       columns: metrics to write first, in this order; others follow.
 
     Raises:
@@ -125,12 +126,15 @@ class MetricsWriter:
             size = checkpoint[f"{path.stem}_size"]
             whole = has_recorded_rows(path, checkpoint) and path.is_file()
             if not whole or path.stat().st_size < size:
-                raise ValueError(f"{path} lacks rows that the checkpoint has seen")
+                raise ValueError(
+                    f"{path} lacks rows that were in it at the last checkpoint: "
+                    "restore the file, or begin a new run"
+                )
             _cut(path, size)
         elif path.exists():
             _cut(path, 0)
         self._file = path.open("a", newline="")
-        # Those of all lines so far.
+        # The number and the hash of all lines so far.
         self._rows, self._digest = _rows_and_digest(path)
         with path.open(newline="") as file:
             self._columns = tuple(next(csv.reader(file), ())) or None

@@ -249,9 +249,9 @@ def check_episodes(
     required = _padded(num_policies, used) * each
     if free is not None and required > free:
         raise ValueError(
-            f"{option} is {num_episodes}: of {num_policies} policies side by side they "
-            f"need at least {_in_words(required)} of memory, and {_in_words(free)} are "
-            "free"
+            f"{option} is {num_episodes}: the episodes of {num_policies} policies at "
+            f"once need at least {_in_words(required)} of memory, and "
+            f"{_in_words(free)} are free"
         )
 
 

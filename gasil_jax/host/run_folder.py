@@ -284,9 +284,9 @@ def _why_no_run(folder: pathlib.Path) -> str:
         return ", which does not exist: it must be the folder of a run"
     if (folder / FIT).is_file():
         return (
-            f", in which gasil_jax.fit has trained what no run can describe "
-            f"({read_fit(folder)['why_no_run']}): only gasil_jax.plot and "
-            "gasil_jax.load_policy take it"
+            f", a folder of gasil_jax.fit that the options of a run can't describe "
+            f"({read_fit(folder)['why_no_run']}): use it with gasil_jax.plot or "
+            "gasil_jax.load_policy"
         )
     return f", which has no {CONFIG}: it must be the folder of a run"
 

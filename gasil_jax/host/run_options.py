@@ -229,8 +229,8 @@ def refuse_changes(options: Options, stored: Mapping[str, Any]) -> None:
     if changed := run_folder.differences(before, run_folder.flat(vars(options)), grows):
         raise InputError(
             f"resume continues {stored['out']}, where {'; '.join(changed)}: only "
-            f"{' and '.join(grows)} may change, and grow, and checkpoint_every, "
-            "keep_checkpoints, devices and log"
+            f"{' and '.join(grows)} may grow, and only checkpoint_every, "
+            "keep_checkpoints, devices and log may differ"
         )
     now = run_folder.flat(description(options))
     run_folder.refuse_other_expert(stored, now, stored["out"])

@@ -7,8 +7,9 @@ and not from the buffer; the discriminator ascends
 
 and the policy receives the bonus -alpha log D(s, a) >= 0, which is larger for pairs
 that look like the buffer's. Everything is computed from the logit l of D:
-log D = -softplus(-l), log(1 - D) = -softplus(l). As in the paper the bonus is never
-negative, so it favours long episodes (survival bias).
+log D = -softplus(-l), log(1 - D) = -softplus(l). This bonus, the paper's and the
+default, is never negative, so it favours long episodes (survival bias). `BONUSES` has
+other forms.
 
 While the buffer is empty, D does not train and the bonus is 0. GAIL is the same method
 with a fixed set of expert pairs instead of the buffer.
@@ -89,16 +90,18 @@ BONUSES: Mapping[str, Callable[[jax.Array], jax.Array]] = {
 def absorbed_share(
     length: jax.Array, terminated: jax.Array, counted: jax.Array, gamma: Any
 ) -> jax.Array:
-    """Return which share of discounted time some episodes spend in an absorbing state.
+    """Return the mean share of discounted time in the absorbing state, float32 ().
 
-    An episode that terminates after T steps is in it from then on, for a share of
-    gamma^T of its discounted time, and one that is truncated never. A further episode,
-    of a share of 1/2, keeps the result from 0 and 1.
+    An episode that terminates after T steps is in the absorbing state from then on,
+    which is the share gamma^T of its discounted time. For a truncated episode the share
+    is 0. One imaginary episode with the share 1/2 is added, so that the result is never
+    0 or 1.
 
     Args:
-      length: number of steps of each episode.
-      terminated: whether it has no future value.
-      counted: whether it is an episode at all.
+      length: int32, any shape, number of steps of each episode.
+      terminated: bool, the same shape, whether the episode terminated.
+      counted: bool, the same shape, false for entries that are not the end of an
+        episode.
       gamma: the discount factor.
     """
     share = jnp.where(counted & terminated, gamma**length, 0.0)
@@ -186,8 +189,8 @@ def gradient_penalty(
     return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
 
 
-# With a gamma of 1 an absorbing state would be worth infinitely much.
-_LEAST_DISCOUNT = 1e-3
+# Lower bound of 1 - gamma: with gamma 1 the absorbing state's value would be infinite.
+_LEAST_ONE_MINUS_GAMMA = 1e-3
 _NORMALIZES_ACTIONS = "discriminator_normalizes_actions"
 
 
@@ -210,8 +213,10 @@ class AdversarialAgent(Agent):
     """An agent with a discriminator.
 
     Attributes:
-      bonus: form of the discriminator's reward: softplus (-log D, the paper's), logit,
-        dail, centered or absorbing.
+      bonus: form of the discriminator's reward: softplus, -log D, as in the paper;
+        logit, log(1 - D) - log D; dail, between 0 and 1; centered, softplus minus its
+        mean over the batch; or absorbing, softplus, and where an episode terminates
+        also the value of an absorbing state.
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_updates: gradient steps of the discriminator in an iteration.
       discriminator_minibatch_size: steps of the policy, and as many good steps, in one
@@ -276,7 +281,7 @@ class AdversarialAgent(Agent):
             assert source.absorbing_logit is not None  # Ensured by `check`.
             gamma = context.config.gamma
             after = BONUSES[self.bonus](source.absorbing_logit(rollout, gamma))
-            horizon = gamma / jnp.maximum(1.0 - gamma, _LEAST_DISCOUNT)
+            horizon = gamma / jnp.maximum(1.0 - gamma, _LEAST_ONE_MINUS_GAMMA)
             bonus += jnp.where(rollout.terminated, horizon * after, 0.0)
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
 

@@ -7,9 +7,10 @@ minibatches of the good-trajectory buffer B. They minimize
 
 While the buffer is empty, the policy is left as it is.
 
-PPO+BC-ADAPTIVE has the gap between buffer and policy, as PPO+GASIL-ADAPTIVE, as a
-factor of the coefficient. So cloning ends as the policy reaches its best episodes, and
-does not hold it to episodes that all tie. Without a gap, the policy is left as it is.
+PPO+BC-ADAPTIVE multiplies the coefficient by the gap of PPO+GASIL-ADAPTIVE (see
+`adaptive`): how much higher the buffer's returns are than the policy's, from 0 to 1. So
+cloning fades as the policy becomes as good as the buffer. If the gap is 0, the policy
+takes no cloning step.
 """
 
 from typing import Any
@@ -83,7 +84,7 @@ class PPOBC(BufferedAgent):
         return state, actor_critic.replace(policy=policy), metrics
 
 
-class Follower(struct.PyTreeNode):
+class AdaptiveCloningState(struct.PyTreeNode):
     """The state of PPO+BC-ADAPTIVE; see `adaptive.Adaptive`."""
 
     buffer: GoodTrajectories
@@ -96,19 +97,23 @@ class PPOBCAdaptive(PPOBC):
 
     name = "ppo+bc-adaptive"
 
-    def init(self, key: jax.Array, sizes: Sizes) -> Follower:
+    def init(self, key: jax.Array, sizes: Sizes) -> AdaptiveCloningState:
         """Return the state before the first batch."""
-        return Follower(self.init_buffer(sizes), jnp.float32(0.0), jnp.bool_(False))
+        return AdaptiveCloningState(
+            self.init_buffer(sizes), jnp.float32(0.0), jnp.bool_(False)
+        )
 
-    def good_trajectories(self, state: Follower) -> GoodTrajectories:
+    def good_trajectories(self, state: AdaptiveCloningState) -> GoodTrajectories:
         """Return the buffer in a state."""
         return state.buffer
 
-    def remember(self, state: Follower, context: Context) -> Follower:
+    def remember(
+        self, state: AdaptiveCloningState, context: Context
+    ) -> AdaptiveCloningState:
         """Insert a batch's episodes into the buffer, and follow the policy's return."""
         batch, past = context.rollout, (state.policy_return, state.has_episodes)
         followed = follow_return(*past, batch.completed, return_=self.ranked_by(batch))
-        return Follower(self.insert(state.buffer, context), *followed)
+        return AdaptiveCloningState(self.insert(state.buffer, context), *followed)
 
     def update_policy(
         self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array

@@ -21,9 +21,9 @@ class Agent(struct.PyTreeNode):
     agent is a pytree of its numbers: those declared with `number` are traced, so a
     sweep may give each run its own.
 
-    The state is a pytree that the training loop carries. Its numbers must be finite
-    from `init` on: an update after which one of them is not is undone. What this class
-    defines is PPO alone.
+    The state is a pytree that the training loop carries. All of its numbers must always
+    be finite: if an update makes a number that is not finite, the loop undoes the
+    update. This class itself is plain PPO.
 
     Attributes:
       name: the agent's name; MODULE:CLASS for a class of your own.
@@ -58,7 +58,11 @@ class Agent(struct.PyTreeNode):
         return None
 
     def value_network(self, sizes: Sizes) -> Any:
-        """Return a Flax module for values, (..., obs) -> (...); None as above."""
+        """Return a Flax module for the values, or None for the package's layers.
+
+        It maps normalized observations, (..., obs), to values, (...), and may only have
+        parameters.
+        """
         return None
 
     def data(self) -> Any:
@@ -74,9 +78,9 @@ class Agent(struct.PyTreeNode):
         return ()
 
     def remember(self, state: Any, context: Context) -> Any:
-        """Return the state with what it keeps of a batch, such as good trajectories.
+        """Return the state after storing data of a batch, such as good trajectories.
 
-        This is not undone if the update that follows is.
+        If the update of this iteration is undone, the stored data stays.
         """
         return state
 
@@ -91,8 +95,8 @@ class Agent(struct.PyTreeNode):
           key: random key; consumed.
 
         Returns:
-          The state; the rewards, (time, env) or, for several streams, (time, env,
-          stream); and metrics.
+          The state; the rewards, float32 (time, env) or, for several streams, (time,
+          env, stream); and metrics, one number each.
         """
         return state, context.rollout.reward, {}
 

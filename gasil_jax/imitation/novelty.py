@@ -7,9 +7,9 @@ maximizes
 
     r + novelty_coefficient (novelty - its mean over the batch).
 
-The mean is subtracted so that ending an episode costs nothing: a bonus that is never
-negative pays for not arriving. PPO+NOVELTY is the control of PPO+BC+NOVELTY: how much
-better that is, is the effect of imitation.
+The mean is subtracted because a bonus that is never negative would reward the policy
+for prolonging its episodes. PPO+NOVELTY is the control of PPO+BC+NOVELTY: the
+difference of their returns is the effect of imitation.
 
 PPO+BC+NOVELTY also clones its best episodes. Where episodes have the same return, as
 all have before the first reward, the buffer keeps those with the most novelty. So the
@@ -30,10 +30,12 @@ from gasil_jax.imitation.behavior_cloning import PPOBC
 from gasil_jax.imitation.interface import Agent
 from gasil_jax.ppo import ActorCritic
 
-# Number of counters, which cells share by a hash, and of random directions.
+# The number of counters (a hash maps cells to counters, so cells may share one), and of
+# random directions. The primes, one per direction, are the multipliers of the hash.
 _COUNTERS, _DIRECTIONS = 2**14, 4
 _PRIMES = (73856093, 19349663, 83492791, 49979687)
-# An episode's mean novelty, from 0 to 1, decides where returns differ by less.
+# Weight of an episode's mean novelty, from 0 to 1, in its rank. It decides only between
+# episodes whose returns differ by less than this.
 _TIE = 1e-3
 
 
@@ -139,8 +141,8 @@ class PPOBCNovelty(PPONovelty, PPOBC):
     """PPO+NOVELTY, then cloning of the buffer.
 
     Attributes:
-      novelty_ties: whether the buffer keeps the "novel" ones of episodes with the same
-        return, or, with "arrival", those that `ties` says.
+      novelty_ties: which of two episodes with the same return the buffer keeps: novel,
+        the one with the higher mean novelty; or arrival, the one that ties names.
     """
 
     name = "ppo+bc+novelty"

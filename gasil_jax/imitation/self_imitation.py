@@ -199,7 +199,16 @@ def loss(
     scale: jax.Array | float,
     value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return a minibatch's loss, (), and its fraction of positive advantages, ()."""
+    """Return a minibatch's loss, (), and its fraction of positive advantages, ().
+
+    Args:
+      log_prob: float32 (samples,), log pi(a | s) of the replayed actions.
+      value: float32 (samples,), V(s).
+      return_: float32 (samples,), R, in the unit of the value.
+      weight: float32 (samples,), the importance weights.
+      scale: (), the standard deviation of the returns, in the unit of the value.
+      value_coefficient: weight of the value's loss.
+    """
     chex.assert_equal_shape([log_prob, value, return_, weight])
     advantage = clipped_advantage(return_, value, scale)
     num_positive = jnp.sum(advantage > 0)

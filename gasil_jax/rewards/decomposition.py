@@ -13,12 +13,12 @@ many of its steps, drawn at random, as in randomized return decomposition (Ren e
 2022, arXiv:2111.13485). Minibatches are drawn from all complete windows in the history.
 
 PPO then learns from m + s g instead of the environment's reward. The difference
-between a window's payout and the sum of m + s g over its steps is added to them in
-equal shares. So a window's rewards sum to its payout; an untrained network spreads the
+between a window's payout and the sum of m + s g over its steps is divided equally among
+its steps. So a window's rewards sum to its payout; an untrained network spreads the
 payout almost evenly; and where every step pays, the reward is the environment's own. If
-a window began in an earlier batch, PPO has already learned from its earlier steps
-without their share. In the history they get it, so that a replay of whole episodes has
-it.
+a window began in an earlier batch, PPO has already learned from the window's earlier
+steps, without their share of this difference. In the history these steps get their
+share, so that agents that replay whole episodes see the complete rewards.
 """
 
 from collections.abc import Callable
@@ -172,9 +172,10 @@ def goodness_of_fit(
       valid: bool (T, N), which windows count.
 
     Returns:
-      "decomposition_fit", the share of the variance that is explained (R2), NaN if
-      fewer than two windows count or all payouts are equal, and "decomposition_error",
-      the root of the mean squared error of a step, both ().
+      "decomposition_fit", (), the share of the variance of `actual` that is explained
+      (R2); NaN if fewer than two windows count or all have the same `actual`.
+      "decomposition_error", (), the root of the mean, over windows, of the squared
+      error; NaN if no window counts.
     """
     count = jnp.sum(valid)
 
@@ -319,19 +320,20 @@ class Decompose(RewardModel):
     Attributes:
       decomposition_learning_rate: Adam's step size for the network that decomposes
         rewards.
-      decomposition_updates: gradient steps in an iteration of the network that
+      decomposition_updates: gradient steps per iteration for the network that
         decomposes rewards.
       decomposition_minibatch_size: windows in one gradient step of the network that
         decomposes rewards. A window is the steps between two payouts.
-      decomposition_window_steps: largest number of steps that represent a window in
-        such a gradient step. Of a longer window, this many are drawn at random.
+      decomposition_window_steps: largest number of steps of a window that a gradient
+        step of the decomposition uses. From a longer window, this many are drawn at
+        random.
       decomposition_history_episodes: length of the history that windows are drawn from,
         in episodes of full length; a batch is added to it. If rewards come only at the
         end of an episode, 1 leaves few windows.
       decomposition_hidden_sizes: widths of the tanh layers of the network that
         decomposes rewards.
-      decomposition_inputs: what that network sees of a step: transition, the
-        observation, the action and the next observation; or pair, without the next
+      decomposition_inputs: inputs of the network that decomposes rewards: transition,
+        the observation, the action and the next observation; or pair, without the next
         observation.
     """
 

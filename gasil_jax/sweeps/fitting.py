@@ -75,19 +75,24 @@ def fit(
       env: one environment.
       algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
-      points: numbers of hyperparameters by name: each point is trained with all seeds,
-        in the same program. What a callback gets is then (points x seeds, ...), in
-        order. A folder holds one point: ``python -m gasil_jax.sweep`` keeps several.
+      points: values of hyperparameters, one mapping from names to values per point.
+        Each point is trained with all seeds, in the same program. The arrays that a
+        callback gets are then (points x seeds, ...), all seeds of the first point
+        first. Not with a folder, which holds one point: ``python -m gasil_jax.sweep``
+        keeps several.
       folder: folder for the files of a run, created if it is missing; None keeps
-        nothing. The commands take it like a run's. Only if the environment is not from
-        `gasil_jax.make_env`, if the seeds do not follow one another, or if a schedule
-        or a model of rewards is one that options can't name, it has a fit.json in place
-        of config.json: then `gasil_jax.load_policy` and ``python -m gasil_jax.plot``
-        take it, but no command that needs the environment.
-      resume: continue the training in the folder from its newest checkpoint. Of the
-        seeds, the algorithm and the evaluations only `total_steps` may differ, and only
-        grow. The environment, and schedules that are functions, are not compared. If
-        the folder holds no training yet, a new one begins.
+        nothing. All commands can read it like the folder of a run, if their options can
+        describe the training. They can't if the environment is not from
+        `gasil_jax.make_env`, if the seeds are not consecutive numbers, if a schedule is
+        a function, if the agent can't be imported by its name, or if a reward model is
+        not one of the package's. Then the folder has a fit.json instead of a
+        config.json, and only `gasil_jax.load_policy` and ``python -m gasil_jax.plot``
+        can read it.
+      resume: continue the training in the folder from its newest checkpoint. Seeds,
+        algorithm and evaluations must be the same, but `total_steps` may be larger. An
+        environment from `gasil_jax.make_env` is compared by its name and settings,
+        another one by the name of its class. Schedules that are functions are not
+        compared. If the folder holds no training yet, a new one begins.
       checkpoint_every: environment steps per seed between two checkpoints, rounded up
         to whole iterations; default a checkpoint every ten minutes and at the end.
       evaluate_every: environment steps per seed between two evaluations of the policy's

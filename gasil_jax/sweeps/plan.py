@@ -48,10 +48,10 @@ class Plan:
         }
 
     def part(self, number: int = 1, count: int = 1) -> list[Run]:
-        """Return the runs of one of `count` shards, whatever is trained already.
+        """Return the runs of shard `number`, counted from 1, of `count` shards.
 
-        The sizes of shards differ by one run at most, and the runs of a program are
-        divided as little as possible.
+        They do not depend on which runs are trained already. The sizes of shards differ
+        by one run at most, and the runs of a program are divided as little as possible.
 
         Raises:
           InputError: if there are more shards than runs.

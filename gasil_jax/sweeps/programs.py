@@ -164,7 +164,7 @@ def group(
 
 
 def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
-    """Return the programs that have begun in the folders of a folder, if it is there.
+    """Return the programs that have begun in a folder's subfolders; it may be missing.
 
     The length of their training, `total_steps`, may have grown since; by default it is
     the one that it began with.
@@ -190,10 +190,12 @@ def read(parent: pathlib.Path, total_steps: int | None = None) -> list[Program]:
 def unfinished(
     requested: Collection[Run], stored: Sequence[Program]
 ) -> tuple[list[Program], list[Run]]:
-    """Return the programs to continue for requested runs, and the runs that none has.
+    """Return the programs to continue, and the requested runs that no program holds.
 
-    A program that has begun trains all of its runs, also those that are not requested.
-    The stored ones may be trained already.
+    Args:
+      requested: the runs that are needed.
+      stored: all programs that have begun, finished or not. A program that is continued
+        trains all of its runs, also those that are not requested.
     """
     asked = set(requested)
     begun = [x for x in stored if not x.training and not asked.isdisjoint(x.runs)]

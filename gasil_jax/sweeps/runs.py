@@ -14,8 +14,8 @@ from gasil_jax.host import descriptions, json_reader
 from gasil_jax.host.environments import Settings
 
 #: Raise this by hand when a change makes the same settings give different numbers, by
-#: more than rounding. All earlier runs then count as missing. Runs of version 1 had
-#: their environments in step.
+#: more than rounding. All earlier runs then count as missing. In version 1, episodes
+#: were not staggered.
 ALGORITHM_VERSION = 2
 
 #: Settings of an environment that compute the same thing in different ways.
@@ -84,7 +84,7 @@ class Run:
 
     @functools.cached_property
     def experiment(self) -> str:
-        """The settings in the key but the seed as JSON, which a curve's runs share."""
+        """All settings in the key but the seed, as JSON; a curve's runs share it."""
         return json.dumps(self._fields, sort_keys=True)
 
     @functools.cached_property
@@ -107,10 +107,13 @@ class Run:
 def read_run(
     experiment: Mapping[str, Any], seed: int, total_steps: int | None = None
 ) -> Run:
-    """Return the run whose `Run.experiment`, read from JSON, and seed these are.
+    """Return a stored run.
 
-    Settings that are newer than the stored run have their defaults. Training may be of
-    another length than was stored, `total_steps`.
+    Args:
+      experiment: its `Run.experiment`, parsed from JSON. Settings that are missing,
+        because they are newer than the stored run, have their defaults.
+      seed: its seed.
+      total_steps: length of training to use instead of the stored one; None keeps it.
 
     Raises:
       ValueError: if a name is unknown, or a value of another type.

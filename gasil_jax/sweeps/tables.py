@@ -90,8 +90,8 @@ def read(plan: Plan, trained: Sequence[Program]) -> Results:
         for run, own in zip(each.runs, each.tables(), strict=True):
             if not _equal(stored.setdefault(run, own)[0], own[0]):
                 raise InputError(
-                    f"{each.path} has another result than another program for seed "
-                    f"{run.seed} of {run.experiment}"
+                    f"{each.path} and another program have different results for seed "
+                    f"{run.seed} of {run.experiment}: move one of the two folders away"
                 )
     every = [stored[run] for run in plan.runs.values()]
     curves = _curves(plan, [metrics for metrics, _ in every])

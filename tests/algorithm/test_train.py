@@ -236,11 +236,10 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
         traced(pair)
     # Minibatches would hold the batch's last step many times.
     more = {"num_envs": 2 * CONFIG.num_envs}
-    with pytest.raises(ValueError, match=r"history.* is .*\[4, .* needs .*\[8, "):
-        traced(state, PPO_GASIL.replace(**more))
-    plain = init(PPO)
-    with pytest.raises(ValueError, match=r"num_envs is .*\[4\]: .* needs .*\[8\]"):
-        traced(plain, PPO.replace(**more))
+    plain, words = init(PPO), r"state\.environments\..* is int32\[4\]: .*int32\[8\]"
+    for algorithm, given in ((PPO_GASIL, state), (PPO, plain)):
+        with pytest.raises(ValueError, match=words):
+            traced(given, algorithm.replace(**more))
     with pytest.raises(ValueError, match=r"history.*, 128.* needs .*, 256"):
         traced(state, PPO_GASIL.replace(batch_steps=2 * CONFIG.batch_steps))
     with pytest.raises(ValueError, match=r"state.agent.* is missing: .* needs float"):

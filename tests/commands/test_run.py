@@ -212,13 +212,13 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env hopper --log wandb --log tensorboard", "log is given twice: put all"),
         ("--env brax:antt", "did you mean 'brax:ant'?"),
         ("--env brax:zoo", "env 'brax:zoo' is unknown: it must be one of brax:"),
-        ("--env brax:ant --physics mujoco", "brax:ant has its own"),
+        ("--env brax:ant --physics mujoco", "leave it out, brax:ant has its own"),
         ("--env nowhere:Line", "'nowhere:Line' can't be imported: No module"),
         ("--env json:Line", "has no attribute 'Line'"),
         ("--env sys:path", "must build an environment without arguments"),
         ("--env json:loads", "arguments: missing a required argument: 's'"),
         ("--env os:getcwd", "'os:getcwd' is no environment: it has no reset"),
-        ("--env os:getcwd --physics mujoco", "os:getcwd has its own"),
+        ("--env os:getcwd --physics mujoco", "leave it out, os:getcwd has"),
         (
             "--env point_mass --max-episode-steps 51",
             "from 1 to 50, the environment's own limit",
@@ -294,7 +294,7 @@ def test_code_that_exits_later_does_not_decide_the_status(capsys):
     status = command_line.reports_errors(lambda: sys.exit())()
     assert status == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("error: code of yours exits: SystemExit (")
+    assert line.startswith("error: your own code ended the program: SystemExit (")
 
 
 def test_ctrl_c_passes_through_what_checks_the_users_code():

@@ -257,7 +257,7 @@ def test_resume_needs_a_folder(capsys):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.unlink(), "lacks rows that the checkpoint has seen"),
+        (lambda path: path.unlink(), "lacks rows that were in it at the last"),
         (
             lambda path: path.write_text(path.read_text().replace(",", "", 9)),
             "metrics.csv",

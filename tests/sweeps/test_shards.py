@@ -260,7 +260,7 @@ def test_two_different_results_of_a_run_are_refused_and_two_equal_ones_are_one(
     metrics = plan.trained(tmp_path / "b")[0].path / "metrics.csv"
     metrics.write_text(metrics.read_text().replace(",7,", ",8,"))
     capsys.readouterr()
-    assert "has another result than another program" in refused(capsys, *both)
+    assert "and another program have different results" in refused(capsys, *both)
     assert not (tmp_path / "out").exists()
 
 

@@ -104,7 +104,17 @@ def _constant(x: np.ndarray) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Limits:
-    """The limited slide and hinge joints."""
+    """The limits of L slide and hinge joints, in metres or radians.
+
+    Attributes:
+      qpos: int (L,), index of each joint in qpos.
+      dof: int (L,), index of its degree of freedom.
+      low: float32 (L or 1, 1), its lower limit.
+      high: float32 (L or 1, 1), its upper limit.
+      margin: float32 (L or 1, 1), distance to a limit below which the limit acts.
+      inverse_weight: float32 (L or 1, 1), MuJoCo's dof_invweight0.
+      impedance: the coefficients of the limits.
+    """
 
     qpos: np.ndarray
     dof: np.ndarray

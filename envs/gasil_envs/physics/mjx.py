@@ -47,12 +47,12 @@ def _left_out(model: mujoco.MjModel) -> str | None:
 
 def _refusal(what: str) -> ValueError:
     return ValueError(
-        f"physics 'mjx' lacks a part of the model that 'mujoco' has: {what}"
+        f"physics 'mjx' does not support this model: {what} (use physics 'mujoco')"
     )
 
 
 class MjxPhysics:
-    """Steps a MuJoCo model with MJX; see `interface.Physics`.
+    """Steps a MuJoCo model in JAX, with our own code or MJX's; see `interface.Physics`.
 
     Args:
       model: the model; its solver options are overwritten.

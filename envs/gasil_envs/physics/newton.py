@@ -35,7 +35,8 @@ from gasil_envs.physics import newton_kernel
 from gasil_envs.physics.batching import add, fold, materialize, on_cpu, on_gpu, total
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
-# same number of edges: C contacts, T tangents, E edges.
+# same number of edges: C contacts, T tangents, E edges. The classes give the shapes of
+# one problem; in a batch every array has B as a further, last axis.
 
 
 class ContactRows(struct.PyTreeNode):
@@ -338,7 +339,17 @@ def _repeat(
 def solve_many(
     iterations: int, line_search: int, problem: Problem, *, for_speed: bool = True
 ) -> Solution:
-    """Solve problems whose arrays have the batch as their last axis."""
+    """Solve a batch of problems.
+
+    Args:
+      iterations: largest number of Newton iterations.
+      line_search: largest number of steps of each line search.
+      problem: the problems; every array has one more axis, the batch, at its end.
+      for_speed: whether sums are unrolled for speed; otherwise compiled for size.
+
+    Returns:
+      The solutions, with the batch as the last axis of every array.
+    """
     inertia, force = problem.inertia, problem.force
     rows = _Rows(problem, for_speed)
     spell_out = for_speed and _spells_out(inertia)
