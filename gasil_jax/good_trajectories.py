@@ -11,6 +11,7 @@ number of episodes, prefer the newer one on a tie, and rank by other numbers, su
 empty buffer is a normal state.
 """
 
+from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -31,8 +32,8 @@ class GoodTrajectories(struct.PyTreeNode):
       return_: float32 (C,), the return of the step's episode; 0 where empty.
       time: int32 (C,), the step's index in its episode.
       size: int32 (), number of filled steps; they are the first ones.
-      terminated: bool (C,), whether the step's episode terminated, and was not
-        truncated; None if the buffer does not keep it.
+      terminated: bool (C,), whether the step's episode terminated, and was neither
+        truncated nor cut by the capacity; None if the buffer does not keep it.
     """
 
     observation: jax.Array
@@ -261,7 +262,7 @@ def shared_returns(
     history: History,
     episodes: Episodes,
     *,
-    scale: jax.Array,
+    normalize: Callable[[jax.Array], jax.Array],
     distance: float,
 ) -> jax.Array:
     """Return the numbers by which `insert` ranks episodes that share their returns.
@@ -269,14 +270,15 @@ def shared_returns(
     An episode's number is its return minus the lowest return, divided by 1 + n. Here n
     is the number of similar episodes that come before it by return (fitness sharing,
     Goldberg and Richardson 1987). So the buffer keeps episodes that succeed in
-    different ways. Episodes are similar if the means of their scaled observations
+    different ways. Episodes are similar if the means of their normalized observations
     differ by less than `distance` (root mean square over the entries).
 
     Args:
       good_trajectories: the buffer before the insertion.
       history: the history that holds the steps of the offered episodes.
       episodes: the offered episodes.
-      scale: float32 (obs,), the unit of each entry of an observation.
+      normalize: observations (..., obs) -> normalized ones, which must be around 0 and
+        bounded: sums of others would not be precise.
       distance: the distance below which two episodes are similar.
 
     Returns:
@@ -286,8 +288,8 @@ def shared_returns(
     """
 
     def means(rows: jax.Array, env: Any, *, end: jax.Array, length: Any) -> jax.Array:
-        """Return the means of `length` scaled rows (env, row, obs) before `end`."""
-        sums = jnp.cumsum(rows / scale[None, None], axis=1)
+        """Return the means of `length` rows (env, row, obs) before `end`."""
+        sums = jnp.cumsum(normalize(rows), axis=1)
         sums = jnp.pad(sums, ((0, 0), (1, 0), (0, 0)))
         total = sums[env, end] - sums[env, end - length]
         return total / jnp.maximum(length, 1)[:, None]
@@ -334,7 +336,9 @@ def insert(
       max_episodes: number of episodes to keep at most; None for any number.
       newest: whether the newer of two episodes with the same return comes first.
       ranked_by: float32 (C + E,), numbers to rank the buffer's own and the offered
-        episodes by; default their returns.
+        episodes by; default their returns. With them an episode that does not fit is
+        left out, unless it is the first: later its rank may be another, and one that
+        was cut would be in the middle of the buffer.
 
     The function sorts whole episodes, not steps, and then gathers every kept step.
     """
@@ -346,8 +350,8 @@ def insert(
     return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
-    ranked_by = return_ if ranked_by is None else ranked_by
-    key = jnp.where(length > 0, -ranked_by, jnp.inf)
+    keys = return_ if ranked_by is None else ranked_by
+    key = jnp.where(length > 0, -keys, jnp.inf)
     if newest:
         by_age = jnp.concatenate(
             [jnp.arange(key.shape[0] - 1, capacity - 1, -1), jnp.arange(capacity)]
@@ -360,6 +364,9 @@ def insert(
         length = length.at[order[max_episodes:]].set(0)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
+    if ranked_by is not None:
+        whole = jnp.max(jnp.where(end <= capacity, end, 0))
+        size = jnp.where(whole > 0, whole, size)
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]
@@ -386,7 +393,8 @@ def insert(
     if terminated is not None:
         assert episodes.terminated is not None, "this buffer keeps how episodes ended"
         both = jnp.concatenate([terminated, episodes.terminated])
-        terminated = filled & both[source]
+        # Of an episode that is cut, the end is not in the buffer.
+        terminated = filled & both[source] & (end[rank] <= capacity)
     return GoodTrajectories(
         observation=gather(good_trajectories.observation, history.observation),
         action=gather(good_trajectories.action, history.action),

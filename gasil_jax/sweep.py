@@ -59,6 +59,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     stored = run_options.resumed_run(arguments)
     options = run_options.parse(Options, arguments, _PROGRAM, stored)
+    if stored is not None:
+        options = _with_new_source(options, stored)
     run_options.check(options)
     shard = shards.parse("1/1" if options.shard is None else options.shard)
     if options.launcher is not None:
@@ -76,6 +78,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
         stored = stored or run_options.begun(options, options.out)
     _train(options, make_plan(options, stored), shard)
     return 0
+
+
+def _with_new_source(options: Options, stored: Mapping[str, Any]) -> Options:
+    """Return the options of a continued sweep without stored sources of points.
+
+    A grid, a number of random points or a file that the command line adds replaces the
+    stored ones, whose points the sweep keeps. Only random points are still drawn from
+    the stored grid if those before were.
+    """
+    sources = {x: getattr(options, x) for x in ("grid", "random", "points_file")}
+    before = {**sources, **stored, "grid": tuple(stored.get("grid") or ())}
+    new = {name for name, value in sources.items() if value != before[name]}
+    if not new:
+        return options
+    if new == {"random"} and before["random"] is not None:
+        new.add("grid")
+    return dataclasses.replace(
+        options,
+        grid=options.grid if "grid" in new else (),
+        random=options.random if "random" in new else None,
+        points_file=options.points_file if "points_file" in new else None,
+    )
 
 
 def make_plan(options: Options, stored: Mapping[str, Any] | None = None) -> Plan:

@@ -42,6 +42,9 @@ _Agent = Annotated[Agent, tyro.conf.arg(name="agent")]
 _Decompose = Annotated[Decompose, tyro.conf.arg(name="decompose-rewards")]
 _Normalize = Annotated[Normalize, tyro.conf.arg(name="normalize-rewards")]
 
+#: Episodes per seed in each evaluation during training, if no number is given.
+EVALUATE_EPISODES = 10
+
 
 @dataclasses.dataclass(frozen=True)
 class Options:
@@ -328,7 +331,9 @@ def _first_arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--agent", nargs="?", default=Options.agent)
     parser.add_argument("--env", nargs="?")
     parser.add_argument("--preset", nargs="?", default=presets.DEFAULT)
-    parser.add_argument("--reward-delay", nargs="?", type=delay, default=1)
+    # As in the parser of all options, a name may have underscores.
+    names = "--reward-delay", "--reward_delay"
+    parser.add_argument(*names, nargs="?", type=delay, default=1)
     given = parser.parse_known_args(_words(arguments))[0]
     given.agent = given.agent or Options.agent
     given.preset = given.preset or presets.DEFAULT
@@ -435,7 +440,8 @@ def evaluation_schedule(options: Options) -> EvaluationSchedule | None:
     """Return the times of evaluations during training; None without evaluations."""
     if options.evaluate_every is None:
         return None
-    return EvaluationSchedule(options.evaluate_every, options.evaluate_episodes or 10)
+    episodes = options.evaluate_episodes or EVALUATE_EPISODES
+    return EvaluationSchedule(options.evaluate_every, episodes)
 
 
 def check_out(options: Options) -> None:

@@ -1,5 +1,6 @@
 """Agents with a good-trajectory buffer: its settings, and what they do with it."""
 
+import functools
 from typing import Any, ClassVar
 
 import jax
@@ -98,7 +99,10 @@ class BufferedAgent(Agent):
         assert history is not None  # Ensured by `history_episodes`.
         if self.admission == "better":
             own = jnp.where(batch.completed, self.ranked_by(batch), jnp.nan)
-            return_ = jnp.where(own > jnp.nanmean(own), return_, jnp.nan)
+            # The mean of equal returns may be a rounding below them.
+            mean = jnp.nanmean(own)
+            above = own > mean + 1e-6 * jnp.abs(mean)
+            return_ = jnp.where(above, return_, jnp.nan)
         episodes = good_trajectories.ended_episodes(
             history,
             batch.ended,
@@ -108,9 +112,14 @@ class BufferedAgent(Agent):
         )
         ranked_by = None
         if self.sharing_distance > 0:
-            _, scale = normalization.moments(context.normalizer)
             ranked_by = good_trajectories.shared_returns(
-                buffer, history, episodes, scale=scale, distance=self.sharing_distance
+                buffer,
+                history,
+                episodes,
+                normalize=functools.partial(
+                    normalization.normalize, context.normalizer
+                ),
+                distance=self.sharing_distance,
             )
         return good_trajectories.insert(
             buffer,

@@ -63,7 +63,7 @@ def fit(
     resume: bool = False,
     checkpoint_every: int | None = None,
     evaluate_every: int | None = None,
-    evaluate_episodes: int = 10,
+    evaluate_episodes: int = run_options.EVALUATE_EPISODES,
     callback: Callback | None = None,
 ) -> FitResult:
     """Train seeds side by side over all devices, in chunks, as the command line does.
@@ -260,8 +260,31 @@ def _describe(members: Members, **arguments: Any) -> tuple[dict[str, Any], str]:
     return run_options.description(options), run_folder.CONFIG
 
 
+def _like_stored(
+    description: dict[str, Any], folder: pathlib.Path
+) -> Mapping[str, Any]:
+    """Return a run's config.json, and make a description have its preset.
+
+    If the run evaluates the default number of episodes, the description says so in the
+    same way.
+
+    Raises:
+      ValueError: if the folder is a sweep's.
+    """
+    stored = run_folder.read(folder)
+    if "points" in stored:
+        raise ValueError(
+            f"folder is {folder}, a sweep: continue it with python -m gasil_jax.sweep"
+        )
+    description["preset"] = stored["preset"]
+    if stored["evaluate_episodes"] is None and stored["evaluate_every"] is not None:
+        if description["evaluate_episodes"] == run_options.EVALUATE_EPISODES:
+            description["evaluate_episodes"] = None
+    return stored
+
+
 def _begin(
-    folder: pathlib.Path, description: Mapping[str, Any], name: str, *, resume: bool
+    folder: pathlib.Path, description: dict[str, Any], name: str, *, resume: bool
 ) -> None:
     """Write what is trained to a new folder, or compare it with what the folder says.
 
@@ -277,8 +300,11 @@ def _begin(
             "another folder"
         )
     else:
-        is_run = name == run_folder.CONFIG
-        before = (run_folder.read if is_run else run_folder.read_fit)(folder)
+        before: Mapping[str, Any]
+        if name == run_folder.FIT:
+            before = run_folder.read_fit(folder)
+        else:
+            before = _like_stored(description, folder)
         if changes := run_folder.differences(before, description):
             raise ValueError(
                 f"resume continues with {folder}, where {'; '.join(changes)}: "

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gasil_jax import good_trajectories
+from gasil_jax import good_trajectories, normalization
 
 CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
 
@@ -138,6 +138,59 @@ def test_the_last_admitted_episode_is_cut_and_ties_go_to_the_older():
     np.testing.assert_array_equal(
         buffer.observation[:, 0], [s[3] for s in reference.steps]
     )
+
+
+def rows_of(ends, values):
+    """A history of one environment, and its episodes, of a length and a return each."""
+    total = sum(length for length, _ in ends)
+    ended, return_, length = (np.zeros((total, 1), x) for x in (bool, float, int))
+    last = np.cumsum([length for length, _ in ends]) - 1
+    ended[last, 0] = True
+    length[last, 0], return_[last, 0] = zip(*ends)
+    history = good_trajectories.init_history(
+        1, total, total, observation_size=values.shape[1], action_size=1
+    )
+    history = good_trajectories.record(
+        history, values[:, None], np.zeros((total, 1, 1)), reward=return_, ended=ended
+    )
+    return history, good_trajectories.ended_episodes(
+        history, ended, return_, length=length, terminated=ended
+    )
+
+
+def test_with_numbers_to_rank_by_no_part_of_an_episode_is_kept():
+    history, episodes = rows_of([(3, 3.0), (5, 2.0), (2, 1.0)], np.ones((10, 1)))
+    empty = good_trajectories.init(CAPACITY, 1, 1, keep_terminated=True)
+    cut = good_trajectories.insert(empty, history, episodes)
+    np.testing.assert_array_equal(cut.time, [0, 1, 2, 0, 1, 2, 3])
+    # The end of an episode that is cut is not in the buffer.
+    np.testing.assert_array_equal(cut.terminated, [1, 1, 1, 0, 0, 0, 0])
+    keys = np.concatenate([np.zeros(CAPACITY), episodes.return_])
+    whole = good_trajectories.insert(empty, history, episodes, ranked_by=keys)
+    assert int(whole.size) == 3 and whole.terminated[:3].all()
+    # But the best one is, if it does not fit.
+    history, episodes = rows_of([(9, 3.0), (8, 2.0)], np.ones((17, 1)))
+    keys = np.concatenate([np.zeros(CAPACITY), episodes.return_])
+    long = good_trajectories.insert(empty, history, episodes, ranked_by=keys)
+    assert int(long.size) == CAPACITY and not long.terminated.any()
+
+
+def test_equal_episodes_share_whatever_an_entrys_offset():
+    ramp = np.tile(np.linspace(-1, 1, 50), 40)
+    values = np.stack([ramp, np.full(2000, 255.0)], axis=1).astype(np.float32)
+    history, episodes = rows_of([(50, 40.0 - i) for i in range(40)], values)
+    of = normalization.init(2).replace(
+        mean=jnp.array([0.0, 255.0]), m2=jnp.array([1.0, 0.0]), count=jnp.float32(1)
+    )
+    result = good_trajectories.shared_returns(
+        good_trajectories.init(100, 2, 1),
+        history,
+        episodes,
+        normalize=functools.partial(normalization.normalize, of),
+        distance=0.5,
+    )
+    expected = (39.0 - np.arange(40)) / (1 + np.arange(40))
+    np.testing.assert_allclose(result[100:][episodes.length > 0], expected, rtol=1e-5)
 
 
 def test_an_empty_buffer_samples_zeros_and_never_nan():
@@ -293,6 +346,10 @@ insert = jax.jit(good_trajectories.insert)
 
 shared = jax.jit(
     lambda buffer, history, episodes, scale, distance: good_trajectories.shared_returns(
-        buffer, history, episodes, scale=scale, distance=distance
+        buffer,
+        history,
+        episodes,
+        normalize=lambda x: x / scale[None, None],
+        distance=distance,
     )
 )

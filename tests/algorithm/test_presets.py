@@ -105,6 +105,7 @@ def test_the_command_line_starts_from_the_preset():
     delayed = parse("walker2d", "--reward-delay", "20")
     assert delayed == gasil_jax.preset("walker2d", "ppo+gasil", reward_delay=20)
     assert delayed != parse("walker2d")
+    assert delayed == parse("walker2d", "--reward_delay=20")
 
 
 def test_flags_override_the_preset():

@@ -15,7 +15,7 @@ import small_training
 import gasil_jax
 from gasil_jax import Decompose, Normalize, evaluate, plot, render, run
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, metrics_files
+from gasil_jax.host import checkpoint, metrics_files, run_folder, run_options
 from gasil_jax.host.interruption import Interrupted
 
 # Iterations, the longest of a chunk, and the algorithm of both ways to train.
@@ -49,6 +49,25 @@ def commanded(tmp_path_factory):
     evaluated = ("--evaluate-every", str(40 * 128), "--evaluate-episodes", "2")
     assert run.main([*FLAGS, *evaluated, "--seeds", "2", "--out", str(out)]) == 0
     return out
+
+
+def test_it_continues_what_a_command_began_but_no_sweep(env, tmp_path):
+    options = run_options.parse(
+        run_options.Options, [*FLAGS, "--evaluate-every", "128"], "x"
+    )
+    once = PPO.replace(total_steps=128)
+    options = dataclasses.replace(options, config=once.config)
+    for name, more in (("run", {}), ("sweep", {"points": [{}]})):
+        (tmp_path / name).mkdir()
+        run_options.write_config(options, tmp_path / name, **more)
+    arguments = {"seeds": 1, "resume": True, "evaluate_every": 128}
+    before = (tmp_path / "sweep" / "config.json").read_text()
+    with pytest.raises(ValueError, match="a sweep: continue it with"):
+        gasil_jax.fit(env, once, folder=tmp_path / "sweep", **arguments)
+    assert (tmp_path / "sweep" / "config.json").read_text() == before
+    gasil_jax.fit(env, once, folder=tmp_path / "run", **arguments)
+    stored = run_folder.read(tmp_path / "run")
+    assert (stored["preset"], stored["evaluate_episodes"]) == ("paper", None)
 
 
 def same(result, folder):
@@ -237,7 +256,7 @@ def test_what_no_run_can_describe_is_plotted(env, own, changes, why, tmp_path, c
     for command in (evaluate, render):
         assert command.main([str(out)]) == 2
         (message,) = capsys.readouterr().err.splitlines()
-        assert why in message and "only gasil_jax.plot and" in message
+        assert why in message and "use it with gasil_jax.plot" in message
 
 
 @pytest.mark.parametrize(

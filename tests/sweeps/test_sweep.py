@@ -315,6 +315,37 @@ def test_a_sweep_continues_with_its_own_points_from_any_file(
     assert "c.json, which can't be read" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("before", "more", "points"),
+    [
+        (["--random", "2"], ["--grid", "alpha=0.5"], 3),
+        (["--grid", "alpha=0.1,0.2"], ["--random", "3"], 5),
+        (["--grid", "alpha=0.1,0.2,0.3", "--random", "1"], ["--random", "3"], 3),
+        (["--points-file", "a.json"], ["--grid", "alpha=0.5"], 2),
+        (["--grid", "alpha=0.5"], ["--points-file", "a.json"], 2),
+    ],
+)
+def test_a_sweep_grows_by_points_of_another_source(
+    before, more, points, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a.json").write_text('[{"alpha": 0.7}]')
+    options = run_options.parse(sweep.Options, [*SMALL, "--out", "s", *before], "x")
+    (tmp_path / "s").mkdir()
+    plan = sweep.make_plan(options)
+    run_options.write_config(options, tmp_path / "s", points=plan.points)
+    planned = []
+
+    def prepare(options, jobs):
+        planned.append(options)
+        raise InputError("enough")
+
+    monkeypatch.setattr(assembly, "prepare", prepare)
+    assert sweep.main(["--resume", "--out", "s", *more]) == 2
+    stored = run_folder.read(tmp_path / "s")
+    assert len(sweep.make_plan(planned[0], stored).points) == points
+
+
 def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
     long = (*FLAGS, "--agent", "ppo", "--total-steps", str(60 * 128), "--seeds", "2")
     grid = ("--grid", "gamma=0.9,0.99", "num_epochs=1,2")
