@@ -100,7 +100,7 @@ def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
             rollout=batch.replace(discounted_return=returns), history=history
         )
         buffer = remembered(agent, context)
-        return buffer.return_[:: int(buffer.size) // 2]
+        return buffer.return_[jnp.array([0, buffer.size - 1])]
 
     np.testing.assert_allclose(kept(), [1.0, 1.0])
     np.testing.assert_allclose(kept(sharing_distance=1.0), [1.0, 0.9])

@@ -291,7 +291,7 @@ def test_the_help_explains_its_settings(capsys):
         ("my_agents:helper", "is of type function: it must be a class that is derived"),
         ("my_agents:Plain", "is of type type: it must be a class that is derived from"),
         ("my_agents:INSTANCE", "is of type Own: it must be a class that is derived"),
-        ("my_agents:Named", "'my_agents:Named' has the name 'mine': it must have the"),
+        ("my_agents:Named", "'my_agents:Named' calls itself 'mine': name the module"),
         ("my_agents:Taken", "'gamma', a name that is taken"),
         ("my_agents:OfRewards", "'reward_clip', a name that is taken"),
         ("my_agents:AnOption", "'seeds', a name that is taken by an option"),

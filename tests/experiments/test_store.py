@@ -247,7 +247,7 @@ def test_a_part_of_training_is_the_rows_whose_middle_is_in_it():
 
 def test_what_is_checked_in_is_small_and_of_few_files():
     files = [x for x in RESULTS.rglob("[!.]*") if x.is_file()]
-    assert len(files) <= 90 and sum(x.stat().st_size for x in files) < 7e6
+    assert len(files) <= 90 and sum(x.stat().st_size for x in files) < 8e6
     # A pattern of .gitignore would leave them out.
     git = ("git", "-C", str(RESULTS), "check-ignore", "-q", *map(str, files))
     assert subprocess.run(git).returncode != 0

@@ -186,7 +186,9 @@ def test_members_have_equal_shares_of_the_devices_that_are_used():
             fits(size, count)
     env = gasil_jax.make_env("point_mass")
     resources.check_episodes(env, 100, 8, devices)
-    with pytest.raises(ValueError, match="episodes is 100: of 80 policies"):
+    with pytest.raises(
+        ValueError, match="episodes is 100: the episodes of 80 policies"
+    ):
         resources.check_episodes(env, 100, 80, devices)
 
 
