@@ -24,7 +24,6 @@ from experiments.search import (
     PAPERS,
     TASKS,
     PaperSearch,
-    Point,
     Search,
     SparseSearch,
     best_of,
@@ -282,25 +281,15 @@ class Summary:
         """Return a note, such as a page of `SUMMARIES`, with its slots filled in."""
         return report.fill((report.NOTES / f"{note}.md").read_text(), self.value)
 
-    def _point(self, search: Search, searched: Store) -> Point | None:
-        """Return the best values for a search's agent: its own, or another search's.
-
-        The other searches are those of PPO and of PPO+GASIL; the final returns on the
-        pages decide. The result is None if the agent's search is not complete.
-        """
+    def tuned(self) -> str:
+        """Return the tuned presets as JSON, updated by what complete searches chose."""
+        rows = json.loads(presets.TUNED.read_text())
         final = {
             results.curve.search: float(interquartile_mean(results.final))
             for name in ("matrix", "ppo_values")
             for results in self.pages[name].results.values()
             if results.complete
         }
-        others = [dataclasses.replace(search, chooser=x) for x in PAIR]
-        best = max([search, *others], key=lambda x: final.get(x, -np.inf))
-        return best.chosen(searched)
-
-    def tuned(self) -> str:
-        """Return the tuned presets as JSON, updated by what complete searches chose."""
-        rows = json.loads(presets.TUNED.read_text())
         for page in self.pages.values():
             for search in page.figure.searches.values():
                 # The preset "paper" has normalized rewards, "scaled" decomposed ones.
@@ -313,7 +302,11 @@ class Summary:
                 is_own = kind == "delayed" and search.env in ("ant", "humanoid")
                 single = search.agent == ADAPTIVE and not is_own
                 single |= isinstance(search, SparseSearch)
-                point = self._point(search, page.searched)
+                # The best of its own values and of those that PPO's and PPO+GASIL's
+                # searches chose, by the final returns on the pages.
+                others = [dataclasses.replace(search, chooser=x) for x in PAIR]
+                best = max([search, *others], key=lambda x: final.get(x, -np.inf))
+                point = best.chosen(page.searched)
                 if point is None or single or other:
                     continue
                 settings = report.changed(search.algorithm(point))
