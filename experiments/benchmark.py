@@ -106,11 +106,12 @@ class Row:
     speed: float = 0.0
 
 
-def _make(env_name: str, variant: str) -> Any:
+def make(env_name: str, variant: str) -> Any:
+    """Return a task whose ended episodes begin anew, built in one of the ways."""
     return wrappers.AutoReset(gasil_envs.make(env_name, **VARIANTS[variant]))
 
 
-def _random_step(env: Any, states: Any, key: jax.Array) -> Any:
+def random_step(env: Any, states: Any, key: jax.Array) -> Any:
     """Return the states of environments after a random action."""
     low, high = env.action_range
     shape = (states.done.shape[0], env.action_size)
@@ -118,9 +119,11 @@ def _random_step(env: Any, states: Any, key: jax.Array) -> Any:
     return jax.vmap(env.step)(states, action)
 
 
-def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
+def random_steps(env: Any, states: Any, key: jax.Array) -> Any:
+    """Return the states of environments after some random actions."""
+
     def step(states: Any, key: Any) -> Any:
-        return (_random_step(env, states, key), None)
+        return (random_step(env, states, key), None)
 
     return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
 
@@ -138,7 +141,7 @@ def _speed(call: Callable[[], Any], steps: int) -> float:
 
 def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     """Random actions in environments that are spread over the devices."""
-    env = _make(env_name, variant)
+    env = make(env_name, variant)
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
     mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
 
@@ -150,7 +153,7 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
         )
 
     states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
-    rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
+    rollout = shard(lambda x: (random_steps(env, x[0], x[1][0]), x[1]))
     began = time.perf_counter()
     advance = rollout.lower((states, _keys(0, count))).compile()
     compile_seconds = time.perf_counter() - began
@@ -206,12 +209,12 @@ def one_step_error(env_name: str, variant: str) -> float:
 
     It is the error of the worst entry, and the median over 64 environments.
     """
-    env, reference = _make(env_name, variant), _make(env_name, "mujoco")
+    env, reference = make(env_name, variant), make(env_name, "mujoco")
     keys = jax.random.split(jax.random.key(1), 64)
     states = jax.jit(jax.vmap(reference.reset))(keys)
-    states = jax.jit(functools.partial(_random_steps, reference))(states, keys[0])
+    states = jax.jit(functools.partial(random_steps, reference))(states, keys[0])
     obs, right = (
-        np.asarray(jax.jit(functools.partial(_random_step, x))(states, keys[1]).obs)
+        np.asarray(jax.jit(functools.partial(random_step, x))(states, keys[1]).obs)
         for x in (env, reference)
     )
     error = np.abs(obs - right) / (1.0 + np.abs(right))

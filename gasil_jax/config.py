@@ -61,7 +61,8 @@ class Range(NamedTuple):
 
     def __str__(self) -> str:
         if self.whole:
-            return f"a whole number, {self.low:g} or more"
+            most = "" if math.isinf(self.high) else f" and at most {self.high:.0f}"
+            return f"a whole number, {self.low:g} or more{most}"
         least = f"{'more than ' * self.excludes_low}{self.low:g}"
         least += " in float32" if self.excludes_low else " or more"
         most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"

@@ -315,6 +315,8 @@ def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, caps
         (("benchmark", "--repeats", "0"), "repeats is 0: it must be 1 or more"),
         (("benchmark", "--repeats", "9", "--page"), "page is set, but "),
         (("profile", "--repeats", "9", "--page"), "page is set, but "),
+        (("roofline", "--repeats", "9", "--page"), "page is set, but "),
+        (("roofline", "--envs", "reacher"), "envs has 'reacher': allowed "),
         (
             # JAX is running with two devices.
             "benchmark --devices 2 --tables scaling --training-envs 100".split(),
