@@ -93,6 +93,7 @@ class Row:
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
       returns: what trained policies return, (seeds,); None if it is not measured.
+      states: of physics, the environments after some steps, from which it is timed.
       speed: steps per second, the median of the repeats, once it is measured.
     """
 
@@ -103,6 +104,7 @@ class Row:
     compile_seconds: float = 0.0
     error: float | None = None
     returns: np.ndarray | None = None
+    states: Any = None
     speed: float = 0.0
 
 
@@ -119,9 +121,7 @@ def random_step(env: Any, states: Any, key: jax.Array) -> Any:
     return jax.vmap(env.step)(states, action)
 
 
-def random_steps(env: Any, states: Any, key: jax.Array) -> Any:
-    """Return the states of environments after some random actions."""
-
+def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
     def step(states: Any, key: Any) -> Any:
         return (random_step(env, states, key), None)
 
@@ -132,7 +132,7 @@ def _keys(number: int, count: int) -> jax.Array:
     return jax.random.split(jax.random.key(number), count)
 
 
-def _speed(call: Callable[[], Any], steps: int) -> float:
+def speed_of(call: Callable[[], Any], steps: int) -> float:
     """Return the steps per second of a call that takes so many steps."""
     began = time.perf_counter()
     jax.block_until_ready(call())
@@ -153,7 +153,7 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
         )
 
     states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
-    rollout = shard(lambda x: (random_steps(env, x[0], x[1][0]), x[1]))
+    rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
     began = time.perf_counter()
     advance = rollout.lower((states, _keys(0, count))).compile()
     compile_seconds = time.perf_counter() - began
@@ -163,8 +163,8 @@ def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     def rollouts() -> Any:
         return advance((states, _keys(1, count)))
 
-    run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
-    return Row(env_name, variant, num_envs, run, compile_seconds)
+    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
+    return Row(env_name, variant, num_envs, run, compile_seconds, states=states)
 
 
 def warp_row(env_name: str, num_envs: int) -> Row:
@@ -200,7 +200,7 @@ def warp_row(env_name: str, num_envs: int) -> Row:
     def rollouts() -> Any:
         return advance(states, _keys(1, _NUM_STEPS))
 
-    run = functools.partial(_speed, rollouts, num_envs * _NUM_STEPS)
+    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
     return Row(env_name, "warp", num_envs, run, compile_seconds)
 
 
@@ -212,7 +212,7 @@ def one_step_error(env_name: str, variant: str) -> float:
     env, reference = make(env_name, variant), make(env_name, "mujoco")
     keys = jax.random.split(jax.random.key(1), 64)
     states = jax.jit(jax.vmap(reference.reset))(keys)
-    states = jax.jit(functools.partial(random_steps, reference))(states, keys[0])
+    states = jax.jit(functools.partial(_random_steps, reference))(states, keys[0])
     obs, right = (
         np.asarray(jax.jit(functools.partial(random_step, x))(states, keys[1]).obs)
         for x in (env, reference)
@@ -259,7 +259,7 @@ def training_row(
         newest.append(advance(newest.pop(), count, batch.data)[0])
         return newest
 
-    run = functools.partial(_speed, train, options.iterations * batch_steps * seeds)
+    run = functools.partial(speed_of, train, options.iterations * batch_steps * seeds)
     name = f"ppo+gasil, {variant}"
     return Row(env_name, name, seeds * num_envs, run, compile_seconds)
 
@@ -372,7 +372,7 @@ def peers_table(env_name: str, options: Options) -> Iterator[list[Row]]:
             env_name, seeds, options.iterations
         ):
             name = f"{name}, {seeds} seed{'s' * (seeds > 1)}"
-            run = functools.partial(_speed, train, steps)
+            run = functools.partial(speed_of, train, steps)
             rows.append(Row(env_name, name, 32 * seeds, run, seconds, returns=returns))
         yield rows
 

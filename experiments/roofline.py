@@ -13,13 +13,11 @@ To measure one CPU core, start it with ``taskset -c 0``.
 import dataclasses
 import functools
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.extend import core
 
 from experiments import benchmark, measured
@@ -89,10 +87,7 @@ def _evaluate(equation: Any, operands: list[Any]) -> tuple[int, list[Any]]:
         return evaluate(params["branches"][int(index)], *operands)
     for inner in ("jaxpr", "call_jaxpr", "call"):
         if inner in params:
-            called = params[inner]
-            if isinstance(called, core.Jaxpr):
-                called = core.ClosedJaxpr(called, ())
-            return evaluate(called, *operands)
+            return evaluate(params[inner], *operands)
     results = equation.primitive.bind(*operands, **params)
     results = list(results) if equation.primitive.multiple_results else [results]
     return _operations(name, params, operands, results), results
@@ -143,17 +138,29 @@ def _while(params: dict[str, Any], operands: list[Any]) -> tuple[int, list[Any]]
         total += count
 
 
-def _peak(repeats: int) -> float:
-    """Return the operations per second of a product of two matrices."""
+def product_row(env_name: str) -> benchmark.Row:
+    """Floating-point operations per second of a product of two matrices."""
     x = jnp.ones((_MATRIX, _MATRIX))
     product = jax.jit(jnp.matmul)
     jax.block_until_ready(product(x, x))
-    seconds = []
-    for _ in range(repeats):
-        began = time.perf_counter()
-        jax.block_until_ready(product(x, x))
-        seconds.append(time.perf_counter() - began)
-    return 2 * _MATRIX**3 / float(np.median(seconds))
+    call = functools.partial(product, x, x)
+    run = functools.partial(benchmark.speed_of, call, 2 * _MATRIX**3)
+    return benchmark.Row(env_name, "operations of a matrix product", 1, run)
+
+
+def physics_row(env_name: str, num_envs: int) -> tuple[benchmark.Row, float, float]:
+    """Floating-point operations per second of physics.
+
+    Returns:
+      The row, the operations of a step of one environment, and the bytes of its state
+      that are read and written.
+    """
+    row = benchmark.physics_row(env_name, "ours", num_envs)
+    step = functools.partial(benchmark.random_step, benchmark.make(env_name, "ours"))
+    count = count_operations(step, row.states, jax.random.key(0)) / num_envs
+    size = 2 * sum(x.nbytes for x in jax.tree.leaves(row.states)) / num_envs
+    name, run = "operations of physics", lambda: count * row.run()
+    return dataclasses.replace(row, name=name, run=run), count, size
 
 
 def run(options: Options) -> None:
@@ -167,19 +174,14 @@ def run(options: Options) -> None:
     jax.config.update("jax_default_matmul_precision", "highest")
     rows = []
     for name in options.envs:
-        env, count = benchmark.make(name, "ours"), options.num_envs
-        key = jax.random.key(0)
-        states = jax.jit(jax.vmap(env.reset))(jax.random.split(key, count))
-        states = jax.jit(functools.partial(benchmark.random_steps, env))(states, key)
-        step = functools.partial(benchmark.random_step, env)
-        operations = count_operations(step, states, key) / count
-        size = 2 * sum(x.nbytes for x in jax.tree.leaves(states)) / count
-        timed = benchmark.physics_row(name, "ours", count)
-        steps = float(np.median([timed.run() for _ in range(options.repeats)]))
-        peak, speed = _peak(options.repeats), steps * operations
-        cells = (operations / 1e3, operations / size, steps / 1e3, speed / 1e9)
-        rows.append([name, *(f"{x:,.1f}" for x in (*cells, peak / 1e9))])
-        rows[-1].append(f"{speed / peak:.2f}")
+        product = product_row(name)
+        physics, count, size = physics_row(name, options.num_envs)
+        # In turn, so that the share compares speeds from the same minutes.
+        benchmark.measure([product, physics], options.repeats)
+        cells = (count / 1e3, count / size, physics.speed / count / 1e3)
+        speeds = (physics.speed / 1e9, product.speed / 1e9)
+        rows.append([name, *(f"{x:,.1f}" for x in (*cells, *speeds))])
+        rows[-1].append(f"{physics.speed / product.speed:.2f}")
         print(", ".join(rows[-1]), flush=True)
     if options.page:
         head = ["", "thousand operations a step", "operations a byte of state"]
