@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +19,7 @@ from gasil_envs.physics import (
     dynamics,
     native,
     newton,
+    newton_fused,
     newton_kernel,
 )
 from gasil_envs.physics.interface import PhysicsState
@@ -108,6 +110,10 @@ def problems(batch, size, groups, seed=0):
     return arrays, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), problem)
 
 
+def batch_last(problem):
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), problem)
+
+
 def plain_newton(inertia, force, jacobian, reference, weight):
     """Newton's method in float64 with backtracking, until nothing changes."""
     distance = lambda q: np.minimum(jacobian @ q - reference, 0.0)
@@ -170,10 +176,8 @@ def test_a_problem_alone_equals_itself_in_nested_batches(batch):
 
 def test_elimination_against_numpy():
     arrays, problem = problems((7,), 23, [])
-    batch_last = lambda x: jnp.moveaxis(x, 0, -1)
-    result = jax.jit(newton.eliminate)(
-        batch_last(problem.inertia), batch_last(problem.force)
-    )
+    problem = batch_last(problem)
+    result = jax.jit(newton.eliminate)(problem.inertia, problem.force)
     expected = np.linalg.solve(arrays["inertia"], arrays["force"][..., None])[..., 0]
     np.testing.assert_allclose(result.T, expected, rtol=1e-3, atol=1e-3)
 
@@ -188,16 +192,52 @@ def test_the_gpu_s_elimination_solves_the_same(size):
     np.testing.assert_allclose(kernel(*pair), expected, rtol=1e-4, atol=1e-4)
 
 
-def test_the_gpu_s_elimination_can_be_lowered_for_one():
+@pytest.mark.parametrize("groups", [[], [(2, SIMPLE), (5, FLAT)], [(3, PYRAMID)]])
+def test_the_kernel_of_a_gpu_solves_the_same(groups):
+    """Its operations are run by XLA, in two blocks, the second of which is padded."""
+    _, problem = problems((40,), 5, groups)
+    contacts = []
+    for group in problem.contacts:
+        # The last contact is in play nowhere, and the one before it here and there.
+        in_play = np.ones((40, len(group.weight[0]), 1))
+        in_play[:, -1] = in_play[::2, -2] = 0.0
+        contacts.append(group.replace(weight=group.weight * in_play))
+    problem = batch_last(problem.replace(contacts=tuple(contacts)))
+    expected = jax.jit(functools.partial(newton.solve_many, 6, 4))(problem)
+    fused = functools.partial(newton_fused.solve_many, 6, 4, interpret=True)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4),
+        newton.Solution(*jax.jit(fused)(problem)),
+        expected,
+    )
+
+
+@pytest.mark.parametrize(
+    ("capability", "expected"), [("9.0", True), ("7.5", False), ("gfx90a", False)]
+)
+def test_old_and_other_gpus_have_no_triton(monkeypatch, capability, expected):
+    device = SimpleNamespace(compute_capability=capability)
+    monkeypatch.setattr(jax, "devices", lambda: [device])
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert batching.has_triton() is expected
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_the_kernels_of_a_gpu_can_be_lowered_for_one(whole):
+    _, problem = problems((20,), 9, [(3, SIMPLE), (8, PYRAMID)])
+    problem = batch_last(problem)
+
+    def solve(problem):
+        if whole:
+            return newton_fused.solve_many(4, 4, problem)
+        return newton_kernel.solve_linear(problem.inertia, problem.force)
+
     fields = {"device_kind": "NVIDIA H100", "num_cores": None, "platform": "gpu"}
     names = inspect.signature(AbstractDevice).parameters  # Each jax has others.
     device = AbstractDevice(**{name: fields[name] for name in names})
     mesh = AbstractMesh((), (), abstract_device=device)
     with jax.sharding.use_abstract_mesh(mesh):
-        traced = jax.jit(newton_kernel.solve_linear).trace(
-            jnp.ones((23, 23, 20)), jnp.ones((23, 20))
-        )
-        lowered = traced.lower(lowering_platforms=("cuda",))
+        lowered = jax.jit(solve).trace(problem).lower(lowering_platforms=("cuda",))
     assert "triton" in lowered.as_text()
 
 

@@ -5,6 +5,7 @@ enough to fill vector units, so it is the last, the one that is contiguous in me
 """
 
 import os
+import re
 from collections.abc import Callable, Iterable
 from typing import Any, cast
 
@@ -37,6 +38,12 @@ def on_cpu() -> bool:
 def on_gpu() -> bool:
     """Whether programs are compiled for a GPU."""
     return jax.default_backend() == "gpu"
+
+
+def has_triton() -> bool:
+    """Whether programs are compiled for a GPU that Triton supports: Ampere or newer."""
+    name = str(getattr(jax.devices()[0], "compute_capability", ""))
+    return on_gpu() and bool(re.fullmatch(r"\d+\.\d", name)) and float(name) >= 8.0
 
 
 _identity = jax.jit(lambda tree: tree)

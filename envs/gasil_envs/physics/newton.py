@@ -31,8 +31,16 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs.physics import newton_kernel
-from gasil_envs.physics.batching import add, fold, materialize, on_cpu, on_gpu, total
+from gasil_envs.physics import newton_fused, newton_kernel
+from gasil_envs.physics.batching import (
+    add,
+    fold,
+    has_triton,
+    materialize,
+    on_cpu,
+    on_gpu,
+    total,
+)
 
 # Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
 # same number of edges: C contacts, T tangents, E edges. The classes give the shapes of
@@ -111,8 +119,9 @@ def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
 # they are up to 4 times as fast, but their compile time grows with the entries, on a
 # GPU more steeply (ant: 89 s instead of MJX's 20).
 _MOST_ENTRIES_SPELLED_OUT = {"cpu": 1100, "gpu": 300}
-# A GPU's compiler unrolls the loops of systems up to this size in acceptable time.
-_MOST_DEGREES_UNROLLED = 10
+# On an H200 a solve of 9 unknowns in one kernel takes half of the time or less. More
+# than 11 unknowns are eliminated in a kernel, and the rest of a solve is not in one.
+_MOST_UNKNOWNS_OF_ONE_KERNEL = min(newton_kernel.SIZES) - 1
 
 
 def _spells_out(matrix: jax.Array) -> bool:
@@ -292,7 +301,7 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
     moves the first row to the end, so that all steps are the same. On a GPU larger
     matrices are eliminated in one kernel.
     """
-    if on_gpu() and matrix.shape[0] in newton_kernel.SIZES:
+    if matrix.shape[0] in newton_kernel.SIZES and has_triton():
         return newton_kernel.solve_linear(matrix, right)
     table = jnp.concatenate([matrix, right[:, None]], axis=1)
     for _ in range(matrix.shape[0]):
@@ -351,6 +360,8 @@ def solve_many(
       The solutions, with the batch as the last axis of every array.
     """
     inertia, force = problem.inertia, problem.force
+    if len(force) <= _MOST_UNKNOWNS_OF_ONE_KERNEL and has_triton():
+        return Solution(*newton_fused.solve_many(iterations, line_search, problem))
     rows = _Rows(problem, for_speed)
     spell_out = for_speed and _spells_out(inertia)
     weight = rows.weight
@@ -427,8 +438,7 @@ def solve_many(
         return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
 
     begin = (start, jaref_at(start))
-    unroll = force.shape[0] <= _MOST_DEGREES_UNROLLED
-    qacc, jaref = _repeat(iterate, begin, least=2, most=iterations, unroll=unroll)
+    qacc, jaref = _repeat(iterate, begin, least=2, most=iterations, unroll=False)
     push = each(lambda d, w: w * jnp.maximum(-d, 0.0), jaref, weight)
     return Solution(
         qacc=qacc,
