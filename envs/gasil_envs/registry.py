@@ -143,7 +143,8 @@ def _is_module(name: str) -> bool:
 
 def _build_of_others(name: str) -> Env:
     family, bare, *_ = name.split(":")
-    _refuse_unknown("env", f"{family}:{bare}", worlds.names(family))
+    whole = name if family in worlds.WITHOUT_PARTS else f"{family}:{bare}"
+    _refuse_unknown("env", whole, worlds.names(family))
     return worlds.build(name)
 
 

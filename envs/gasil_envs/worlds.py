@@ -28,6 +28,8 @@ FAMILIES: Mapping[str, tuple[str, str]] = {
     "playground": ("gasil_envs.of_playground", "playground"),
     "sparse": ("gasil_envs.mazes", "gasil_jax"),  # This package's own.
 }
+#: Families whose observations are arrays already, so that no name ends with a part.
+WITHOUT_PARTS = ("brax", "sparse")
 
 
 def forms() -> tuple[str, ...]:

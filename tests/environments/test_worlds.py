@@ -186,6 +186,7 @@ def test_a_part_is_chosen_and_every_dtype_becomes_float32(space, monkeypatch):
     [
         ("gymnax:cartpole", "did you mean 'gymnax:CartPole-v1'"),
         ("gymnax:Breakout", "did you mean 'gymnax:Breakout-MinAtar'"),
+        ("brax:fast:x", "env 'brax:fast:x' is unknown: it must be one of brax:ant"),
         ("gymnax:", "env 'gymnax:' is unknown: it must be one of gymnax:CartPole-v1"),
         ("gymnx:CartPole-v1", "unknown family: did you mean 'gymnax:CartPole-v1'"),
         ("cartpole", "unknown: it must be one of .*brax:NAME, gymnax:NAME, navix:NAME"),
