@@ -117,7 +117,8 @@ def check_name(name: str) -> None:
         parse_dataset_id(name)
     except (ValueError, TypeError):
         raise InputError(
-            f"name is {name!r}: it must be like hopper/good-v0, with a version"
+            f"name is {name!r}: it must be like hopper/good-v0, with a version and "
+            "at least two characters before a slash"
         ) from None
     if get_dataset_path(name).exists():
         raise InputError(f"name is {name!r}, which exists: name a new data set")

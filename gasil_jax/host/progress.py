@@ -152,8 +152,6 @@ class Progress:
             self._return = f"{interquartile_mean(np.array(each)):.1f}"
         now = time.monotonic()
         speed = (steps - self._steps_before) / max(now - self._training_since, 1e-9)
-        # The last iteration may go beyond the total.
-        steps = min(steps, self._total)
         left = datetime.timedelta(seconds=math.ceil((self._total - steps) / speed))
         status = (
             f"return {self._return or '(none ended)'}, {speed:,.0f} steps/s, "

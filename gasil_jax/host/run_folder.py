@@ -285,8 +285,8 @@ def _why_no_run(folder: pathlib.Path) -> str:
     if (folder / FIT).is_file():
         return (
             f", a folder of gasil_jax.fit that the options of a run can't describe "
-            f"({read_fit(folder)['why_no_run']}): use it with gasil_jax.plot or "
-            "gasil_jax.load_policy"
+            f"({read_fit(folder)['why_no_run']}): use it with gasil_jax.plot, "
+            "gasil_jax.load_policy or gasil_jax.fit"
         )
     return f", which has no {CONFIG}: it must be the folder of a run"
 
@@ -363,10 +363,13 @@ def differences(
       grows: the fields that may be larger now.
 
     Returns:
-      "NAME was A, is B" for each of these fields.
+      "NAME was A, is B" for each of these fields, or for the agent alone, whose
+      settings another agent does not have.
     """
-    changes, requested = [], flat(now)
-    for name, old in flat(before).items():
+    changes, earlier, requested = [], flat(before), flat(now)
+    if earlier.get("agent") != requested.get("agent"):
+        earlier = {"agent": earlier.get("agent")}
+    for name, old in earlier.items():
         new = requested.get(name)
         grown = name in grows and new is not None and new >= old
         if old != new and not grown and name not in _MAY_DIFFER:

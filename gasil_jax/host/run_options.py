@@ -293,14 +293,14 @@ def resumed_run(arguments: Sequence[str] | None) -> dict[str, Any] | None:
 
     Raises:
       InputError: if --resume is given without --out, if it is given without --env and
-        the folder holds no run, or if the run's config.json is damaged.
+        the folder holds no run that options describe, or if config.json is damaged.
     """
     if "--resume" not in _words(arguments):
         return None
     given = _first_arguments(arguments)
     if given.out is None:
         raise InputError("resume needs --out and the folder of the run to continue")
-    if run_folder.has_run(given.out):
+    if run_folder.has_run(given.out) or (given.out / run_folder.FIT).is_file():
         return run_folder.read(given.out)
     if given.env is None:
         raise InputError(

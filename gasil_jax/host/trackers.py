@@ -138,11 +138,13 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise `ValueError` for a tracker that is unknown or not installed.
+    """Raise `ValueError` for a tracker that is unknown, not installed or named twice.
 
     A note says if Weights & Biases will be offline.
     """
     for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"log has {name!r} twice: name it once")
         if name not in TRACKERS:
             allowed = ", ".join(TRACKERS)
             raise ValueError(f"log is {name!r}: it must be one of {allowed}")

@@ -116,7 +116,8 @@ def train(
     """
     schedule = CheckpointSchedule(options.checkpoint_every, options.keep_checkpoints)
     num_members = sum(len(job.runs) for job in jobs)
-    total_steps = options.algorithm.config.total_steps * num_members
+    configs = [job.algorithm.config for job in jobs for _ in job.runs]
+    total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
     kind = "seeds" if num_members == options.seeds else "members"
     steps_before = 0
     with (

@@ -123,6 +123,7 @@ def test_bad_input_is_one_line_and_status_2(filled, untrained_point_mass, capsys
         ([str(out), "--name", "there-v0"], "'there-v0', which exists"),
         ([str(out), "--name", "../there-v0"], "must be like hopper/good-v0"),
         ([str(out), "--name", "there"], "must be like hopper/good-v0"),
+        ([str(out), "--name", "a/there-v0"], "two characters before a slash"),
         ([str(out), "--name", "new-v0", "--seed", "7"], "seed is 7: the run has 0"),
         ([str(untrained_point_mass), "--name", "new-v0"], "no whole episode"),
         ([str(out.parent), "--name", "new-v0"], "must be the folder of a run"),

@@ -297,3 +297,12 @@ def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypat
     (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(own, **{"algorithm": PPO, **changes})
+
+
+def test_a_command_says_why_it_can_t_continue_what_no_options_describe(
+    tmp_path, capsys
+):
+    described = {"why_no_run": "x", "env": "Own", "agent": "ppo", "seeds": [0]}
+    (tmp_path / "fit.json").write_text(json.dumps(described))
+    assert run.main(["--resume", "--out", str(tmp_path)]) == 2
+    assert "a folder of gasil_jax.fit that" in capsys.readouterr().err

@@ -61,12 +61,12 @@ def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
 
 def test_steps_are_of_a_seed(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", -1.0)
-    with progress.Progress("hopper ppo", 10 * 30_000, 10) as shown:
+    with progress.Progress("hopper ppo", 10 * 30_720, 10) as shown:
         shown.update(10 * 15_360, np.full((10, 2), np.nan))
         shown.update(10 * 30_720, np.full((10, 2), 4.0))
     half, end = capsys.readouterr().err.splitlines()
-    assert half.startswith("hopper ppo: 15,360/30,000 steps x 10 seeds, return (none")
-    assert end.startswith("hopper ppo: 30,000/30,000 steps x 10 seeds, return 4.0, ")
+    assert half.startswith("hopper ppo: 15,360/30,720 steps x 10 seeds, return (none")
+    assert end.startswith("hopper ppo: 30,720/30,720 steps x 10 seeds, return 4.0, ")
 
 
 def test_at_80_columns_only_the_bar_gives_way(monkeypatch):

@@ -526,3 +526,12 @@ def test_an_agent_continues_bit_for_bit(agent, tmp_path):
     if "buffer_steps" in members.algorithm.settings:
         assert (metrics["good_steps"] == 100).all()
     assert len(leaves) > 20
+
+
+def test_of_another_agent_the_agent_is_the_only_difference():
+    before = {"agent": "ppo+gasil", "buffer_steps": 1000, "gamma": 0.9}
+    now = {"agent": "ppo", "gamma": 0.99}
+    assert run_folder.differences(before, now) == ["agent was ppo+gasil, is ppo"]
+    assert run_folder.differences(now, now | {"gamma": 1.0}) == [
+        "gamma was 0.99, is 1.0"
+    ]

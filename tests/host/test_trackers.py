@@ -209,6 +209,8 @@ def test_a_program_of_a_sweep_is_told_with_its_own_values(tmp_path, monkeypatch)
 def test_bad_names_and_missing_packages_are_refused(monkeypatch, capsys):
     assert run.main([*SMALL, "--log", "tensorbord"]) == 2
     assert "log is 'tensorbord': it must be one of tens" in capsys.readouterr().err
+    assert run.main([*SMALL, "--log", "tensorboard", "tensorboard"]) == 2
+    assert "log has 'tensorboard' twice: name it once" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert run.main([*SMALL, "--log", "wandb"]) == 2
     assert 'pip install "gasil_jax[wandb]"' in capsys.readouterr().err
