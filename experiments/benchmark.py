@@ -307,10 +307,11 @@ def baseline_row(
         pipes, processes = [], []
         for _ in range(runs):
             mine, theirs = context.Pipe()
-            arguments = (task, num_envs, spread, threads, theirs)
-            # A daemon may not start processes.
             process = context.Process(
-                target=_train_baseline, args=arguments, daemon=not spread
+                target=_train_baseline,
+                args=(task, num_envs, spread),
+                kwargs={"threads": threads, "pipe": theirs},
+                daemon=not spread,  # A daemon may not start processes.
             )
             process.start()
             processes.append(process)
