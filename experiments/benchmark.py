@@ -108,6 +108,13 @@ class Row:
     speed: float = 0.0
 
 
+def start_jax(num_devices: int) -> None:
+    """Choose CPU devices and precision as commands do; call it before JAX starts."""
+    prepare(Settings(physics="mujoco"), num_devices)
+    jax.config.update("jax_num_cpu_devices", num_devices)
+    jax.config.update("jax_default_matmul_precision", "highest")
+
+
 def make(env_name: str, variant: str) -> Any:
     """Return a task whose ended episodes begin anew, built in one of the ways."""
     return wrappers.AutoReset(gasil_envs.make(env_name, **VARIANTS[variant]))
@@ -442,10 +449,7 @@ def run(options: Options) -> None:
         peers.check()
     if options.page:
         measured.find("benchmark", options)
-    count = options.devices or available_cores()
-    prepare(Settings(physics="mujoco"), count)
-    jax.config.update("jax_num_cpu_devices", count)
-    jax.config.update("jax_default_matmul_precision", "highest")
+    start_jax(options.devices or available_cores())
     print(measured.machine())
     versions = metrics_files.versions()
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))

@@ -24,7 +24,6 @@ from experiments import benchmark, measured
 from experiments.search import TASKS
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line
-from gasil_jax.host.environments import Settings, prepare
 
 #: Primitives that compute one number for each number of their result.
 _BY_NUMBER = frozenset(
@@ -171,9 +170,7 @@ def run(options: Options) -> None:
     command_line.check_minimum(options, num_envs=1, repeats=1)
     if options.page:
         measured.find("roofline", options)
-    prepare(Settings(), 1)  # Before JAX starts: it keeps the loops of physics.
-    jax.config.update("jax_num_cpu_devices", 1)
-    jax.config.update("jax_default_matmul_precision", "highest")
+    benchmark.start_jax(1)
     rows = []
     for name in options.envs:
         product = product_row(name)

@@ -68,6 +68,12 @@ def add(terms: Iterable[jax.Array]) -> jax.Array:
     return cast(jax.Array, sum(terms))
 
 
+def sum_signed(values: Iterable[jax.Array], signs: Iterable[int]) -> jax.Array:
+    """Sum arrays with constant signs -1, 0 or 1, which are not all 0."""
+    pairs = zip(values, signs, strict=True)
+    return add([value if sign > 0 else -value for value, sign in pairs if sign])
+
+
 def total(x: jax.Array, axis: int = 0) -> jax.Array:
     """Sum over an axis other than the last, spelled out.
 

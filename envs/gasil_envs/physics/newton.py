@@ -39,6 +39,7 @@ from gasil_envs.physics.batching import (
     materialize,
     on_cpu,
     on_gpu,
+    sum_signed,
     total,
 )
 
@@ -249,7 +250,7 @@ class _Rows:
             along.append(add(of_edges))
             for t in range(tangents):
                 signs = [signs[t] for signs in edges]
-                along.append(_sum_signed(of_edges, signs))
+                along.append(sum_signed(of_edges, signs))
         joined = materialize(jnp.concatenate(along))
         return result + _matvec_transposed(self._basis, joined, self._spell_out)
 
@@ -271,7 +272,7 @@ class _Rows:
                 for j, part in enumerate(basis):
                     products = [s[i] * s[j] for s in signs]
                     if any(products):
-                        terms.append(_sum_signed(of_edges, products)[:, None] * part)
+                        terms.append(sum_signed(of_edges, products)[:, None] * part)
                 weighted.append(sum(terms))
         weighted = materialize(jnp.concatenate(weighted))
         return result + _symmetric_product(weighted, self._basis, self._spell_out)
@@ -284,14 +285,6 @@ def _add_signed(
         if sign:
             first = first + other if sign > 0 else first - other
     return first
-
-
-def _sum_signed(values: jax.Array, signs: list[int]) -> jax.Array:
-    """Sum over the leading axis with constant signs -1, 0 or 1."""
-    chosen = [
-        value if sign > 0 else -value for value, sign in zip(values, signs) if sign
-    ]
-    return sum(chosen)
 
 
 def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:

@@ -17,6 +17,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from gasil_envs.physics.batching import sum_signed
+
 # Pallas takes long to import, and only a GPU needs it: functions import it themselves.
 
 # Shape letters are those of `newton`. The arrays in the classes are references to
@@ -114,12 +116,6 @@ def _sum(count: Any, most: int, term: Callable[[Any], Any]) -> Any:
     return _each((count + at_once - 1) // at_once, add_terms, zeros)
 
 
-def _sum_signed(values: Sequence[jax.Array], signs: Sequence[int]) -> jax.Array:
-    """Sum with constant signs -1, 0 or 1."""
-    chosen = [x if sign > 0 else -x for x, sign in zip(values, signs) if sign]
-    return functools.reduce(jnp.add, chosen) if chosen else jnp.zeros_like(values[0])
-
-
 def _factorize(entry: Callable[[Any, Any], jax.Array], factor: Any) -> None:
     """Store the factor of a matrix; `entry` returns its entry at i and j <= i."""
     size = factor.shape[0]
@@ -177,6 +173,10 @@ class _Block:
             carry = _each(count, functools.partial(function, group), carry)
         return carry
 
+    def _sum_over_joints(self, term: Callable[[Any], Any]) -> Any:
+        """Sum the trees of arrays term(v) over the degrees of freedom."""
+        return _sum(self._size, self._size, term)
+
     def _sum_over_contacts(
         self, term: Callable[[_Group, Any, int], jax.Array], total: jax.Array
     ) -> jax.Array:
@@ -198,8 +198,8 @@ class _Block:
             rows = [group.basis[c, a, v] for a in range(group.basis.shape[1])]
             return [[row * vector[v] for row in rows] for vector in vectors]
 
-        along = _sum(self._size, self._size, term)
-        return [[_sum_signed(x, signs) for signs in group.edges] for x in along]
+        along = self._sum_over_joints(term)
+        return [[sum_signed(x, signs) for signs in group.edges] for x in along]
 
     def _of_limit(self, v: Any) -> jax.Array:
         """J qacc - aref of a joint's limit."""
@@ -232,14 +232,12 @@ class _Block:
             return costs
 
         def away_cost(i: Any, cost: jax.Array) -> jax.Array:
-            memory.residual[i] = _sum(
-                self._size,
-                self._size,
-                lambda j: inputs.inertia[i, j] * (warmstart[j] - smooth[j]),
+            memory.residual[i] = self._sum_over_joints(
+                lambda j: inputs.inertia[i, j] * (warmstart[j] - smooth[j])
             )
             return cost + (warmstart[i] - smooth[i]) * memory.residual[i]
 
-        costs = _sum(self._size, self._size, limit_costs)
+        costs = self._sum_over_joints(limit_costs)
         of_warmstart, of_smooth = self._each_contact(contact_costs, costs)
         better = _each(self._size, away_cost, of_warmstart) < of_smooth
 
@@ -263,13 +261,13 @@ class _Block:
         ]
         forces = [w * d for w, d in zip(active, distance)]
         for a, signs in enumerate(group.signs):
-            group.push[c, a] = _sum_signed(forces, signs)
+            group.push[c, a] = sum_signed(forces, signs)
 
         def row(v: Any, _: None) -> None:
             basis = [group.basis[c, a, v] for a in range(len(group.signs))]
-            on_edges = [w * _sum_signed(basis, x) for w, x in zip(active, group.edges)]
+            on_edges = [w * sum_signed(basis, x) for w, x in zip(active, group.edges)]
             for a, signs in enumerate(group.signs):
-                group.weighted[c, a, v] = _sum_signed(on_edges, signs)
+                group.weighted[c, a, v] = sum_signed(on_edges, signs)
 
         _each(self._size, row)
 
@@ -335,15 +333,12 @@ class _Block:
         inputs, memory = self._inputs, self._memory
 
         def multiply(i: Any, sums: Any) -> Any:
-            memory.product[i] = _sum(
-                self._size,
-                self._size,
-                lambda j: inputs.inertia[i, j] * memory.direction[j],
+            memory.product[i] = self._sum_over_joints(
+                lambda j: inputs.inertia[i, j] * memory.direction[j]
             )
-            along = memory.direction[i]
-            return sums[0] + along * memory.residual[i], sums[
-                1
-            ] + along * memory.product[i]
+            (linear, quadratic), along = sums, memory.direction[i]
+            linear = linear + along * memory.residual[i]
+            return linear, quadratic + along * memory.product[i]
 
         none = jnp.zeros_like(memory.residual[0])
         linear, quadratic = _each(self._size, multiply, (none, none))
@@ -368,7 +363,7 @@ class _Block:
                     sums = jax.tree.map(jnp.add, sums, terms)
                 return sums
 
-            first, second = _sum(self._size, self._size, of_limit)
+            first, second = self._sum_over_joints(of_limit)
             sums = first + linear + step * quadratic, second + quadratic
             first, second = self._each_contact(add_contact, sums)
             low = jnp.where(first < 0.0, step, low)
@@ -391,7 +386,7 @@ class _Block:
                 values.append(jnp.where(weight > 0.0, force, 0.0))
                 group.jaref[c, e] = values[-1]
             for a, signs in enumerate(group.signs):
-                group.push[c, a] = -_sum_signed(values, signs)
+                group.push[c, a] = -sum_signed(values, signs)
 
         for group in self._groups:
             _each(group.basis.shape[0], functools.partial(forces, group))
