@@ -21,9 +21,9 @@ from mujoco import mjx
 from gasil_envs.physics import collision, newton, tree
 from gasil_envs.physics.batching import add, fold, materialize, take, total
 
-_PYRAMID = ((1, 0), (-1, 0), (0, 1), (0, -1))
+_PYRAMID = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1))
 # The edges normal +- tangent, and the normal itself with twice the weight.
-_FLAT_PYRAMID = ((1,), (-1,), (0,))
+_FLAT_PYRAMID = ((1, 1), (1, -1), (1, 0))
 
 
 class Impedance(struct.PyTreeNode):
@@ -214,7 +214,7 @@ def layout(model: mujoco.MjModel) -> Layout:
     pyramid = _PYRAMID if motion_normal is None else _FLAT_PYRAMID
     groups = [
         _group(model, contact, dim, edges=edges, motion_normal=motion_normal)
-        for dim, edges in ((1, ((),)), (3, pyramid))
+        for dim, edges in ((1, ((1,),)), (3, pyramid))
     ]
     return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
 
@@ -299,7 +299,7 @@ def _group(
         impedance=Impedance.of(model, at(contact.solref, 2), at(contact.solimp, 5)),
     )
     pairs = collision.pairs(
-        model, geom[index], len(edges[0]), motion_normal=motion_normal
+        model, geom[index], len(edges[0]) - 1, motion_normal=motion_normal
     )
     return Group(edges, pairs, constants)
 
@@ -357,16 +357,17 @@ def contact_rows(
     scale = jnp.where(is_normal, 1.0, constants.friction[:, None, None])
     along = materialize(along * scale)  # (C, A, V, B)
     speed = materialize(total(along * qvel, 2))
-    signs = np.array([(1, *signs) for signs in edges], np.float32)[..., None]
+    signs = np.array(edges, np.float32)[..., None]
     speed = total(speed[:, None] * signs, 2)  # (C, edges, B)
     impedance = constants.impedance(gap)
     pull = constants.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
     weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)
     # A normal that stands for two edges weighs as both.
-    count = [2.0 if edges == _FLAT_PYRAMID and not any(s) else 1.0 for s in edges]
+    count = [
+        2.0 if edges == _FLAT_PYRAMID and signs == (1, 0) else 1.0 for signs in edges
+    ]
     return newton.ContactRows(
-        normal=along[:, 0],
-        tangents=along[:, 1:],
+        basis=along,
         reference=-constants.impedance.damping[:, None] * speed - pull[:, None],
         weight=weight[:, None] * np.array(count, np.float32)[:, None],
         edges=edges,
@@ -390,11 +391,10 @@ def body_forces(
       edge_forces: (C, E, B), force along each edge.
     """
     (_, position, axes), constants = contacts
-    signs = np.array(edges, np.float32).reshape(len(edges), -1)
     force = total(edge_forces, 1)[:, None] * axes[:, 0]
-    for t in range(signs.shape[1]):
-        along = total(edge_forces * signs[:, t, None], 1) * constants.friction
-        force = force + along[:, None] * axes[:, t + 1]
+    for t, signs in enumerate(np.array(edges, np.float32).T[1:], 1):
+        along = total(edge_forces * signs[:, None], 1) * constants.friction
+        force = force + along[:, None] * axes[:, t]
     wrench = jnp.concatenate([tree.cross(position - com, force), force], axis=1)
     wrench = materialize(wrench)
     return total(constants.body[:, :, None] * wrench[:, None])

@@ -2,7 +2,7 @@
 
 The stages and integrators are those of C MuJoCo (``engine_forward.c``). Smooth dynamics
 are in `tree`, contacts in `collision`, constraint rows in `constraints`, and every
-linear system is solved in `newton`. Every array has the batch as its last axis.
+linear system is solved in `solver`. Every array has the batch as its last axis.
 
 Shape letters: N bodies, V degrees of freedom, B batch.
 """
@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics import constraints, newton, tree
+from gasil_envs.physics import constraints, newton, solver, tree
 from gasil_envs.physics.batching import materialize, on_cpu, total
 from gasil_envs.physics.interface import Fields, PhysicsState
 
@@ -155,7 +155,7 @@ def forward(
         problem = newton.Problem(
             smooth.inertia, force, state.qacc_warmstart, limits, tuple(rows)
         )
-        solution = newton.solve_many(
+        solution = solver.solve_many(
             dynamics.iterations, 4, problem, for_speed=for_speed
         )
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
@@ -262,7 +262,7 @@ def _euler(
     qacc = now.qacc
     if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
         damping = np.diag(dt * model.dof_damping).astype(np.float32)[..., None]
-        qacc = newton.eliminate(now.inertia + damping, now.force)
+        qacc = solver.eliminate(now.inertia + damping, now.force)
     qvel = state.qvel + dt * qacc
     qpos = _integrate_positions(model, state.qpos, qvel)
     return PhysicsState(qpos, qvel, now.qacc), now.fields

@@ -1,4 +1,4 @@
-"""Newton's method for small dense constraint problems, many at once.
+"""Newton's method for small dense constraint problems.
 
 MuJoCo's constrained acceleration minimizes, over qacc,
 
@@ -7,9 +7,7 @@ MuJoCo's constrained acceleration minimizes, over qacc,
 
 (MuJoCo documentation, "Computation", pyramidal cones: every row is one-sided). The
 cost is convex and piecewise quadratic, so Newton's method with an exact line search
-ends as soon as it has found the active rows. The number of iterations is fixed, and
-every array has the batch as its last axis: with 5 to 30 degrees of freedom the batch
-is the only axis that is long enough to fill vector units.
+ends as soon as it has found the active rows.
 
 Rows are not stored one by one. A joint's limit is one entry of a diagonal. The rows
 of a contact are the edges of its friction pyramid, normal +- friction * tangent: with
@@ -19,48 +17,37 @@ E the small constant matrix that makes edges of normal and tangents, J = E B, an
 
 where B has 2 or 3 rows for each contact and J has 4.
 
+The method is written once, for a `System`: `newton_batch` has many problems in arrays
+with the batch as the last axis, `newton_kernel` one problem in a thread block of a GPU.
+
 It is not reverse-mode differentiable. Neither is MJX's own solver, because its loop is
 dynamic.
 """
 
-import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs.physics import newton_fused, newton_kernel
-from gasil_envs.physics.batching import (
-    add,
-    fold,
-    has_triton,
-    materialize,
-    on_cpu,
-    on_gpu,
-    sum_signed,
-    total,
-)
-
-# Shape letters: V degrees of freedom, B batch; and for a group of contacts with the
-# same number of edges: C contacts, T tangents, E edges. The classes give the shapes of
-# one problem; in a batch every array has B as a further, last axis.
+# Shape letters: V degrees of freedom; and for a group of contacts with the same number
+# of edges: C contacts, A axes (the normal and the tangents), E edges. The classes give
+# the shapes of one problem; in a batch every array has B as a further, last axis.
 
 
 class ContactRows(struct.PyTreeNode):
     """The rows of a group of contacts with the same number of edges; float32.
 
     Attributes:
-      normal: (C, V), Jacobian of the normal; zero where out of play.
-      tangents: (C, T, V), Jacobian of the tangents, times the friction.
+      basis: (C, A, V), Jacobians of the normal and of the tangents times the friction;
+        zero where out of play.
       reference: (C, E), aref of the edges.
       weight: (C, E), D of the edges; 0 where out of play and above 0 elsewhere.
-      edges: E rows of T signs: an edge is normal + signs @ tangents.
+      edges: E rows of A signs: an edge is their product with the axes.
     """
 
-    normal: jax.Array
-    tangents: jax.Array
+    basis: jax.Array
     reference: jax.Array
     weight: jax.Array
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
@@ -112,329 +99,138 @@ class Solution(struct.PyTreeNode):
     constraint_force: jax.Array
 
 
-def _dot(a: jax.Array, b: jax.Array) -> jax.Array:
-    return total(a * b)
+class System(Protocol):
+    """Problems in the arrays in which a device solves them.
 
+    A vector (V numbers a problem) and rows (a number for each row of J) are trees of
+    arrays, which only a system looks into.
 
-# Sums over matrices with more entries than this are left to reductions. Spelled out
-# they are up to 4 times as fast, but their compile time grows with the entries, on a
-# GPU more steeply (ant: 89 s instead of MJX's 20).
-_MOST_ENTRIES_SPELLED_OUT = {"cpu": 1100, "gpu": 300}
-# On an H200 a solve of 9 unknowns in one kernel takes half of the time or less. More
-# than 11 unknowns are eliminated in a kernel, and the rest of a solve is not in one.
-_MOST_UNKNOWNS_OF_ONE_KERNEL = min(newton_kernel.SIZES) - 1
-
-
-def _spells_out(matrix: jax.Array) -> bool:
-    most = _MOST_ENTRIES_SPELLED_OUT["cpu" if on_cpu() else "gpu"]
-    return matrix.shape[0] * matrix.shape[1] <= most
-
-
-def _sum_in_a_loop(term: Callable[[Any], jax.Array], count: int) -> jax.Array:
-    """Sum terms by their index, compiled for size.
-
-    A CPU's kernel of many operations can hold neither a matrix product nor, from jaxlib
-    0.11 on, a sum over an axis: XLA hands both to libraries.
-    """
-    first = term(0)
-    return jax.lax.fori_loop(1, count, lambda i, sum_: sum_ + term(i), first)
-
-
-def _matvec(matrix: jax.Array, vector: jax.Array, spell_out: bool) -> jax.Array:
-    """(N, V, B), (V, B) -> (N, B)."""
-    if spell_out:
-        return add(matrix[:, i] * vector[i] for i in range(vector.shape[0]))
-    if on_gpu():
-        return jnp.sum(matrix * vector, axis=1)
-    return _sum_in_a_loop(lambda i: matrix[:, i] * vector[i], vector.shape[0])
-
-
-def _matvec_transposed(
-    matrix: jax.Array, vector: jax.Array, spell_out: bool
-) -> jax.Array:
-    """(N, V, B), (N, B) -> (V, B)."""
-    if spell_out:
-        return add(matrix[n] * vector[n] for n in range(vector.shape[0]))
-    if on_gpu():
-        return jnp.sum(matrix * vector[:, None], axis=0)
-    return _sum_in_a_loop(lambda n: matrix[n] * vector[n], vector.shape[0])
-
-
-def _symmetric_product(left: jax.Array, right: jax.Array, spell_out: bool) -> jax.Array:
-    """Return left' right, if it is symmetric: (N, V, B), (N, V, B) -> (V, V, B)."""
-    num_rows, size, _ = left.shape
-    if not spell_out and on_gpu():
-        return jnp.moveaxis(jnp.einsum("nib,njb->bij", left, right), 0, -1)
-    if not spell_out:
-        return _sum_in_a_loop(lambda n: left[n][:, None] * right[n], num_rows)
-    rows = [
-        add(left[n, i] * right[n, : i + 1] for n in range(num_rows))
-        for i in range(size)
-    ]
-    rows = [materialize(row) for row in rows]
-    return jnp.stack(
-        [
-            jnp.concatenate(
-                [rows[i], *(rows[j][i : i + 1] for j in range(i + 1, size))]
-            )
-            for i in range(size)
-        ]
-    )
-
-
-class _Rows:
-    """The constraint matrix J of a `Problem` whose batch is the last axis.
-
-    A vector with one number per row is a list: (V, B) for the limits, and (E, C, B) for
-    each group of contacts.
+    Attributes:
+      force: a vector, the problem's.
+      warmstart: a vector, the problem's.
+      reference: rows, aref.
+      weight: rows, D.
     """
 
-    def __init__(self, problem: Problem, for_speed: bool):
-        def edges_first(x: jax.Array) -> jax.Array:
-            return jnp.swapaxes(x, 0, 1)
+    force: Any
+    warmstart: Any
+    reference: Any
+    weight: Any
 
-        self._sign = problem.limits.sign
-        self._edges = [group.edges for group in problem.contacts]
-        self._shapes = [group.tangents.shape[:2] for group in problem.contacts]
-        self.reference = [
-            problem.limits.reference,
-            *(edges_first(group.reference) for group in problem.contacts),
-        ]
-        self.weight = [
-            problem.limits.weight,
-            *(edges_first(group.weight) for group in problem.contacts),
-        ]
-        # B has, group after group, the normals, the first and the second tangents.
-        parts = []
-        for group in problem.contacts:
-            parts += [group.normal, *jnp.moveaxis(group.tangents, 1, 0)]
-        self._basis = materialize(jnp.concatenate(parts)) if parts else None
-        self._spell_out = (
-            self._basis is not None and for_speed and _spells_out(self._basis)
-        )
+    def inertia_times(self, vector: Any) -> Any:
+        """M vector."""
 
-    def _split(self, along: jax.Array) -> list[list[jax.Array]]:
-        """(rows of B, ...) to [normal (C, ...), tangents...] of each group."""
-        groups, first = [], 0
-        for contacts, tangents in self._shapes:
-            bounds = [first + i * contacts for i in range(tangents + 2)]
-            groups.append([along[i : i + contacts] for i in bounds[:-1]])
-            first = bounds[-1]
-        return groups
+    def times(self, vector: Any) -> Any:
+        """J vector."""
 
-    def times(self, vector: jax.Array) -> list[jax.Array]:
-        """J vector: (V, B) -> rows."""
-        result = [self._sign * vector]
-        if self._basis is None:
-            return result
-        for edges, (normal, *tangents) in zip(
-            self._edges,
-            self._split(_matvec(self._basis, vector, self._spell_out)),
-            strict=True,
-        ):
-            result.append(
-                jnp.stack([_add_signed(normal, tangents, signs) for signs in edges])
-            )
-        return result
+    def transposed_times(self, rows: Any) -> Any:
+        """J' rows."""
 
-    def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
-        """J' rows: -> (V, B)."""
-        of_limits, *of_groups = rows
-        result = self._sign * of_limits
-        if self._basis is None:
-            return result
-        along: list[jax.Array] = []
-        for edges, of_edges, (_, tangents) in zip(
-            self._edges, of_groups, self._shapes, strict=True
-        ):
-            along.append(add(of_edges))
-            for t in range(tangents):
-                signs = [signs[t] for signs in edges]
-                along.append(sum_signed(of_edges, signs))
-        joined = materialize(jnp.concatenate(along))
-        return result + _matvec_transposed(self._basis, joined, self._spell_out)
+    def solve(self, active: Any, right: Any) -> Any:
+        """Return x of (M + J' diag(active) J) x = right; of M x = right if None."""
 
-    def gram(self, weights: list[jax.Array]) -> jax.Array:
-        """J' diag(weights) J: -> (V, V, B)."""
-        of_limits, *of_groups = weights
-        diagonal = self._sign**2 * of_limits
-        result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
-        if self._basis is None:
-            return result
-        weighted = []
-        for edges, of_edges, basis in zip(
-            self._edges, of_groups, self._split(self._basis), strict=True
-        ):
-            signs = [(1, *signs) for signs in edges]
-            for i in range(len(basis)):
-                # Row i of E' diag(w) E, times B.
-                terms = []
-                for j, part in enumerate(basis):
-                    products = [s[i] * s[j] for s in signs]
-                    if any(products):
-                        terms.append(sum_signed(of_edges, products)[:, None] * part)
-                weighted.append(sum(terms))
-        weighted = materialize(jnp.concatenate(weighted))
-        return result + _symmetric_product(weighted, self._basis, self._spell_out)
+    def total(self, tree: Any) -> jax.Array:
+        """Return the sum of all numbers of each problem."""
+
+    def differ(self, a: Any, b: Any) -> jax.Array:
+        """Return whether two trees of booleans differ in a problem."""
+
+    def store(self, tree: Any) -> Any:
+        """Return the same, computed once however often it is used."""
+
+    def repeat(
+        self,
+        function: Callable[[Any], Any],
+        carry: Any,
+        *,
+        least: int,
+        most: int,
+        is_short: bool,
+    ) -> Any:
+        """Call a function `least` to `most` times, and return the last carry.
+
+        The function returns the carry and whether something has changed. After `least`
+        calls it need not be called again once nothing changes; a test of that may cost
+        as much as a short function.
+        """
 
 
-def _add_signed(
-    first: jax.Array, others: list[jax.Array], signs: tuple[int, ...]
-) -> jax.Array:
-    for other, sign in zip(others, signs, strict=True):
-        if sign:
-            first = first + other if sign > 0 else first - other
-    return first
+def _is_pushing(jaref: Any) -> Any:
+    return jax.tree.map(lambda d: d < 0.0, jaref)
 
 
-def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
-    """Return x of A x = b by Gauss-Jordan elimination: (V, V, B), (V, B) -> (V, B).
-
-    Symmetric positive matrices need no pivoting. Each step drops the first column and
-    moves the first row to the end, so that all steps are the same. On a GPU larger
-    matrices are eliminated in one kernel.
-    """
-    if matrix.shape[0] in newton_kernel.SIZES and has_triton():
-        return newton_kernel.solve_linear(matrix, right)
-    table = jnp.concatenate([matrix, right[:, None]], axis=1)
-    for _ in range(matrix.shape[0]):
-        row = table[0, 1:] / table[0, 0]
-        others = table[1:, 1:] - table[1:, :1] * row
-        table = materialize(jnp.concatenate([others, row[None]]))
-    return table[:, 0]
-
-
-def _repeat(
-    function: Callable[[Any], tuple[Any, jax.Array]],
-    carry: Any,
-    *,
-    least: int,
-    most: int,
-    unroll: bool,
-) -> Any:
-    """Call a function `least` to `most` times, and on a CPU until nothing changes.
-
-    The function returns the carry and whether something has changed. On a GPU each
-    test would wait for the host, and a loop costs more than a small body, so it
-    may be unrolled there. On a CPU unrolling it only costs compile time.
-    """
-    if not on_cpu():
-
-        def call(_: Any, carry: Any) -> Any:
-            return function(carry)[0]
-
-        return jax.lax.fori_loop(0, most, call, carry, unroll=unroll)
-
-    def goes_on(state: Any) -> jax.Array:
-        count, changed, _ = state
-        return (count < least) | (changed & (count < most))
-
-    def body(state: Any) -> Any:
-        count, _, carry = state
-        carry, changed = function(carry)
-        return count + 1, changed, carry
-
-    return jax.lax.while_loop(goes_on, body, (0, True, carry))[2]
-
-
-@jax.named_scope("solver")
-def solve_many(
-    iterations: int, line_search: int, problem: Problem, *, for_speed: bool = True
-) -> Solution:
-    """Solve a batch of problems.
+def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
+    """Return the accelerations, a vector, and the forces along the rows.
 
     Args:
+      system: the problems.
       iterations: largest number of Newton iterations.
       line_search: largest number of steps of each line search.
-      problem: the problems; every array has one more axis, the batch, at its end.
-      for_speed: whether sums are unrolled for speed; otherwise compiled for size.
-
-    Returns:
-      The solutions, with the batch as the last axis of every array.
     """
-    inertia, force = problem.inertia, problem.force
-    if len(force) <= _MOST_UNKNOWNS_OF_ONE_KERNEL and has_triton():
-        return Solution(*newton_fused.solve_many(iterations, line_search, problem))
-    rows = _Rows(problem, for_speed)
-    spell_out = for_speed and _spells_out(inertia)
-    weight = rows.weight
-    each = jax.tree.map
-
-    def flat(x: jax.Array) -> jax.Array:
-        return x.reshape(-1, x.shape[-1])
-
-    def of_rows(parts: Any) -> jax.Array:
-        return add(total(flat(x)) for x in parts)
+    each, weight = jax.tree.map, system.weight
 
     # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
     def jaref_at(qacc: Any) -> Any:
-        return each(jnp.subtract, rows.times(qacc), rows.reference)
+        return system.store(each(jnp.subtract, system.times(qacc), system.reference))
 
-    qacc_smooth = eliminate(inertia, force)
+    def dot(a: Any, b: Any) -> jax.Array:
+        return system.total(each(jnp.multiply, a, b))
 
-    def is_pushing(jaref: Any) -> Any:
-        return each(lambda d: d < 0.0, jaref)
+    def row_cost(jaref: Any) -> jax.Array:
+        return system.total(
+            each(lambda d, w: w * jnp.minimum(d, 0.0) ** 2, jaref, weight)
+        )
 
-    def changes(a: Any, b: Any) -> jax.Array:
-        pairs = zip(a, b, strict=True)
-        parts = [fold(jnp.logical_or, flat(x != y)) for x, y in pairs]
-        return jnp.any(functools.reduce(jnp.logical_or, parts))
+    warmstart, smooth = system.warmstart, system.solve(None, system.force)
+    away = each(jnp.subtract, warmstart, smooth)
+    at_warmstart, at_smooth = jaref_at(warmstart), jaref_at(smooth)
+    cost = dot(away, system.inertia_times(away)) + row_cost(at_warmstart)
+    better = cost < row_cost(at_smooth)
 
-    def cost(qacc: jax.Array) -> jax.Array:
-        away = qacc - qacc_smooth
+    def choose(a: jax.Array, b: jax.Array) -> jax.Array:
+        return jnp.where(better, a, b)
 
-        def square(d: jax.Array, w: jax.Array) -> jax.Array:
-            return w * jnp.minimum(d, 0.0) ** 2
-
-        constraint_cost = of_rows(each(square, materialize(jaref_at(qacc)), weight))
-        return _dot(away, _matvec(inertia, away, spell_out)) + constraint_cost
-
-    better = cost(problem.warmstart) < cost(qacc_smooth)
-    start = jnp.where(better, problem.warmstart, qacc_smooth)
-
-    def iterate(carry: tuple[jax.Array, list[jax.Array]]) -> Any:
+    def iterate(carry: Any) -> Any:
         qacc, jaref = carry
         active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), jaref, weight)
-        residual = _matvec(inertia, qacc, spell_out) - force
-        pull = rows.transposed_times(each(jnp.multiply, active, jaref))
-        active, gradient = materialize((active, residual + pull))
-        hessian = inertia + rows.gram(active)
-        direction = -eliminate(hessian, gradient)
+        residual = each(jnp.subtract, system.inertia_times(qacc), system.force)
+        pull = system.transposed_times(each(jnp.multiply, active, jaref))
+        active, gradient = system.store((active, each(jnp.add, residual, pull)))
+        direction = each(jnp.negative, system.solve(active, gradient))
 
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
-        slope = materialize(rows.times(direction))
-        linear = _dot(direction, residual)
-        quadratic = _dot(direction, _matvec(inertia, direction, spell_out))
+        slope = system.store(system.times(direction))
+        linear = dot(direction, residual)
+        quadratic = dot(direction, system.inertia_times(direction))
 
-        def search_step(search: tuple[Any, ...]) -> Any:
+        def search_step(search: Any) -> Any:
             step, low, high, pushing = search
             there = each(lambda d, s: d + step * s, jaref, slope)
             pushed = each(
                 lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
             )
-            second = quadratic + of_rows(each(jnp.multiply, pushed, slope))
-            first = linear + step * quadratic
-            first = first + of_rows(each(jnp.multiply, pushed, there))
+            second = quadratic + dot(pushed, slope)
+            first = linear + step * quadratic + dot(pushed, there)
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
             following = jnp.where(inside, following, 0.5 * (low + high))
-            now = is_pushing(there)
-            return (following, low, high, now), changes(pushing, now)
+            now = _is_pushing(there)
+            return (following, low, high, now), system.differ(pushing, now)
 
-        step = jnp.ones_like(linear)
-        pushing = is_pushing(jaref)
+        step, pushing = jnp.ones_like(linear), _is_pushing(jaref)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
-        step = _repeat(search_step, search, least=1, most=line_search, unroll=True)[0]
-        moved = each(lambda d, s: d + step * s, jaref, slope)
-        return (qacc + step * direction, moved), changes(pushing, is_pushing(moved))
+        step = system.repeat(
+            search_step, search, least=1, most=line_search, is_short=True
+        )[0]
+        qacc, moved = each(
+            lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
+        )
+        return (qacc, moved), system.differ(pushing, _is_pushing(moved))
 
-    begin = (start, jaref_at(start))
-    qacc, jaref = _repeat(iterate, begin, least=2, most=iterations, unroll=False)
-    push = each(lambda d, w: w * jnp.maximum(-d, 0.0), jaref, weight)
-    return Solution(
-        qacc=qacc,
-        edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in push[1:]),
-        constraint_force=rows.transposed_times(push),
+    start = each(choose, (warmstart, at_warmstart), (smooth, at_smooth))
+    qacc, jaref = system.repeat(
+        iterate, start, least=2, most=iterations, is_short=False
     )
+    return qacc, each(lambda d, w: w * jnp.maximum(-d, 0.0), jaref, weight)
