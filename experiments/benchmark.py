@@ -421,7 +421,8 @@ def for_page(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
         seconds = ", ".join(f"{x.compile_seconds:.0f}" for x in each)
         lines.append([env, *speeds, seconds])
         if has_errors:
-            lines[-1].append(", ".join(f"{x.error:.0e}" for x in each))
+            errors = [f"{x.error:.0e}" for x in each if x.error is not None]
+            lines[-1].append(", ".join(errors))
     return head, lines
 
 

@@ -216,6 +216,14 @@ def test_the_kernel_of_a_gpu_solves_the_same(size, groups):
     )
 
 
+def test_a_gpu_takes_the_same_rows(monkeypatch):
+    x, index = jnp.arange(12.0).reshape(6, 2), [4, 0, 0, 5]
+    expected = batching.take(x, index)
+    monkeypatch.setattr(batching, "on_cpu", lambda: False)
+    np.testing.assert_array_equal(batching.take(x, index), expected)
+    assert batching.take(x, []).shape == (0, 2)
+
+
 @pytest.mark.parametrize(
     ("capability", "expected"), [("9.0", True), ("7.5", False), ("gfx90a", False)]
 )

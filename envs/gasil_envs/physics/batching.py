@@ -11,6 +11,8 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.experimental.layout import Layout, with_layout_constraint
 from jax.experimental.xla_metadata import set_xla_metadata
 
 _LOOPS = "xla_cpu_disable_loop_unrolling"
@@ -49,6 +51,15 @@ def has_triton() -> bool:
 _identity = jax.jit(lambda tree: tree)
 
 
+def keep_layout(x: jax.Array) -> jax.Array:
+    """Keep XLA from storing an array with its axes in another order.
+
+    On a GPU neighbouring threads have neighbouring numbers of the last axis, the batch.
+    XLA does not know this, and chooses another order where that saves a transposition.
+    """
+    return with_layout_constraint(x, Layout(tuple(range(x.ndim))))
+
+
 def materialize(tree: Any) -> Any:
     """Make arrays be computed once and stored, however often they are used.
 
@@ -57,7 +68,7 @@ def materialize(tree: Any) -> Any:
     does not look into a call that is not to be inlined.
     """
     if not on_cpu():
-        return jax.lax.optimization_barrier(tree)
+        return jax.tree.map(keep_layout, jax.lax.optimization_barrier(tree))
     with set_xla_metadata(inlineable="false"):
         return _identity(tree)
 
@@ -108,7 +119,13 @@ def stacked(parts: Iterable[Any], axis: int = 0) -> jax.Array:
 
 
 def take(x: jax.Array, index: Iterable[int]) -> jax.Array:
-    """Return rows of the first axis by their constant indices, without a gather."""
+    """Return rows of the first axis by their constant indices.
+
+    A CPU's kernel can hold no gather. On a GPU each number of a stack is searched among
+    its parts, which takes long if there are many.
+    """
+    if not on_cpu():
+        return x[np.asarray(list(index), int)]
     rows = [x[int(i)] for i in index]
     return jnp.stack(rows) if rows else x[:0]
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from gasil_envs.physics import newton
-from gasil_envs.physics.batching import add, sum_signed
+from gasil_envs.physics.batching import add, keep_layout, sum_signed
 
 # Pallas takes long to import, and only a GPU needs it: functions import it themselves.
 
@@ -344,7 +344,7 @@ def _call(
         compiler_params=triton.CompilerParams(num_warps=warps, num_stages=1),
         interpret=interpret,
         name="newton",
-    )(jax.tree.map(lambda x: jnp.moveaxis(x, -1, 0), arrays))
+    )(jax.tree.map(lambda x: jnp.moveaxis(keep_layout(x), -1, 0), arrays))
 
 
 def _spec(*shape: int) -> Any:
