@@ -468,7 +468,8 @@ class Locomotion(Env):
                 raise ValueError(
                     f"{what} is {name!r}: it must be one of {', '.join(names)}"
                 )
-        batching.keep_loops()
+        if solver != "mjx":
+            batching.keep_loops()
         self.task = task = task if isinstance(task, Task) else TASKS[task]
         self.model = _load(task.xml)
         _check(task, self.model)
