@@ -1,5 +1,6 @@
 """The profile's table, and the parts that operations belong to."""
 
+import functools
 from types import SimpleNamespace
 
 import jax
@@ -7,6 +8,7 @@ import pytest
 
 from experiments import __main__ as experiments
 from experiments import benchmark, measured, profile
+from gasil_envs.physics import batching
 
 
 @pytest.fixture
@@ -118,3 +120,17 @@ def test_what_a_benchmark_measured_is_a_line_for_each_task():
     assert benchmark.for_page([*rows, *more])[1][0][-1] == "1e-07"
     many = [row(env, "ours", n, n) for env in ("ant", "hopper") for n in (8, 2048)]
     assert benchmark.for_page(many)[0][1:3] == ["8: ours", "2,048: ours"]
+
+
+def test_mjx_is_timed_in_a_process_without_the_option_of_our_loops(monkeypatch):
+    monkeypatch.setattr(benchmark, "_FLAGS", "")
+    monkeypatch.setenv("XLA_FLAGS", "")
+    batching.keep_loops()
+    option = "'disable_loop_unrolling' in __import__('os').environ['XLA_FLAGS']"
+    build = functools.partial(
+        benchmark.Row, "ant", "mjx", 8, functools.partial(eval, option)
+    )
+    assert build().run() and benchmark._row("ours", build).run()
+    row = benchmark._row("mjx", build)
+    assert (row.name, row.num_envs) == ("mjx", 8)
+    assert row.run() == row.run() == 0.0
