@@ -2,6 +2,7 @@
 
 import functools
 import inspect
+import os
 from types import SimpleNamespace
 
 import jax
@@ -12,7 +13,7 @@ import pytest
 from jax.sharding import AbstractDevice, AbstractMesh
 
 import gasil_envs
-from gasil_envs import locomotion
+from gasil_envs import locomotion, registry
 from gasil_envs.physics import (
     batching,
     constraints,
@@ -54,6 +55,16 @@ def test_a_batch_of_one_is_a_batch():
         np.testing.assert_array_equal(result, np.full(batch, expected))
     tiled = jax.jit(batching.in_tiles(lambda x: 2.0 * x))
     np.testing.assert_array_equal(tiled(jnp.ones((3, 1))), np.full((3, 1), 2.0))
+
+
+@pytest.mark.parametrize(("name", "expected"), [("small", True), ("mjx", False)])
+def test_only_our_physics_gets_the_option_that_keeps_loops(monkeypatch, name, expected):
+    monkeypatch.setenv("XLA_FLAGS", "")
+    registry.prepare(registry.Settings(solver=name), 1)
+    assert ("disable_loop_unrolling" in os.environ["XLA_FLAGS"]) is expected
+    monkeypatch.setenv("XLA_FLAGS", "")
+    gasil_envs.make("inverted_pendulum", solver=name)
+    assert ("disable_loop_unrolling" in os.environ["XLA_FLAGS"]) is expected
 
 
 def test_host_calls_that_would_deadlock_are_refused(monkeypatch):
