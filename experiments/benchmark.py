@@ -394,7 +394,9 @@ def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
         rows.append(dataclasses.replace(row, name=f"physics alone, {variant}"))
         training = functools.partial(
             training_row,
-            *(env_name, variant, options),
+            env_name,
+            variant,
+            options,
             devices=devices,
             seeds=options.seeds,
         )

@@ -468,8 +468,7 @@ class Locomotion(Env):
                 raise ValueError(
                     f"{what} is {name!r}: it must be one of {', '.join(names)}"
                 )
-        if solver != "mjx":
-            batching.keep_loops()
+        batching.keep_loops(solver)
         self.task = task = task if isinstance(task, Task) else TASKS[task]
         self.model = _load(task.xml)
         _check(task, self.model)

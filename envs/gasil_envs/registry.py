@@ -229,8 +229,7 @@ def without_effect(name: str, settings: Settings) -> list[str]:
 
 def prepare(settings: Settings, num_devices: int) -> None:
     """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
-    if settings.solver != "mjx":
-        batching.keep_loops()
+    batching.keep_loops(settings.solver)
     if settings.physics == "mujoco":
         native.reserve_threads(num_devices)
 
@@ -253,8 +252,7 @@ def make(name: str, **settings: Any) -> Env:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
     check(name, chosen)
-    if chosen.solver != "mjx":
-        batching.keep_loops()
+    batching.keep_loops(chosen.solver)
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.max_episode_steps is not None:

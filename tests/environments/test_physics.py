@@ -221,7 +221,7 @@ def test_the_kernel_of_a_gpu_solves_the_same(size, groups):
     expected = jax.jit(functools.partial(solver.solve_many, 6, 4))(problem)
     kernel = functools.partial(newton_kernel.solve_many, 6, 4, interpret=True)
     jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-3),
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4),
         jax.jit(kernel)(problem),
         expected,
     )

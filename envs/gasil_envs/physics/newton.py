@@ -24,12 +24,14 @@ It is not reverse-mode differentiable. Neither is MJX's own solver, because its 
 dynamic.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+
+from gasil_envs.physics.batching import add, sum_signed
 
 # Shape letters: V degrees of freedom; and for a group of contacts with the same number
 # of edges: C contacts, A axes (the normal and the tangents), E edges. The classes give
@@ -153,6 +155,26 @@ class System(Protocol):
         calls it need not be called again once nothing changes; a test of that may cost
         as much as a short function.
         """
+
+
+def weighted_axes(
+    edges: Sequence[Sequence[int]], weights: Any, axes: Sequence[Any]
+) -> Iterator[jax.Array]:
+    """Yield, for each axis, its rows of E' diag(weights) E B of a group of contacts.
+
+    Args:
+      edges: E rows of A signs, as in `ContactRows`.
+      weights: for each edge an array (C, ...).
+      axes: for each axis an array (C, V, ...), its rows of B.
+    """
+    signs = list(zip(*edges, strict=True))
+    for own in signs:
+        terms = []
+        for others, axis in zip(signs, axes, strict=True):
+            products = [a * b for a, b in zip(own, others, strict=True)]
+            if any(products):
+                terms.append(sum_signed(weights, products)[:, None] * axis)
+        yield add(terms)
 
 
 def _is_pushing(jaref: Any) -> Any:

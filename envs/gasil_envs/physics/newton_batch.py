@@ -170,18 +170,11 @@ class _Batch:
         result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
         if self._basis is None:
             return result
-        weighted = []
+        weighted: list[jax.Array] = []
         for edges, of_edges, basis in zip(
             self._edges, of_groups, self._split(self._basis), strict=True
         ):
-            for i in range(len(basis)):
-                # Row i of E' diag(w) E, times B.
-                terms = []
-                for j, part in enumerate(basis):
-                    products = [signs[i] * signs[j] for signs in edges]
-                    if any(products):
-                        terms.append(sum_signed(of_edges, products)[:, None] * part)
-                weighted.append(add(terms))
+            weighted += newton.weighted_axes(edges, of_edges, basis)
         joined = materialize(jnp.concatenate(weighted))
         return result + _symmetric_product(joined, self._basis, self._spell_out)
 

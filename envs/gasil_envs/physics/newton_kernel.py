@@ -231,19 +231,13 @@ class _Block:
         for edges, axes, of_edges in zip(
             self._edges, self._basis, of_groups, strict=True
         ):
-            of_axes = list(zip(*edges, strict=True))
             for i, row in enumerate(matrix):
-                parts = [loads[i]() for loads in axes]
-                for signs, loads in zip(of_axes, axes, strict=True):
-                    # A row of E' diag(w) E, times B.
-                    terms = []
-                    for others, part in zip(of_axes, parts, strict=True):
-                        products = [a * b for a, b in zip(signs, others, strict=True)]
-                        if any(products):
-                            terms.append(sum_signed(of_edges, products)[:, None] * part)
-                    weighted = add(terms)
+                weighted = newton.weighted_axes(
+                    edges, of_edges, [parts[i]() for parts in axes]
+                )
+                for left, parts in zip(weighted, axes, strict=True):
                     for j in range(len(row)):
-                        row[j] = row[j] + _product(weighted, loads[i + j]())
+                        row[j] = row[j] + _product(left, parts[i + j]())
 
     def total(self, tree: Any) -> jax.Array:
         # Arrays of one shape are added before a sum that all threads take part in.
@@ -363,11 +357,7 @@ def solve_many(
 ) -> newton.Solution:
     """Solve a batch of problems as `solver.solve_many` does.
 
-    Args:
-      iterations: largest number of Newton iterations.
-      line_search: largest number of steps of each line search.
-      problem: the problems; every array has the batch at its end.
-      interpret: run the kernel as XLA's operations, on any device, to test it.
+    With `interpret` the kernel runs as XLA's operations, on any device, to test it.
     """
     size, limits = problem.force.shape[0], problem.limits
     padded = len(_parts(size)) * WIDTH
