@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 from experiments.search import DELAY, PAPERS, Point, Search
 from experiments.store import Store
 from gasil_jax import presets
+from gasil_jax.agents import AGENTS
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings
-from gasil_jax.imitation import AGENTS
 from gasil_jax.sweeps.runs import Run
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.

@@ -121,7 +121,7 @@ _PARTS = [
         _adaptive(f"rule {rule}", imitation_rule=rule)
         for rule in ("agreement", "gap", "fixed")
     ),
-    _adaptive("deviation 1", initial_deviation=1.0),
+    _adaptive("deviation 1", initial_std=1.0),
 ]
 #: PPO+GASIL with forms of the bonus that don't favour long episodes.
 _LOGIT, _CENTERED = (
@@ -135,7 +135,7 @@ def _by_root(size: int) -> Point:
     """Return what the preset `scaled` had when most of its settings followed a root."""
     return {
         "learning_rate": 1.5e-3 / size,
-        "initial_deviation": 1 / math.sqrt(size),
+        "initial_std": 1 / math.sqrt(size),
         "gae_lambda": 1 - math.sqrt(size) / 40,
     }
 
@@ -163,7 +163,7 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
     "deviation scaled inversely, lambda 0.95": lambda size: {
         **_by_root(size),
         "gae_lambda": 0.95,
-        "initial_deviation": 2 / size,
+        "initial_std": 2 / size,
     },
     "lambda and gamma scaled linearly": lambda size: {
         **_by_root(size),

@@ -23,8 +23,8 @@ from experiments import plots
 from experiments.store import RESULTS, ResultsFolder
 from gasil_envs import pictures
 from gasil_jax import normalization, policy
+from gasil_jax.agents import PPOGASIL, adversarial
 from gasil_jax.host import command_line, output_file
-from gasil_jax.imitation import PPOGASIL, adversarial
 from gasil_jax.networks import Discriminator
 
 _EPISODES = 20
@@ -61,7 +61,7 @@ def states_at(
     @functools.partial(jax.jit, donate_argnums=0)
     def advance(state: Any, count: jax.Array) -> Any:
         def step(_: Any, state: Any) -> Any:
-            return gasil_jax.iterate(env, algorithm, state)[0]
+            return gasil_jax.train_step(env, algorithm, state)[0]
 
         return jax.lax.fori_loop(0, count, step, state)
 

@@ -58,7 +58,7 @@ _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
     "gae_lambda": (0.95, 0.98, 0.995),
     "gamma": (0.99, 0.995),
-    "initial_deviation": (0.15, 0.25, 0.4, 0.6, 1.0),
+    "initial_std": (0.15, 0.25, 0.4, 0.6, 1.0),
 }
 _ALPHA: Space = {"alpha": (0.02, 0.1, 0.2, 1.0)}
 _DISCRIMINATOR: Space = {
@@ -87,7 +87,7 @@ BEYOND: Mapping[str, tuple[Any, Any]] = {
     "learning_rate": (3e-5, 1.2e-3),
     "gae_lambda": (0.9, None),
     "gamma": (0.98, 0.998),
-    "initial_deviation": (0.08, 1.5),
+    "initial_std": (0.08, 1.5),
     "alpha": (0.005, 3.0),
     "behavior_cloning_coefficient": (0.003, 3.0),
     "sil_coefficient": (0.003, 3.0),

@@ -1,23 +1,23 @@
+from . import agents as agents
 from . import statistics as statistics
+from .agents import GAIL as GAIL
+from .agents import GASIL as GASIL
+from .agents import PPO as PPO
+from .agents import PPOBC as PPOBC
+from .agents import PPOGASIL as PPOGASIL
+from .agents import PPOSIL as PPOSIL
+from .agents import Agent as Agent
+from .agents import PPOBCAdaptive as PPOBCAdaptive
+from .agents import PPOBCNovelty as PPOBCNovelty
+from .agents import PPOBonus as PPOBonus
+from .agents import PPOGASILAdaptive as PPOGASILAdaptive
+from .agents import PPONovelty as PPONovelty
 from .algorithms import Algorithm as Algorithm
 from .algorithms import algorithm as algorithm
 from .config import Config as Config
 from .context import Context as Context
 from .host.environments import make_env as make_env
 from .host.members import member as member
-from .imitation import GAIL as GAIL
-from .imitation import GASIL as GASIL
-from .imitation import PPO as PPO
-from .imitation import PPOBC as PPOBC
-from .imitation import PPOGASIL as PPOGASIL
-from .imitation import PPOSIL as PPOSIL
-from .imitation import Agent as Agent
-from .imitation import PPOBCAdaptive as PPOBCAdaptive
-from .imitation import PPOBCNovelty as PPOBCNovelty
-from .imitation import PPOBonus as PPOBonus
-from .imitation import PPOGASILAdaptive as PPOGASILAdaptive
-from .imitation import PPONovelty as PPONovelty
-from .imitation import agents as agents
 from .policy import load_policy as load_policy
 from .presets import preset as preset
 from .rewards import Decompose as Decompose
@@ -29,7 +29,7 @@ from .sweeps.fitting import fit as fit
 from .sweeps.saved_states import load_reward as load_reward
 from .train import TrainState as TrainState
 from .train import init as init
-from .train import iterate as iterate
 from .train import make_train as make_train
+from .train import train_step as train_step
 
 __version__: str

@@ -5,6 +5,7 @@ import inspect
 from collections.abc import Mapping
 from typing import Any
 
+from gasil_jax.agents import AGENTS, Agent, agents_with
 from gasil_jax.config import (
     SCHEDULE_SUFFIX,
     Config,
@@ -17,7 +18,6 @@ from gasil_jax.config import (
     validate_switch,
 )
 from gasil_jax.errors import refusal, shown, unknown
-from gasil_jax.imitation import AGENTS, Agent, agents_with
 from gasil_jax.rewards import REWARD_MODELS, RewardModel
 
 

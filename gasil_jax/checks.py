@@ -6,12 +6,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gasil_envs import own_code, own_environment
+from gasil_envs import user_code, user_environment
 from gasil_jax import algorithms, networks
+from gasil_jax.agents import Agent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.context import Sizes, sizes_of
 from gasil_jax.errors import refusal, shown
-from gasil_jax.imitation import Agent
 
 
 def check_environment(env: Any) -> None:
@@ -24,7 +24,7 @@ def check_environment(env: Any) -> None:
     *_, innermost = _levels(env)
     # Ours and Brax's need no check.
     if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
-        own_environment.check(type(innermost).__name__, env, env)
+        user_environment.check(type(innermost).__name__, env, env)
 
 
 def check(env: Any, algorithm: Algorithm) -> None:
@@ -37,7 +37,7 @@ def check(env: Any, algorithm: Algorithm) -> None:
     algorithms.check(algorithm)
     agent, num_envs = algorithm.agent, algorithm.config.num_envs
     sizes = sizes_of(env, num_envs)
-    with own_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
+    with user_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
         agent.check(sizes)
     _check_components(algorithm, sizes)
     _check_networks(agent, sizes)
@@ -72,11 +72,11 @@ def _check_networks(agent: Any, sizes: Sizes) -> None:
         ("discriminator_network", (), (observation, action), (2,)),
     ):
         what = f"{function} of agent {agent.name!r}"
-        with own_code.refused(f"{what} fails"):
+        with user_code.refused(f"{what} fails"):
             network = getattr(agent, function, lambda *_: None)(*arguments)
         if network is None or type(network).__module__ == networks.__name__:
             continue
-        with own_code.refused(f"{what} can't be traced"):
+        with user_code.refused(f"{what} can't be traced"):
             output, variables = jax.eval_shape(
                 lambda network=network, inputs=inputs: network.init_with_output(
                     jax.random.key(0), *inputs
@@ -102,7 +102,7 @@ def _check_interface(env: Any) -> None:
         raise ValueError(
             f"env is the class {env.__name__}: it must be an instance, {env.__name__}()"
         )
-    if (lacking := own_environment.missing(env)) is not None:
+    if (lacking := user_environment.missing(env)) is not None:
         raise ValueError(
             f"env is {shown(env)}, which has no {lacking}: it must be an environment "
             "with Brax's interface, as gasil_jax.make_env gives"

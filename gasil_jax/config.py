@@ -178,7 +178,7 @@ class Config(struct.PyTreeNode):
         the value has its own network, gradient clip and Adam.
       max_grad_norm: largest global norm of a gradient; the policy's and the value's
         gradients are clipped separately.
-      initial_deviation: standard deviation of the untrained policy's actions.
+      initial_std: standard deviation of the untrained policy's actions.
     """
 
     total_steps: int = count(1_000_000)
@@ -201,7 +201,7 @@ class Config(struct.PyTreeNode):
     entropy_coefficient: float = number(0.0, 0.0)
     value_coefficient: float = number(1.0, 0.0)
     max_grad_norm: float = number(0.5, 0.0, excludes_low=True)
-    initial_deviation: float = number(1.0, 0.0, excludes_low=True)
+    initial_std: float = number(1.0, 0.0, excludes_low=True)
 
     @property
     def num_steps(self) -> int:

@@ -32,10 +32,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from gasil_envs import worlds
+from gasil_jax.agents import AGENTS, Agent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
 from gasil_jax.errors import refusal, unknown
-from gasil_jax.imitation import AGENTS, Agent
 
 #: The preset that runs start from if none is named.
 DEFAULT = "tuned"
@@ -72,7 +72,7 @@ _ADAPTIVE = {
     "normalize_rewards": True,
     "num_envs": 32,
     "gamma": 0.995,
-    "initial_deviation": 0.4,
+    "initial_std": 0.4,
     "imitation_weight": 0.7,
     "discriminator_updates": 20,
     "discriminator_learning_rate": 1e-4,
@@ -127,7 +127,7 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
         "num_envs": 32,
         "gamma": 0.995,
         "learning_rate": between(7.5e-4, 1e-4),
-        "initial_deviation": between(0.7, 0.25),
+        "initial_std": between(0.7, 0.25),
         "gae_lambda": between(0.975, 0.9),
     }
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 of the paper: `init`, `iterate`, and `make_train`, their composition.
+"""Algorithm 1 of the paper: `init`, `train_step`, and `make_train`, their composition.
 
 Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or over
 any hyperparameter, shard it over devices, call it from other JAX code.
@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs import own_code, wrappers
+from gasil_envs import user_code, wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import (
     checks,
@@ -23,11 +23,11 @@ from gasil_jax import (
     rollout,
     schedules,
 )
+from gasil_jax.agents.interface import Checked
 from gasil_jax.algorithms import Algorithm, check_numbers
 from gasil_jax.context import Context, Metrics, sizes_of
 from gasil_jax.distributions import Distribution
 from gasil_jax.errors import shown
-from gasil_jax.imitation.interface import Checked
 from gasil_jax.networks import Value
 from gasil_jax.ppo import ActorCritic
 from gasil_jax.rollout import Rollout
@@ -116,7 +116,7 @@ def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
         actor_critic=_init_actor_critic(
             env,
             algorithm,
-            numbers["initial_deviation"],
+            numbers["initial_std"],
             policy_key=policy_key,
             value_key=value_key,
         ),
@@ -196,7 +196,7 @@ def _networks(env: Any, algorithm: Algorithm) -> tuple[Any, Any, Distribution]:
 def _init_actor_critic(
     env: Any,
     algorithm: Algorithm,
-    initial_deviation: jax.Array,
+    initial_std: jax.Array,
     *,
     policy_key: jax.Array,
     value_key: jax.Array,
@@ -205,7 +205,7 @@ def _init_actor_critic(
     observation = jnp.zeros(env.observation_size)
     transform = ppo.optimizer(algorithm.config)
     policy_params = policy.init(policy_key, observation)
-    policy_params = distribution.explore(policy_params, initial_deviation)
+    policy_params = distribution.explore(policy_params, initial_std)
     trained = learner.init(policy_params, transform)
     return ActorCritic(
         policy=trained if policy.own is None else trained.replace(network=policy),
@@ -232,7 +232,7 @@ def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
     given = {name: getattr(state, name) for name in ("history", "rewards", "agent")}
     given["hyperparameters"] = dict.fromkeys(state.hyperparameters, number)
     given["environments.episode_length"] = state.environments.episode_length
-    if change := own_code.first_change(needed, given):
+    if change := user_code.first_change(needed, given):
         path, expected, actual = change
         part, rest = path.removeprefix("['").split("']", 1)
         raise ValueError(
@@ -242,7 +242,7 @@ def _check_state(env: Any, algorithm: Algorithm, state: TrainState) -> None:
 
 
 @full_precision
-def iterate(
+def train_step(
     env: Any, algorithm: Algorithm, state: TrainState, *, data: Any = None
 ) -> tuple[TrainState, Metrics]:
     """Run one iteration of Algorithm 1: a batch of experience and the updates from it.
@@ -651,7 +651,7 @@ def make_train(env: Any, algorithm: Algorithm) -> Train:
     Returns:
       ``train(key, hyperparameters=None, data=None) -> (TrainState, Metrics)``. The key
       is consumed; hyperparameters are values that replace numbers of the algorithm, by
-      name, such as ``{"alpha": 0.2}``; data is as in `iterate`; metrics are float32
+      name, such as ``{"alpha": 0.2}``; data is as in `train_step`; metrics are float32
       (iterations,) each.
 
     Raises:
@@ -666,7 +666,7 @@ def make_train(env: Any, algorithm: Algorithm) -> Train:
         data: Any = None,
     ) -> tuple[TrainState, Metrics]:
         return jax.lax.scan(
-            lambda state, _: iterate(env, algorithm, state, data=data),
+            lambda state, _: train_step(env, algorithm, state, data=data),
             init(env, algorithm, key, hyperparameters),
             length=algorithm.config.num_iterations,
         )

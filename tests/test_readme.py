@@ -271,7 +271,7 @@ def test_options_in_the_table_exist():
     assert len(fields) > 18
     options = run_options.parse(run_options.Options, ["--env", "hopper"], "x")
     names = {*vars(options), *vars(options.settings)}
-    for agent in gasil_jax.agents():
+    for agent in gasil_jax.agents.AGENTS:
         models = {"decompose_rewards": True, "normalize_rewards": True}
         names |= gasil_jax.algorithm(agent, **models).settings.keys()
     for field in fields:
@@ -281,7 +281,7 @@ def test_options_in_the_table_exist():
 def test_the_agents_of_the_table_are_all_that_there_are():
     table = TEXT[TEXT.index("| `--agent` |") :].split("\n\n")[0]
     agents = re.findall(r"^\| `([a-z][a-z+-]*)` \|", table, re.MULTILINE)
-    assert sorted(agents) == sorted(gasil_jax.agents())
+    assert sorted(agents) == sorted(gasil_jax.agents.AGENTS)
 
 
 @pytest.fixture(scope="session")
@@ -437,7 +437,7 @@ def rows_of(page, heading):
     return [[cell.strip() for cell in row.strip("|").split(" | ")] for row in rows]
 
 
-@pytest.mark.parametrize("agent", gasil_jax.agents())
+@pytest.mark.parametrize("agent", gasil_jax.agents.AGENTS)
 def test_the_list_of_metrics_is_complete(agent, tmp_path):
     env = gasil_jax.make_env("point_mass", reward_delay=5)
     algorithm = gasil_jax.algorithm(
@@ -453,7 +453,7 @@ def test_the_list_of_metrics_is_complete(agent, tmp_path):
         np.savez(tmp_path / "expert.npz", observation=observation, action=action)
         algorithm = algorithm.replace(expert=str(tmp_path / "expert.npz"))
     first = lambda: gasil_jax.init(env, algorithm, jax.random.key(0))
-    step = lambda: gasil_jax.iterate(env, algorithm, first())[1]
+    step = lambda: gasil_jax.train_step(env, algorithm, first())[1]
     listed = [
         name.strip("`")
         for name, agents, *_ in rows_of("data.md", "Metrics")

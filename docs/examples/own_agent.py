@@ -13,8 +13,8 @@ import jax.numpy as jnp
 
 import gasil_jax
 from gasil_jax import normalization
+from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.config import number
-from gasil_jax.imitation.buffered import BufferedAgent
 
 
 class Nearest(BufferedAgent):

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from brax.envs import Env
 
-from gasil_envs import own_code
+from gasil_envs import user_code
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.point_mass import PointMass
 
@@ -158,7 +158,7 @@ class OwnPainter:
     def draw(self, episode: Sequence[Any]) -> np.ndarray:
         """Return a picture of the last state, uint8 (height, width, 3)."""
         name = type(self._env).__name__
-        with own_code.refused(f"draw of {name} fails"):
+        with user_code.refused(f"draw of {name} fails"):
             picture = np.asarray(self._env.draw(episode[-1], self._size))
         shape = (self._size[1], self._size[0], 3)
         if picture.shape != shape or picture.dtype != np.uint8:

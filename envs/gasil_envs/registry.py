@@ -13,9 +13,9 @@ from brax.envs import Env
 
 from gasil_envs import (
     locomotion,
-    own_code,
-    own_environment,
     point_mass,
+    user_code,
+    user_environment,
     worlds,
     wrappers,
 )
@@ -66,7 +66,7 @@ _EPISODE_LENGTH = 1000
 
 def _refusal(name: str, value: Any, allowed: str) -> ValueError:
     """Return the error for a value that is not allowed, in one short line."""
-    return ValueError(f"{name} is {own_code.shown(value)}: it must be {allowed}")
+    return ValueError(f"{name} is {user_code.shown(value)}: it must be {allowed}")
 
 
 def _refuse_unknown(
@@ -118,8 +118,8 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
             # are chosen, so their names are not looked up here.
             return lambda settings: _build_of_others(name)
         _refuse_unknown_family(name, family)
-        own_environment.find(name)
-        return lambda settings: own_environment.build(name)
+        user_environment.find(name)
+        return lambda settings: user_environment.build(name)
     _refuse_unknown("env", name, names(), forms=(*worlds.forms(), "MODULE:NAME"))
     return lambda settings: _build_ours(name, settings)
 

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env, State
 
-from gasil_envs import own_environment
+from gasil_envs import user_environment
 
 #: The module of each family, and the package that it needs, by the prefix of names.
 FAMILIES: Mapping[str, tuple[str, str]] = {
@@ -88,7 +88,7 @@ def build(name: str) -> Env:
             f"env {name!r} fails within {package} {version} itself: {why}"
         ) from None
     if isinstance(env, World):
-        own_environment.check(name, env, env)
+        user_environment.check(name, env, env)
     return env
 
 

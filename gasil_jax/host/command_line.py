@@ -22,7 +22,7 @@ from tyro.constructors import (
     PrimitiveTypeInfo,
 )
 
-from gasil_envs.own_code import in_a_line
+from gasil_envs.user_code import in_a_line
 from gasil_jax.config import Schedule
 from gasil_jax.errors import InputError
 from gasil_jax.host.interruption import Interrupted, allow_interrupts

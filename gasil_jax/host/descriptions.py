@@ -6,12 +6,12 @@ Here names become objects: an agent is one of the package's, or MODULE:CLASS.
 from collections.abc import Mapping
 from typing import Any, get_type_hints
 
-from gasil_envs import own_code
+from gasil_envs import user_code
+from gasil_jax.agents import AGENTS, Agent
 from gasil_jax.algorithms import Algorithm, check
 from gasil_jax.config import names
 from gasil_jax.errors import InputError, NotImportable, refusal, unknown
 from gasil_jax.host import json_reader
-from gasil_jax.imitation import AGENTS, Agent
 from gasil_jax.rewards import REWARD_MODELS
 
 
@@ -33,7 +33,7 @@ def find_agent(name: Any) -> type[Agent]:
             )
         return AGENTS[name]
     try:
-        agent = own_code.find("agent", name)
+        agent = user_code.find("agent", name)
     except ValueError as error:
         raise NotImportable(str(error)) from None
     if not (isinstance(agent, type) and issubclass(agent, Agent)):
@@ -47,7 +47,7 @@ def find_agent(name: Any) -> type[Agent]:
             f"agent {name!r} calls itself {agent.name!r}: name the module that "
             "defines the class, or remove the class's attribute `name`"
         )
-    with own_code.refused(f"agent {name!r} can't be made", passing=ValueError):
+    with user_code.refused(f"agent {name!r} can't be made", passing=ValueError):
         check(Algorithm(agent()))
     return agent
 

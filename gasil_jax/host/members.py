@@ -74,7 +74,7 @@ def advance_members(
     """
     # A jitted function is traced once for both uses, which saves seconds.
     step = jax.jit(
-        jax.vmap(lambda state: train.iterate(env, algorithm, state, data=data))
+        jax.vmap(lambda state: train.train_step(env, algorithm, state, data=data))
     )
     chunk = chunk_size(algorithm.config)
     metrics = jax.tree.map(

@@ -13,9 +13,10 @@ from typing import Annotated, Any, TypeVar
 import jax
 import tyro
 
-from gasil_envs import own_code
+from gasil_envs import user_code
 from gasil_jax import algorithms, checks, presets
 from gasil_jax import train as training
+from gasil_jax.agents import PPOGASIL, Agent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, names, validate
 from gasil_jax.errors import InputError
@@ -32,7 +33,6 @@ from gasil_jax.host import (
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.periodic_evaluation import EvaluationSchedule
 from gasil_jax.host.progress import announced
-from gasil_jax.imitation import PPOGASIL, Agent
 from gasil_jax.rewards import REWARD_MODELS, Decompose, Normalize, RewardModel
 
 # Each is a group of the help; its fields are options without a prefix.
@@ -414,7 +414,7 @@ def note_options_without_effect(
     }
     reasons |= without_effect(algorithm)
     if discrete:
-        reasons["initial_deviation"] = f"the actions of {options.env} are discrete"
+        reasons["initial_std"] = f"the actions of {options.env} are discrete"
     for name, reason in sorted(reasons.items()):
         if now[name] != before[name]:
             command_line.note(f"{name} is {now[name]}, which has no effect: {reason}")
@@ -548,9 +548,9 @@ def _trace(env: Any, algorithm: Algorithm) -> None:
 
     def begin() -> Any:
         state = training.init(env, algorithm, jax.random.key(0))
-        return training.iterate(env, algorithm, state)
+        return training.train_step(env, algorithm, state)
 
     package = pathlib.Path(training.__file__).parent
     what = f"agent {algorithm.agent.name!r} can't be traced"
-    with command_line.input_checked(), own_code.refused(what, package):
+    with command_line.input_checked(), user_code.refused(what, package):
         jax.eval_shape(begin)

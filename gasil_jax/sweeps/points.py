@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import algorithms
+from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import names, ranges
 from gasil_jax.errors import InputError, did_you_mean, refusal
 from gasil_jax.host import run_options
 from gasil_jax.host.command_line import whole_number
-from gasil_jax.imitation import agents_with
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]

@@ -21,6 +21,10 @@ ALGORITHM_VERSION = 2
 #: Settings of an environment that compute the same thing in different ways.
 _WAYS = ("physics", "solver")
 
+#: The names of settings in a run's key and in stored runs, where they differ from those
+#: here. So a setting can be renamed, and stored runs keep their keys.
+STORED_NAMES: Mapping[str, str] = {"initial_std": "initial_deviation"}
+
 #: Settings that are newer than stored runs, of algorithms or of environments, with the
 #: value that those runs had, which is the default. A setting with this value is left
 #: out of a run's key, so that stored runs keep theirs.
@@ -79,7 +83,7 @@ class Run:
             "env": self.env,
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
-            "algorithm": values,
+            "algorithm": {STORED_NAMES.get(x, x): y for x, y in values.items()},
         }
 
     @functools.cached_property
@@ -97,8 +101,9 @@ class Run:
     def shapes(self) -> str:
         """The settings that runs of one compiled program share, as JSON."""
         traced = self.algorithm.hyperparameters
+        numbers = {STORED_NAMES.get(name, name) for name in traced}
         algorithm = {
-            name: None if name in traced else value
+            name: None if name in numbers else value
             for name, value in self._fields["algorithm"].items()
         }
         return json.dumps({**self._fields, "algorithm": algorithm}, sort_keys=True)
@@ -120,7 +125,9 @@ def read_run(
     """
     fields = dict(experiment)
     own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
-    algorithm = descriptions.read(fields.pop("algorithm"))
+    current = {stored: name for name, stored in STORED_NAMES.items()}
+    settings = fields.pop("algorithm")
+    algorithm = descriptions.read({current.get(x, x): y for x, y in settings.items()})
     if total_steps is not None:
         algorithm = algorithm.replace(total_steps=total_steps)
     settings = json_reader.as_type(Settings, fields, "settings")

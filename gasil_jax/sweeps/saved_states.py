@@ -16,6 +16,7 @@ import numpy as np
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import numpy_policy, policy, train
+from gasil_jax.agents.adversarial import AdversarialAgent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
 from gasil_jax.errors import InputError, refusal
@@ -27,7 +28,6 @@ from gasil_jax.host import (
     run_folder,
 )
 from gasil_jax.host.members import member
-from gasil_jax.imitation.adversarial import AdversarialAgent
 from gasil_jax.sweeps import programs
 from gasil_jax.sweeps.plan import stored_plan
 from gasil_jax.sweeps.programs import Program

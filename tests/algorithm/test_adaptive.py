@@ -11,8 +11,8 @@ from test_train import SMALL
 
 import gasil_jax
 from gasil_jax import good_trajectories
+from gasil_jax.agents import adaptive, adversarial
 from gasil_jax.context import Sizes
-from gasil_jax.imitation import adaptive, adversarial
 from gasil_jax.testing import example_context
 
 ADAPTIVE = SMALL["ppo+gasil-adaptive"]

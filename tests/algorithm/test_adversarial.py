@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import gasil_jax
-from gasil_jax.imitation import adversarial
+from gasil_jax.agents import adversarial
 from gasil_jax.testing import example_context
 
 

@@ -78,7 +78,7 @@ def programs(agent):
     numbers = dict.fromkeys(algorithm.hyperparameters, two)
     init = jax.jit(init).lower(keys, numbers).compile()
     iterate = jax.vmap(
-        lambda state, factor: gasil_jax.iterate(Scaled(ENV, factor), algorithm, state)
+        lambda x, factor: gasil_jax.train_step(Scaled(ENV, factor), algorithm, x)
     )
     return init, jax.jit(iterate).lower(init.out_info, two).compile()
 
@@ -101,7 +101,7 @@ def close(**tolerance):
 
 
 def test_every_agent_but_the_taught_one_is_tested():
-    assert [*ALGORITHMS, "gail"] == list(gasil_jax.agents())
+    assert [*ALGORITHMS, "gail"] == list(gasil_jax.agents.AGENTS)
 
 
 @pytest.mark.parametrize("agent", each(SELF_TAUGHT))

@@ -35,7 +35,7 @@ def networks():
     @jax.jit
     def first(key):
         state = gasil_jax.init(ENV, CLONING, key)
-        return gasil_jax.iterate(ENV, CLONING, state)[0].actor_critic
+        return gasil_jax.train_step(ENV, CLONING, state)[0].actor_critic
 
     return first(KEY)
 

@@ -151,7 +151,7 @@ FLAGS = (
 def finished(tmp_path_factory):
     """A run with delayed, decomposed rewards and noise."""
     out = str(tmp_path_factory.mktemp("discrete") / "run")
-    more = ("--seeds", "2", "--evaluate-every", "512", "--initial-deviation", "0.5")
+    more = ("--seeds", "2", "--evaluate-every", "512", "--initial-std", "0.5")
     assert run.main([*FLAGS, *more, "--total-steps", "1024", "--out", out]) == 0
     return out
 
@@ -160,7 +160,7 @@ def test_a_run_from_end_to_end(finished, tmp_path, capsys):
     # Finished, it is not trained again.
     assert run.main(["--resume", "--out", finished]) == 0
     said = capsys.readouterr()
-    assert "initial_deviation is 0.5, which has no effect: the actions of" in said.err
+    assert "initial_std is 0.5, which has no effect: the actions of" in said.err
     assert "gasil_jax.render" in said.out
     assert evaluate.main([finished, "--episodes", "4"]) == 0
     assert evaluate.main([finished, "--episodes", "4", "--stochastic"]) == 0

@@ -16,10 +16,10 @@ from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import evaluate
+from gasil_jax.agents import expert as expert_module
 from gasil_jax.context import Sizes
 from gasil_jax.host import resources, run_options
 from gasil_jax.host.members import make_members
-from gasil_jax.imitation import expert as expert_module
 from gasil_jax.run import main
 
 

@@ -72,7 +72,7 @@ def assert_close(compiled, eager):
 def test_a_compiled_iteration_equals_an_eager_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
     env = gasil_jax.make_env("point_mass", reward_delay=2, max_episode_steps=2)
-    iterate = lambda state: gasil_jax.iterate(env, ALGORITHM, state)
+    iterate = lambda state: gasil_jax.train_step(env, ALGORITHM, state)
     init = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))
     with without_optimizations():  # Both begin with the same state.
         first = init(jax.random.key(0))
@@ -115,7 +115,7 @@ def test_matrices_are_multiplied_in_full_precision():
     env = gasil_jax.make_env("point_mass", max_episode_steps=2)
     init = lambda: gasil_jax.init(env, ALGORITHM, jax.random.key(0))
     state = jax.eval_shape(init)
-    jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, ALGORITHM, x))(state)
+    jaxpr = jax.make_jaxpr(lambda x: gasil_jax.train_step(env, ALGORITHM, x))(state)
     precisions = list(products(jaxpr.jaxpr))
     assert len(precisions) > 10
     assert set(precisions) == {(highest, highest)}
@@ -126,5 +126,5 @@ def test_matrices_are_multiplied_in_full_precision():
     assert precisions and set(precisions) == {(highest, highest)}
     # What the program asks for itself it gets.
     with jax.default_matmul_precision("default"):
-        jaxpr = jax.make_jaxpr(lambda x: gasil_jax.iterate(env, ALGORITHM, x))(state)
+        jaxpr = jax.make_jaxpr(lambda x: gasil_jax.train_step(env, ALGORITHM, x))(state)
     assert (highest, highest) not in set(products(jaxpr.jaxpr))

@@ -119,10 +119,10 @@ def test_a_component_is_drawn_by_its_weight():
 
 
 @pytest.mark.parametrize("components", [2, 5])
-def test_an_untrained_policy_has_the_initial_deviation_and_components_apart(components):
+def test_an_untrained_policy_has_the_initial_std_and_components_apart(components):
     env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.algorithm(
-        "ppo", policy_components=components, initial_deviation=0.25
+        "ppo", policy_components=components, initial_std=0.25
     )
     init = lambda key: gasil_jax.init(env, algorithm, key)
     state = jax.jit(init)(jax.random.key(0))

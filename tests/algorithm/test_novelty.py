@@ -8,7 +8,7 @@ import numpy as np
 
 import gasil_jax
 from gasil_jax import normalization
-from gasil_jax.imitation.novelty import PPOBCNovelty, PPONovelty
+from gasil_jax.agents.novelty import PPOBCNovelty, PPONovelty
 from gasil_jax.testing import example_context
 
 ENV = gasil_jax.make_env("sparse:u_maze", max_episode_steps=8)

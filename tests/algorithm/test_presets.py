@@ -34,7 +34,7 @@ def parse(*arguments):
 def test_every_row_is_valid_and_of_something_that_exists(name, reward_delay):
     rows = presets.PRESETS[name][reward_delay > 1]
     for (env, agent), overrides in rows.items():
-        assert env in gasil_envs.names() and agent in gasil_jax.agents()
+        assert env in gasil_envs.names() and agent in gasil_jax.agents.AGENTS
         algorithm = gasil_jax.preset(env, agent, name, reward_delay=reward_delay)
         algorithms.check(algorithm)
         assert overrides and algorithm != gasil_jax.algorithm(agent)
@@ -58,7 +58,7 @@ def test_a_tuned_row_is_the_one_that_returns_most():
     """On humanoid that is with the values of PPO's search, for all agents."""
     rows = {x: gasil_jax.preset("humanoid", x).config for x in PAPERS}
     assert {x.gae_lambda for x in rows.values()} == {0.9}
-    assert {x.initial_deviation for x in rows.values()} == {0.25}
+    assert {x.initial_std for x in rows.values()} == {0.25}
     store = Store(RESULTS / "runs")
     own = Search("walker2d", "ppo+gasil")
     assert gasil_jax.preset("walker2d") == own.algorithm(own.chosen(store))
@@ -72,7 +72,7 @@ def test_scaled_rows_follow_the_number_of_actions(env):
     # Straight lines from two dimensions to eight; more have the values of eight.
     ends = {
         "learning_rate": (7.5e-4, 1e-4),
-        "initial_deviation": (0.7, 0.25),
+        "initial_std": (0.7, 0.25),
         "gae_lambda": (0.975, 0.9),
     }
     for delay in (1, DELAY):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax import good_trajectories
-from gasil_jax.imitation import self_imitation
+from gasil_jax.agents import self_imitation
 
 GAMMA = 0.9
 

@@ -148,7 +148,7 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
         gamma=1.0,
     )
     algorithm = gasil_jax.Algorithm(agent, config=config)
-    iterate = jax.jit(lambda state: gasil_jax.iterate(env, algorithm, state))
+    iterate = jax.jit(lambda state: gasil_jax.train_step(env, algorithm, state))
 
     def train(state):
         rows = []

@@ -38,7 +38,7 @@ def test_an_example_is_what_the_first_iteration_gives():
     @jax.jit
     def first(key):
         state = gasil_jax.init(env, algorithm, key)
-        return state.agent, *gasil_jax.iterate(env, algorithm, state)
+        return state.agent, *gasil_jax.train_step(env, algorithm, state)
 
     before, state, metrics = first(key)
     kinds = lambda tree: jax.tree.map(

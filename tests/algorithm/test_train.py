@@ -177,7 +177,7 @@ def test_a_state_may_begin_outside_of_jit_and_be_donated():
     """With noise the environment's state holds keys."""
     env = gasil_jax.make_env("point_mass", obs_noise=0.1)
     key = jax.random.key(0)
-    iterate = lambda state: gasil_jax.iterate(env, PPO, state)[0]
+    iterate = lambda state: gasil_jax.train_step(env, PPO, state)[0]
     step = jax.jit(iterate, donate_argnums=0)
     result = step(gasil_jax.init(env, PPO, key))
     expected = step(jax.jit(lambda key: gasil_jax.init(env, PPO, key))(key))
@@ -219,7 +219,7 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
 
     state = init(PPO_GASIL)
     traced = lambda state, algorithm=PPO_GASIL: jax.eval_shape(
-        lambda state: gasil_jax.iterate(env, algorithm, state), state
+        lambda state: gasil_jax.train_step(env, algorithm, state), state
     )
     own = lambda **changes: state.replace(
         hyperparameters={**state.hyperparameters, **changes}
@@ -228,7 +228,7 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
     with pytest.raises(ValueError, match=r"alpha has shape \(\d+,\): .*vmap"):
         traced(own(alpha=jnp.ones(CONFIG.num_envs)))
     with pytest.raises(ValueError, match=r"alpha is -1.0: it must be 0 or more"):
-        gasil_jax.iterate(env, PPO_GASIL, own(alpha=-1.0))
+        gasil_jax.train_step(env, PPO_GASIL, own(alpha=-1.0))
     with pytest.raises(ValueError, match=r"sil_coefficient is a setting of ppo\+sil"):
         traced(own(sil_coefficient=0.1))
     pair = jax.tree.map(lambda x: jax.ShapeDtypeStruct((2, *x.shape), x.dtype), state)

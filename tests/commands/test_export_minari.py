@@ -10,8 +10,8 @@ import pytest
 from small_training import FLAGS
 
 from gasil_jax import export_minari, good_trajectories, run
+from gasil_jax.agents import expert
 from gasil_jax.host import checkpoint
-from gasil_jax.imitation import expert
 from gasil_jax.sweeps import saved_states
 
 minari = pytest.importorskip("minari")

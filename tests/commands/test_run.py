@@ -17,7 +17,7 @@ import pytest
 from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
-from gasil_envs import locomotion, own_code
+from gasil_envs import locomotion, user_code
 from gasil_jax.host import command_line, run_options
 from gasil_jax.run import main
 from gasil_jax.sweeps import assembly
@@ -41,7 +41,7 @@ def finished(tmp_path_factory):
     return folder / "out", told.getvalue(), printed.getvalue()
 
 
-@pytest.mark.parametrize("agent", gasil_jax.agents())
+@pytest.mark.parametrize("agent", gasil_jax.agents.AGENTS)
 def test_the_help_explains_every_option_in_whole_lines(agent, monkeypatch, capsys):
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
@@ -300,7 +300,7 @@ def test_code_that_exits_later_does_not_decide_the_status(capsys):
 def test_ctrl_c_passes_through_what_checks_the_users_code():
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        with pytest.raises(KeyboardInterrupt), own_code.refused("never said"):
+        with pytest.raises(KeyboardInterrupt), user_code.refused("never said"):
             signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, handler)

@@ -9,7 +9,7 @@ import pytest
 from environment_contract import BATCH, check_reset_and_step
 
 import gasil_envs
-from gasil_envs import locomotion, mazes, own_environment, pictures, wrappers
+from gasil_envs import locomotion, mazes, pictures, user_environment, wrappers
 
 
 def is_robot(name):
@@ -19,7 +19,7 @@ def is_robot(name):
 @pytest.mark.parametrize("name", [x for x in mazes.names() if not is_robot(x)])
 def test_reset_and_step(name):
     env = gasil_envs.make(f"sparse:{name}")
-    own_environment.check(name, env.env, env)
+    user_environment.check(name, env.env, env)
     check_reset_and_step(
         env,
         jax.jit(jax.vmap(env.reset)),
@@ -34,7 +34,7 @@ def test_reset_and_step(name):
 @pytest.mark.parametrize("name", ["hopper", "halfcheetah_noisy"])
 def test_a_robot_is_paid_for_each_healthy_step_beyond_its_distance_alone(name):
     env = gasil_envs.make(f"sparse:{name}")
-    own_environment.check(name, env.env, env)
+    user_environment.check(name, env.env, env)
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     check_reset_and_step(env, reset, step)
     start = reset(jax.random.split(jax.random.key(0), BATCH))

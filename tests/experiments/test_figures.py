@@ -128,7 +128,7 @@ def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path
         scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
         by_root = scaled.replace(
             learning_rate=1.5e-3 / size,
-            initial_deviation=1 / math.sqrt(size),
+            initial_std=1 / math.sqrt(size),
             gae_lambda=1 - math.sqrt(size) / 40,
         )
         algorithms = [
@@ -141,6 +141,6 @@ def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path
             scaled,
             by_root,
             by_root.replace(gae_lambda=0.95),
-            by_root.replace(gae_lambda=0.95, initial_deviation=inverse),
+            by_root.replace(gae_lambda=0.95, initial_std=inverse),
             by_root.replace(gae_lambda=both[0], gamma=both[1]),
         ]

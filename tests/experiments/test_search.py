@@ -141,7 +141,7 @@ def test_what_matters_is_told(tmp_path):
         fill(store, one, points, [1e4 * x["gamma"] for x in points])
     shares = search.importance("ppo", store)
     assert shares["gamma"] == pytest.approx(1.0)
-    assert max(shares["gae_lambda"], shares["initial_deviation"]) < 0.3
+    assert max(shares["gae_lambda"], shares["initial_std"]) < 0.3
     row = next(
         x for x in Page("matrix", store).importance().splitlines() if "| ppo |" in x
     )
@@ -191,7 +191,7 @@ def test_the_papers_protocol_has_the_appendix_s_values():
         assert algorithm.settings["normalize_rewards"] and not config.stagger_episodes
         assert (config.num_epochs, config.minibatch_size) == (10, 64)
         assert (config.gamma, config.gae_lambda) == (0.99, 0.95)
-        assert config.initial_deviation == 1.0 and config.entropy_coefficient == 0.0
+        assert config.initial_std == 1.0 and config.entropy_coefficient == 0.0
 
 
 def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):

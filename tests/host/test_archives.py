@@ -8,7 +8,7 @@ import pytest
 from altered_archives import altered
 
 from gasil_jax import numpy_policy, policy
-from gasil_jax.imitation import expert
+from gasil_jax.agents import expert
 
 POLICY = {
     "seeds": np.arange(2),

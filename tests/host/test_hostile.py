@@ -10,7 +10,7 @@ from hostile_values import drawn, is_real, is_whole
 
 import gasil_jax
 from gasil_jax import algorithms, config, evaluation, numpy_policy
-from gasil_jax.imitation import AGENTS
+from gasil_jax.agents import AGENTS
 from gasil_jax.policy import from_state
 from gasil_jax.sweeps import fitting, saved_states
 
@@ -193,7 +193,7 @@ CASES = [
     ],
     ("callback", lambda x: fit(callback=x), lambda x: x is None or callable(x)),
     ("key", lambda x: POLICY(np.zeros(17), x), lambda x: x is None or is_key(x)),
-    ("state", lambda x: gasil_jax.iterate(ENV, SMALL, x), lambda x: False),
+    ("state", lambda x: gasil_jax.train_step(ENV, SMALL, x), lambda x: False),
     ("state", lambda x: from_state(x, ENV), lambda x: False),
     ("env", lambda x: gasil_jax.make_train(x, SMALL), lambda x: False),
     ("algorithm", lambda x: gasil_jax.make_train(ENV, x), lambda x: False),

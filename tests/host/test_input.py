@@ -22,10 +22,10 @@ from hypothesis import strategies as st
 import gasil_jax
 from gasil_envs import wrappers
 from gasil_jax import algorithms, evaluate, evaluation, merge, npz, run, sweep
+from gasil_jax.agents import AGENTS, expert
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file, run_folder
 from gasil_jax.host.environments import Settings, check
-from gasil_jax.imitation import AGENTS, expert
 from gasil_jax.rewards import REWARD_MODELS
 
 
@@ -111,7 +111,7 @@ ANY_FLOAT = st.one_of(
 def small_algorithms(draw):
     """Draw small algorithms, about one in four valid."""
     # GAIL needs an expert.
-    agent = draw(st.sampled_from([x for x in gasil_jax.agents() if x != "gail"]))
+    agent = draw(st.sampled_from([x for x in gasil_jax.agents.AGENTS if x != "gail"]))
     algorithm = gasil_jax.algorithm(agent, normalize_rewards=draw(st.booleans()))
     factor = draw(st.integers(1, 4))
     num_envs = draw(st.sampled_from([1, 2, 3]))
@@ -332,7 +332,7 @@ def test_traced_values_pass_unlooked_at():
 def test_an_accepted_algorithm_completes_an_iteration(algorithm):
     env = gasil_jax.make_env("point_mass", reward_delay=2)
     init = lambda key: gasil_jax.init(env, algorithm, key)
-    first = jax.jit(lambda key: gasil_jax.iterate(env, algorithm, init(key)))
+    first = jax.jit(lambda key: gasil_jax.train_step(env, algorithm, init(key)))
     state, _ = first(jax.random.key(0))
     assert int(state.iteration) == 1
     for leaf in jax.tree.leaves((state.actor_critic, state.agent)):

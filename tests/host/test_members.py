@@ -66,7 +66,7 @@ def test_a_members_result_is_its_own():
     """With a seed and numbers of its own it is trained as `make_train` trains it."""
     members, states, advance = compiled("ppo+gasil")
     half = {x: 0.5 * y for x, y in members.algorithm.hyperparameters.items()}
-    del half["initial_deviation"]  # The first states are already drawn.
+    del half["initial_std"]  # The first states are already drawn.
     numbers = {x: states.hyperparameters[x].at[1].set(half[x]) for x in half}
     numbers = {**states.hyperparameters, **numbers}
     states = members.to_devices(states.replace(hyperparameters=numbers))

@@ -38,7 +38,7 @@ _MANY = (
     "clip_epsilon",
     "entropy_coefficient",
     "max_grad_norm",
-    "initial_deviation",
+    "initial_std",
     "alpha",
 )
 

@@ -20,11 +20,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import good_trajectories, learner, normalization, ppo
+from gasil_jax.agents.adaptive import follow_return, gap
+from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
-from gasil_jax.imitation.adaptive import follow_return, gap
-from gasil_jax.imitation.buffered import BufferedAgent
 from gasil_jax.learner import Learner
 from gasil_jax.ppo import ActorCritic
 

@@ -6,15 +6,15 @@ An agent of your own code is named MODULE:CLASS and needs no entry.
 
 from collections.abc import Mapping
 
+from gasil_jax.agents.adaptive import PPOGASILAdaptive
+from gasil_jax.agents.adversarial import GAIL, GASIL, PPOGASIL
+from gasil_jax.agents.behavior_cloning import PPOBC, PPOBCAdaptive
+from gasil_jax.agents.constant_bonus import PPOBonus
+from gasil_jax.agents.interface import Agent
+from gasil_jax.agents.novelty import PPOBCNovelty, PPONovelty
+from gasil_jax.agents.ppo import PPO
+from gasil_jax.agents.self_imitation import PPOSIL
 from gasil_jax.config import names
-from gasil_jax.imitation.adaptive import PPOGASILAdaptive
-from gasil_jax.imitation.adversarial import GAIL, GASIL, PPOGASIL
-from gasil_jax.imitation.behavior_cloning import PPOBC, PPOBCAdaptive
-from gasil_jax.imitation.constant_bonus import PPOBonus
-from gasil_jax.imitation.interface import Agent
-from gasil_jax.imitation.none import PPO
-from gasil_jax.imitation.novelty import PPOBCNovelty, PPONovelty
-from gasil_jax.imitation.self_imitation import PPOSIL
 
 #: The package's own agents by name.
 AGENTS: Mapping[str, type[Agent]] = {
@@ -33,11 +33,6 @@ AGENTS: Mapping[str, type[Agent]] = {
         GAIL,
     )
 }
-
-
-def agents() -> tuple[str, ...]:
-    """Return the names of the package's agents."""
-    return tuple(AGENTS)
 
 
 def agents_with(setting: str) -> list[str]:
@@ -59,6 +54,5 @@ __all__ = [
     "PPOBonus",
     "PPOGASILAdaptive",
     "PPONovelty",
-    "agents",
     "agents_with",
 ]

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from gasil_jax import good_trajectories, normalization
+from gasil_jax.agents.interface import Agent
 from gasil_jax.config import choice, count, number, switch
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
-from gasil_jax.imitation.interface import Agent
 from gasil_jax.rollout import Rollout
 
 

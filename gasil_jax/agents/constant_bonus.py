@@ -7,9 +7,9 @@ agent is the effect of imitation.
 
 import jax
 
+from gasil_jax.agents.interface import Agent
 from gasil_jax.config import Schedule, number, schedule
 from gasil_jax.context import Context, Metrics
-from gasil_jax.imitation.interface import Agent
 
 
 class PPOBonus(Agent):

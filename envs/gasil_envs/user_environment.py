@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from brax.envs import Env
 
-from gasil_envs import own_code, wrappers
+from gasil_envs import user_code, wrappers
 
 #: The attributes of Brax's interface that training uses.
 INTERFACE = ("reset", "step", "observation_size")
@@ -35,7 +35,7 @@ def find(name: str) -> Callable[[], Env]:
     Raises:
       ValueError: if it can't be imported or needs arguments.
     """
-    constructor = own_code.find("env", name)
+    constructor = user_code.find("env", name)
     try:
         inspect.signature(constructor).bind()
     except (TypeError, ValueError) as error:
@@ -52,7 +52,7 @@ def build(name: str) -> Env:
       ValueError: if it can't be built or does not have Brax's interface.
     """
     constructor = find(name)
-    with own_code.refused(f"env {name!r} can't be built"):
+    with user_code.refused(f"env {name!r} can't be built"):
         env = constructor()
         # An attribute may be a property, which is the user's code too.
         lacking = missing(env)
@@ -87,7 +87,7 @@ def check(name: str, env: Any, trained: Any) -> None:
     for function in ("reset", "step"):
         if not callable(given := getattr(env, function)):
             raise ValueError(
-                f"env {name!r} has {function} {own_code.shown(given)}: it must be a "
+                f"env {name!r} has {function} {user_code.shown(given)}: it must be a "
                 "function"
             )
     if hasattr(env, "episode_length"):
@@ -138,17 +138,17 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
                 jax.eval_shape(lambda value=value: value)
             except TypeError:
                 raise ValueError(
-                    f"the {field} of its {function} is {own_code.shown(value)}: it "
+                    f"the {field} of its {function} is {user_code.shown(value)}: it "
                     "must be an array"
                 ) from None
         if not isinstance(state.info, Mapping):
             raise ValueError(
-                f"the info of its {function} is {own_code.shown(state.info)}: it must "
+                f"the info of its {function} is {user_code.shown(state.info)}: it must "
                 "be a dict"
             )
         return state
 
-    with own_code.refused(f"env {name!r} can't be traced"):
+    with user_code.refused(f"env {name!r} can't be traced"):
         return jax.eval_shape(called, *arguments)
 
 
@@ -189,7 +189,7 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
     if trained is not env:
         first = _traced(name, trained, "reset", key)
         then = _traced(name, trained, "step", first, action)
-    if change := own_code.first_change(first, then):
+    if change := user_code.first_change(first, then):
         path, before, after = change
         raise ValueError(
             f"env {name!r}: state{path} is {before} after its reset and {after} after "

@@ -1,6 +1,6 @@
 """No imitation: PPO alone."""
 
-from gasil_jax.imitation.interface import Agent
+from gasil_jax.agents.interface import Agent
 
 
 class PPO(Agent):

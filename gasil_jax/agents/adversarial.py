@@ -24,6 +24,9 @@ import numpy as np
 from flax import struct
 
 from gasil_jax import learner, normalization
+from gasil_jax.agents import expert
+from gasil_jax.agents.buffered import BufferedAgent
+from gasil_jax.agents.interface import Agent
 from gasil_jax.config import (
     Schedule,
     choice,
@@ -36,9 +39,6 @@ from gasil_jax.config import (
 )
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
-from gasil_jax.imitation import expert
-from gasil_jax.imitation.buffered import BufferedAgent
-from gasil_jax.imitation.interface import Agent
 from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
 from gasil_jax.rollout import Rollout

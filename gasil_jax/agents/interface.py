@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_envs import own_code
+from gasil_envs import user_code
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.ppo import ActorCritic
@@ -221,7 +221,7 @@ class Checked:
         # Undoing an update would broadcast other shapes and convert other dtypes.
         # Leaves may be Python's numbers until their shapes are evaluated.
         shapes = jax.eval_shape(lambda: (before, value))
-        if change := own_code.first_change(*shapes):
+        if change := user_code.first_change(*shapes):
             path, expected, given = change
             raise ValueError(
                 f"{function} of agent {self._agent.name!r}: the returned {what}{path} "

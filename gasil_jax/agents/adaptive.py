@@ -28,10 +28,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import good_trajectories
+from gasil_jax.agents.adversarial import SelfImitatingAgent
 from gasil_jax.config import choice, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
-from gasil_jax.imitation.adversarial import SelfImitatingAgent
 from gasil_jax.learner import Learner
 from gasil_jax.rewards import normalization as reward_normalization
 

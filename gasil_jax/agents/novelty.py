@@ -23,11 +23,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import normalization
+from gasil_jax.agents.behavior_cloning import PPOBC
+from gasil_jax.agents.interface import Agent
 from gasil_jax.config import choice, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.good_trajectories import GoodTrajectories
-from gasil_jax.imitation.behavior_cloning import PPOBC
-from gasil_jax.imitation.interface import Agent
 from gasil_jax.ppo import ActorCritic
 
 # The number of counters (a hash maps cells to counters, so cells may share one), and of
