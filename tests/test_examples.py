@@ -35,11 +35,10 @@ def run_script(monkeypatch, capsys):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Let examples train with less; PPO+BONUS, with an alpha too, compiles sooner."""
+    """Let examples train with less."""
 
     def smaller(original):
         def make(*names, **settings):
-            names = ["ppo+bonus" if x == "ppo+gasil" else x for x in names]
             return original(*names, **settings).replace(**SMALL)
 
         return make
