@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from flax import struct
 
 from gasil_envs import user_code
@@ -25,8 +26,8 @@ Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 #: What follows the name of a number in the name of its schedule.
 SCHEDULE_SUFFIX = "_schedule"
 
-#: Counts are int32.
-_LARGEST_COUNT = 2**31 - 1
+#: Counts are int32, and all other numbers float32.
+_LARGEST_COUNT, _LARGEST_FLOAT = 2**31 - 1, 3.4e38
 
 
 class Range(NamedTuple):
@@ -40,7 +41,7 @@ class Range(NamedTuple):
     """
 
     low: float
-    high: float = math.inf
+    high: float = _LARGEST_FLOAT
     excludes_low: bool = False
     whole: bool = False
 
@@ -49,7 +50,7 @@ class Range(NamedTuple):
         if not isinstance(value, kind) or isinstance(value, bool):
             return False
         is_above = value > self.low if self.excludes_low else value >= self.low
-        return bool(is_above and value <= self.high and abs(value) < math.inf)
+        return bool(is_above and value <= self.high)
 
     def __str__(self) -> str:
         if self.whole:
@@ -57,7 +58,7 @@ class Range(NamedTuple):
             return f"a whole number, {self.low:g} or more{most}"
         least = f"{'more than ' * self.excludes_low}{self.low:g}"
         least += "" if self.excludes_low else " or more"
-        most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"
+        most = f"at most {self.high:g}" if self.high < _LARGEST_FLOAT else "finite"
         return f"{least} and {most}"
 
 
@@ -65,7 +66,11 @@ _COUNT = Range(1, _LARGEST_COUNT, whole=True)
 
 
 def number(
-    default: float, low: float, high: float = math.inf, *, excludes_low: bool = False
+    default: float,
+    low: float,
+    high: float = _LARGEST_FLOAT,
+    *,
+    excludes_low: bool = False,
 ) -> Any:
     """Declare a number, a traced leaf of the pytree: each run may have its own.
 
@@ -278,8 +283,9 @@ def validate_number(name: str, value: Any, allowed: Range) -> None:
         )
     if isinstance(value, jax.core.Tracer):
         return
-    # Arrays of one number, of NumPy or JAX.
-    value = value.item() if hasattr(value, "item") else value
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
+        value = value.item()
     if value not in allowed:
         raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
 
@@ -290,7 +296,10 @@ def _validate_schedule(name: str, schedule: Any, total_steps: int) -> None:
         for step in (0, total_steps):
             what = f"{name} gives no number at step {step}"
             with user_code.refused(what), jax.ensure_compile_time_eval():
-                factor = float(schedule(jax.numpy.float32(step)))
+                factor = schedule(jax.numpy.float32(step))
+                if isinstance(factor, jax.core.Tracer):
+                    return
+                factor = float(factor)
             validate_number(f"{name}({step})", factor, Range(0.0))
         return
     pairs = "(steps, factor) points, steps increasing"
