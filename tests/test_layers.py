@@ -12,7 +12,7 @@ COMMANDS = ("run", "sweep", "merge", "evaluate", "render", "plot", "export_minar
 #: for the expert that GAIL imitates.
 OF_FILES = {"io", "json", "os", "pathlib", "shutil", "tempfile", "gasil_jax.npz"}
 OF_FILES |= {"gasil_jax.numpy_policy"}
-READS_FILES = {"agents.expert", "policy", "npz", "numpy_policy"}
+READS_FILES = {"__main__", "agents.expert", "policy", "npz", "numpy_policy"}
 #: What modules of each layer may import of the package; "algorithms" is every other
 #: module at the top, and those of `agents` and `rewards`.
 ALLOWED = {
