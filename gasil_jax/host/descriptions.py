@@ -11,7 +11,7 @@ from gasil_jax.agents import AGENTS, Agent
 from gasil_jax.algorithms import Algorithm, check
 from gasil_jax.config import names
 from gasil_jax.errors import InputError, NotImportable, refusal, unknown
-from gasil_jax.host import json_reader
+from gasil_jax.host import json_files
 from gasil_jax.rewards import REWARD_MODELS
 
 
@@ -71,7 +71,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     agent = find_agent(settings.pop("agent"))
     algorithm = Algorithm(agent())
     switches = {
-        model.switch: json_reader.as_type(
+        model.switch: json_files.as_type(
             bool, settings.pop(model.switch, False), model.switch
         )
         for model in REWARD_MODELS
@@ -86,7 +86,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
             raise InputError(algorithm.why_not(name))
     return algorithm.replace(
         **{
-            name: json_reader.as_type(kinds[name], value, name)
+            name: json_files.as_type(kinds[name], value, name)
             for name, value in settings.items()
         }
     )

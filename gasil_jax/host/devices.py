@@ -11,8 +11,9 @@ from typing import Any
 import jax
 import jaxlib
 
-from gasil_jax.host import command_line, environments
+from gasil_jax.host import environments
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
 
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
@@ -31,7 +32,7 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
         # The program has used JAX before, so the devices stay as they are.
         running = len(jax.devices("cpu"))
         if requested is not None and running != count:
-            command_line.note(
+            note(
                 f"devices is {requested}, which has no effect: JAX is already running "
                 f"with {running} CPU device{'s' if running > 1 else ''}"
             )

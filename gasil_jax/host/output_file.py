@@ -5,6 +5,7 @@ import errno
 import os
 import pathlib
 import re
+import sys
 import uuid
 from collections.abc import Iterator, Sequence
 
@@ -18,6 +19,11 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 class WriteError(OSError):
     """A file or folder could not be written; the message is one line with its path."""
+
+
+def note(text: str) -> None:
+    """Print a line to stderr about something that is allowed but may be a mistake."""
+    print(f"note: {text}", file=sys.stderr)
 
 
 def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
@@ -90,14 +96,6 @@ def _partial(path: pathlib.Path) -> pathlib.Path:
 def is_temporary(path: pathlib.Path) -> bool:
     """Return whether it is a temporary file of `atomic`, by its name."""
     return re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name) is not None
-
-
-def delete_temporary(path: pathlib.Path) -> None:
-    """Delete the temporary files of killed processes; none may write the file now."""
-    for other in path.parent.glob(f".{path.stem}.*{path.suffix}"):
-        if is_temporary(other):
-            with contextlib.suppress(OSError):
-                other.unlink()
 
 
 @contextlib.contextmanager

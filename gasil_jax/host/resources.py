@@ -13,6 +13,8 @@ from gasil_envs import wrappers
 from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config
+from gasil_jax.host.programs import Program
+from gasil_jax.host.sweep import Recording
 
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
@@ -23,9 +25,47 @@ _OUTPUTS_PER_STEP = 2.5
 # Memory of an evaluated episode, in states of its environment. XLA reports 7 (point
 # mass) and 25 (hopper).
 _STATES_PER_EPISODE = 7
-# The folder of all control groups, and the file that lists those of this process.
+# The folder of all control groups, and the file that names that of this process.
 _CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
-_OWN_CONTROL_GROUPS = pathlib.Path("/proc/self/cgroup")
+_OWN_CONTROL_GROUP = pathlib.Path("/proc/self/cgroup")
+
+
+def check(
+    env: Any,
+    programs: Sequence[Program],
+    recording: Recording,
+    devices: Sequence[jax.Device],
+    folder: pathlib.Path,
+) -> None:
+    """Check that programs fit the devices' memory and the disk.
+
+    Args:
+      env: one environment.
+      programs: the programs, which are trained one after the other.
+      recording: what is recorded.
+      devices: the devices to train on.
+      folder: the folder of the checkpoints; it need not exist.
+
+    Raises:
+      ValueError: if one does not fit; the message gives the sizes.
+    """
+    sizes = []
+    for each in programs:
+        count, one = len(each.runs), need(env, each.algorithm)
+        check_memory(one, each.algorithm.config, count, devices)
+        if recording.evaluate_every is not None:
+            check_episodes(
+                env,
+                recording.evaluate_episodes,
+                count,
+                devices,
+                option="evaluate_episodes",
+            )
+        sizes.append((one.state, count))
+    written = sum(size_of_checkpoints(each.path) for each in programs)
+    # One more, because the best checkpoint is kept too.
+    count = recording.keep_checkpoints + 1
+    check_disk(sizes, folder, count, written=written)
 
 
 class Need(NamedTuple):
@@ -98,8 +138,6 @@ def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
             largest = max(sizes, key=lambda size: sizes[size])
             rows = sizes[largest]
             outputs = _OUTPUTS_PER_STEP * 4 * rows * (inputs + sum(settings[widths]))
-            if name.startswith("discriminator"):
-                outputs *= 1 + bool(settings.get("discriminator_gradient_penalty"))
             words = f"{largest} {rows} and {widths} {settings[widths]}"
             steps[f"outputs of layers, with {words}"] = int(outputs)
     return steps
@@ -131,58 +169,34 @@ def available(devices: Sequence[jax.Device]) -> int | None:
     return min(free, default=None)
 
 
-class _Files(NamedTuple):
-    """The files of a control group's limit and use, and the field of its cache."""
-
-    limit: str
-    used: str
-    cached: str
-
-
-_VERSION_1 = _Files(
-    "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
-)
-_VERSION_2 = _Files("memory.max", "memory.current", "inactive_file")
-
-
 def _free_in_control_groups(
-    root: pathlib.Path = _CONTROL_GROUPS, own: pathlib.Path = _OWN_CONTROL_GROUPS
+    root: pathlib.Path = _CONTROL_GROUPS, own: pathlib.Path = _OWN_CONTROL_GROUP
 ) -> list[int]:
-    """Return the bytes left below each limit of this process's control groups.
+    """Return the bytes left below each limit of this process's control group.
 
     A group's limit also holds for the groups in it. The kernel's cache of files counts
     as free.
 
     Args:
       root: the folder of all groups.
-      own: the file that lists the groups of this process.
+      own: the file that names the group of this process.
     """
-    free = []
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:  # Only Linux has control groups.
-        return []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        names, top = _VERSION_2, root
-        if controllers:
-            names, top = _VERSION_1, root / "memory"
-            if "memory" not in controllers.split(","):
-                continue
-        group = top / path.lstrip("/")
+    free: list[int] = []
+    # Only Linux has control groups, and a group may have no limit.
+    with contextlib.suppress(OSError, ValueError):
+        group = root / own.read_text().strip().split(":", 2)[2].lstrip("/")
         for folder in (group, *group.parents):
-            # The group may have no such file, or no limit.
             with contextlib.suppress(OSError, ValueError, LookupError):
-                free.append(_free_in(folder, names))
-            if folder == top:
+                limit, used = (
+                    int((folder / f"memory.{x}").read_text())
+                    for x in ("max", "current")
+                )
+                lines = (folder / "memory.stat").read_text().splitlines()
+                cached = int(dict(map(str.split, lines))["inactive_file"])
+                free.append(limit - used + cached)
+            if folder == root:
                 break
     return free
-
-
-def _free_in(group: pathlib.Path, names: _Files) -> int:
-    limit, used = (int((group / x).read_text()) for x in (names.limit, names.used))
-    lines = (group / "memory.stat").read_text().splitlines()
-    return limit - used + int(dict(map(str.split, lines))[names.cached])
 
 
 def _padded(count: int, devices: Sequence[jax.Device]) -> int:

@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line
+from gasil_jax.host.output_file import note
 
 _Config = Mapping[str, Any]
 #: What each member has of its own, by its label.
@@ -157,7 +157,7 @@ def check(names: Sequence[str]) -> None:
                 f'(pip install "gasil_jax[{name}]")'
             ) from None
     if "wandb" in names and _lacks_key():
-        command_line.note(
+        note(
             "log is 'wandb' and there is no API key: the run is kept in its folder, "
             "for `wandb sync` (`wandb login` beforehand logs online)"
         )

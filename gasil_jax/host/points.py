@@ -4,7 +4,7 @@ import itertools
 import json
 import math
 import pathlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,6 @@ from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import names, ranges
 from gasil_jax.errors import InputError, did_you_mean, refusal
-from gasil_jax.host import run_options
-from gasil_jax.host.command_line import whole_number
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -31,6 +29,20 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 }
 
 
+def whole_number(text: str) -> int:
+    """Return the whole number in a text, which may be written as 1e6.
+
+    Raises:
+      ValueError: if the text is not a whole number.
+    """
+    try:
+        return int(text)
+    except ValueError:
+        if (number := float(text)).is_integer():
+            return int(number)
+        raise
+
+
 def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
     """Return the names that a sweep may vary, with the type of their values."""
     return {
@@ -39,6 +51,22 @@ def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
         for name, allowed in ranges(part).items()
         if name not in _FIXED
     }
+
+
+def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
+    """Return points that all have the same names, without repetitions.
+
+    A point that lacks a name has the algorithm's own value.
+    """
+    listed = list(every)
+    varied = list(dict.fromkeys(name for point in listed for name in point))
+    own = algorithm.settings
+    kinds = _kinds(algorithm)
+    whole = [
+        {x: kinds.get(x, float)(point.get(x, own[x])) for x in varied}
+        for point in listed
+    ]
+    return tuple(x for i, x in enumerate(whole) if x not in whole[:i])
 
 
 def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
@@ -56,18 +84,18 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
             raise InputError(f"grid has {name} twice: give all its values in one entry")
         if name not in kinds:
             raise InputError(f"grid: {_why_not(name, algorithm)}")
-        read = whole_number if kinds[name] is int else float
+        number = whole_number if kinds[name] is int else float
         try:
-            values[name] = tuple(dict.fromkeys(map(read, listed.split(","))))
+            values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
         except ValueError:
-            like = f"numbers, like {name}=0.1,0.2"
-            if read is whole_number:
-                like = f"whole numbers, like {name}=10,20"
-            raise InputError(f"grid has {entry!r}: it must be {like}") from None
+            like = "whole numbers" if kinds[name] is int else "numbers"
+            raise InputError(
+                f"grid has {entry!r}: it must be {like}, like {name}=10,20"
+            ) from None
     return values
 
 
-def _read(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
+def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
     """Return the points that a JSON file lists.
 
     Raises:
@@ -75,22 +103,18 @@ def _read(path: pathlib.Path, algorithm: Algorithm) -> list[dict[str, Any]]:
     """
     source = f"points_file is {path}"
     try:
-        points = json.loads(path.read_text())
+        every = json.loads(path.read_text())
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"{source}, which can't be read: {error}") from None
-    if not isinstance(points, list) or not points:
+    if not isinstance(every, list) or not every:
         raise InputError(f"{source}: it must hold a list of points, one or more")
-    for point in points:
-        if not isinstance(point, dict):
-            raise InputError(f"{source}: {point!r} is not a point")
-        if points.count(point) > 1:
-            raise InputError(f"{source}: it has {point} twice")
-    check(points, algorithm, f"{source}: ")
-    kinds = _kinds(algorithm)
-    return [{name: kinds[name](x) for name, x in point.items()} for point in points]
+    if not all(isinstance(point, dict) for point in every):
+        raise InputError(f"{source}: each point must be an object, NAME: VALUE")
+    check(every, algorithm, f"{source}: ")
+    return every
 
 
-def check(points: Sequence[Point], algorithm: Algorithm, source: str = "") -> None:
+def check(every: Iterable[Point], algorithm: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed.
 
     Raises:
@@ -98,19 +122,28 @@ def check(points: Sequence[Point], algorithm: Algorithm, source: str = "") -> No
         value and the range.
     """
     allowed = _kinds(algorithm)
-    without_effect = run_options.without_effect(algorithm)
+    unused = without_effect(algorithm)
     try:
-        for point in points:
+        for point in every:
             for name, value in point.items():
                 if name not in allowed:
                     raise InputError(_why_not(name, algorithm))
                 if value is None:
                     raise refusal(name, value, "a number")
-                if name in without_effect:
-                    raise InputError(f"{name} can't vary: {without_effect[name]}")
+                if name in unused:
+                    raise InputError(f"{name} can't vary: {unused[name]}")
             algorithms.check(algorithm.replace(**point))
     except ValueError as error:
         raise InputError(f"{source}{error}") from None
+
+
+def without_effect(algorithm: Algorithm) -> dict[str, str]:
+    """Return the names of settings that have no effect, each with the reason."""
+    if algorithm.agent.uses_reward:
+        return {}
+    reason = f"agent {algorithm.agent.name!r} does not use the environment's reward"
+    every = [x for model in REWARD_MODELS for x in (model.switch, *names(model))]
+    return dict.fromkeys(every, reason)
 
 
 def _why_not(name: str, algorithm: Algorithm) -> str:
@@ -125,17 +158,18 @@ def _why_not(name: str, algorithm: Algorithm) -> str:
 def make_points(
     grid: Sequence[str],
     random: int | None,
-    points_file: str | None,
+    points_file: pathlib.Path | None,
     *,
     seed: int,
     algorithm: Algorithm,
-) -> list[dict[str, Any]]:
-    """Return the points of a sweep, without repetitions.
+) -> list[Point]:
+    """Return the points of a sweep.
 
     Args:
       grid: NAME=VALUE,VALUE,... for each name that varies.
       random: number of points to draw from the grid or, without a grid, from
-        `PAPER_RANGES`; None takes the whole grid.
+        `PAPER_RANGES`; None takes the whole grid. More points are those of a smaller
+        number, and others.
       points_file: a file that lists the points, instead of grid and random.
       seed: seed of the draws.
       algorithm: what the points change. Names that it does not have are left out of
@@ -147,27 +181,24 @@ def make_points(
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file can't be combined with grid or random")
-        return _read(pathlib.Path(points_file), algorithm)
+        return _read(points_file, algorithm)
     values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
-    if random is None and not values:
-        raise InputError(
-            "grid is empty: it must be NAME=VALUE,..., or use --random or --points-file"
-        )
     if random is None:
-        points = itertools.product(*values.values())
-        return [dict(zip(values, point, strict=True)) for point in points]
+        every = itertools.product(*values.values())
+        return [dict(zip(values, point, strict=True)) for point in every]
     kinds = _kinds(algorithm)
     values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)
-    if count >= 2**63:
-        raise InputError(f"random is {random}: the grid must have under 2**63 points")
-    if not 1 <= random <= count:
+    if not 1 <= random <= min(count, 10_000):
         raise InputError(
-            f"random is {random}: it must be at most {count}, the number of points, "
-            "and at least 1"
+            f"random is {random}: it must be from 1 to {min(count, 10_000):,}, of "
+            f"{count:,} points"
         )
-    chosen = np.random.default_rng(seed).choice(count, random, replace=False)
-    columns = zip(values.values(), np.unravel_index(chosen, sizes), strict=True)
-    drawn = zip(*([listed[i] for i in at] for listed, at in columns), strict=True)
-    return [dict(zip(values, point, strict=True)) for point in drawn]
+    generator, drawn = np.random.default_rng(seed), dict[tuple[int, ...], None]()
+    while len(drawn) < random:
+        drawn[tuple(int(generator.integers(size)) for size in sizes)] = None
+    return [
+        {name: x[i] for (name, x), i in zip(values.items(), at, strict=True)}
+        for at in drawn
+    ]

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.statistics import (
-    FEW_POINTS,
     FEWEST_SEEDS,
     are_numbers,
     bootstrap_interval,
@@ -216,7 +215,6 @@ def marginals(
     values: Mapping[str, Sequence[Any]],
     returns: np.ndarray,
     *,
-    importance: Mapping[str, float | None],
     best: int | None,
     left_out: int,
 ) -> None:
@@ -226,7 +224,6 @@ def marginals(
       path: the image file.
       values: each point's value of every hyperparameter that varies, by name.
       returns: each point's mean final return, (points,), all finite.
-      importance: `statistics.importance` of each hyperparameter.
       best: index of the point that is marked as the best; None for none.
       left_out: number of points without a return, which are not among these.
     """
@@ -239,9 +236,7 @@ def marginals(
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, name in zip(grid.flat, values):
         _draw_marginal(axes, values[name], returns, best=best)
-        share = importance[name]
-        title = "" if share is None else f"importance {share:.0%}"
-        axes.set(xlabel=name.replace("_", " "), title=title)
+        axes.set(xlabel=name.replace("_", " "))
     for axes in grid.flat[len(values) :]:
         axes.remove()
     for axes in grid[:, 0]:
@@ -252,12 +247,6 @@ def marginals(
     text = "point: mean over its seeds; mean: over the points of each value"
     if any(len(groups(x)) < len(set(x)) for x in values.values()):
         text += ", or of neighbouring values with fewer than two points each"
-    if any(share is not None for share in importance.values()):
-        text += "; importance: share of the points' variance that these means explain, "
-        text += "corrected for their number"
-        if len(returns) < FEW_POINTS:
-            text += f" (uncertain with {len(returns)} points: shares may add up to "
-            text += "more than 100%)"
     if left_out:
         text += f"; {left_out} of {len(returns) + left_out} points are left out, "
         text += "because a seed has no return"

@@ -9,8 +9,7 @@ from typing import Any
 
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import ranges
-from gasil_jax.errors import InputError
-from gasil_jax.host import descriptions, json_reader
+from gasil_jax.host import descriptions, json_files
 from gasil_jax.host.environments import Settings
 
 #: Raise this by hand when a change makes the same settings give different numbers, by
@@ -64,8 +63,8 @@ class Run:
         values = descriptions.describe(self.algorithm)
         for name, value in values.items():
             if callable(value):
-                raise InputError(f"{name} is a function: a stored run needs points")
-            if name.endswith("_schedule"):
+                values[name] = "a function"
+            elif name.endswith("_schedule"):
                 values[name] = [[float(x) for x in point] for point in value]
         # 1 and 1.0 are the same number, and so the same run.
         for part in self.algorithm.parts:
@@ -98,27 +97,34 @@ class Run:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @functools.cached_property
+    def identity(self) -> tuple[str, int]:
+        """What stays the same when training is continued to more steps."""
+        return identity(self._fields, self.seed)
+
+    @functools.cached_property
     def shapes(self) -> str:
         """The settings that runs of one compiled program share, as JSON."""
-        traced = self.algorithm.hyperparameters
-        numbers = {STORED_NAMES.get(name, name) for name in traced}
+        traced = {STORED_NAMES.get(x, x) for x in self.algorithm.hyperparameters}
         algorithm = {
-            name: None if name in numbers else value
+            name: None if name in traced else value
             for name, value in self._fields["algorithm"].items()
         }
         return json.dumps({**self._fields, "algorithm": algorithm}, sort_keys=True)
 
 
-def read_run(
-    experiment: Mapping[str, Any], seed: int, total_steps: int | None = None
-) -> Run:
+def identity(experiment: Mapping[str, Any], seed: int) -> tuple[str, int]:
+    """Return `Run.identity` from a parsed `Run.experiment` and a seed."""
+    algorithm = {**experiment["algorithm"], "total_steps": None}
+    return json.dumps({**experiment, "algorithm": algorithm}, sort_keys=True), seed
+
+
+def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
     """Return a stored run.
 
     Args:
       experiment: its `Run.experiment`, parsed from JSON. Settings that are missing,
         because they are newer than the stored run, have their defaults.
       seed: its seed.
-      total_steps: length of training to use instead of the stored one; None keeps it.
 
     Raises:
       ValueError: if a name is unknown, or a value of another type.
@@ -128,7 +134,5 @@ def read_run(
     current = {stored: name for name, stored in STORED_NAMES.items()}
     settings = fields.pop("algorithm")
     algorithm = descriptions.read({current.get(x, x): y for x, y in settings.items()})
-    if total_steps is not None:
-        algorithm = algorithm.replace(total_steps=total_steps)
-    settings = json_reader.as_type(Settings, fields, "settings")
+    settings = json_files.as_type(Settings, fields, "settings")
     return Run(algorithm=algorithm, seed=seed, settings=settings, **own)

@@ -1,0 +1,196 @@
+"""Evaluate the policies of a run: ``python -m gasil_jax.evaluate RUN``."""
+
+import csv
+import dataclasses
+import pathlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+import numpy as np
+
+from gasil_jax import numpy_policy, policy, statistics
+from gasil_jax.cli.parsing import (
+    POSITIONAL,
+    check_key,
+    check_minimum,
+    input_checked,
+    read,
+)
+from gasil_jax.cli.reporting import reports_errors
+from gasil_jax.errors import InputError, refusal
+from gasil_jax.evaluation import run_episodes
+from gasil_jax.host import environments, output_file, resources
+from gasil_jax.host.progress import announced
+from gasil_jax.host.saved import Policies, load_policies
+
+
+def evaluate_in_gymnasium(
+    gymnasium_id: str,
+    act: Callable[[np.ndarray], np.ndarray],
+    *,
+    num_episodes: int,
+    seed: int = 0,
+    num_steps: int | None = None,
+) -> dict[str, np.ndarray]:
+    """Run complete episodes of a policy in Gymnasium, with C MuJoCo.
+
+    Args:
+      gymnasium_id: name of the task, such as "Walker2d-v5".
+      act: observation -> action, as from `numpy_policy.load`.
+      num_episodes: number of episodes, which run one after the other.
+      seed: seed of the first episode; each next episode has the next seed.
+      num_steps: steps after which an episode is truncated; default the task's own.
+
+    Returns:
+      "episode_return" and "episode_length", (num_episodes,) each.
+    """
+    import gymnasium
+
+    if not callable(act):
+        raise refusal("act", act, "a function of an observation")
+    env = gymnasium.make(gymnasium_id, max_episode_steps=num_steps)
+    returns, lengths = [], []
+    for episode in range(num_episodes):
+        observation, _ = env.reset(seed=seed + episode)
+        total, length, running = 0.0, 0, True
+        while running:
+            observation, reward, terminated, truncated, _ = env.step(act(observation))
+            total, length = total + float(reward), length + 1
+            running = not (terminated or truncated)
+        returns.append(total)
+        lengths.append(length)
+    env.close()
+    return {
+        "episode_return": np.array(returns),
+        "episode_length": np.array(lengths),
+    }
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Evaluate the policies of a run, or of a point of a sweep.
+
+    Attributes:
+      run: folder of the run or sweep, or zoo:NAME, one of the package's policies.
+      point: number of a sweep's point in results.csv; default the one with the
+        highest mean final return, of those whose seeds all stayed finite.
+      checkpoint: checkpoint of the policies: last, or best, which has the best
+        evaluation or, without evaluations, the best mean return in training.
+      seed: evaluate only this seed; default all seeds.
+      episodes: number of episodes for each seed.
+      stochastic: draw actions from the policy instead of taking its mean.
+      gymnasium: evaluate in Gymnasium, with C MuJoCo, without delay and noise. Only for
+        locomotion, and not with stochastic.
+      key: random key of the episodes' starts and actions.
+      out: new CSV file, to which the return and length of each episode are written.
+    """
+
+    run: pathlib.Path = dataclasses.field(metadata=POSITIONAL)
+    point: int | None = None
+    checkpoint: Literal["last", "best"] = "last"
+    seed: int | None = None
+    episodes: int = 20
+    stochastic: bool = False
+    gymnasium: bool = False
+    key: int = 0
+    out: pathlib.Path | None = None
+
+
+def _score(options: Options, policies: Policies) -> dict[str, np.ndarray]:
+    def score(weights: Any, key: jax.Array) -> dict[str, jax.Array]:
+        return run_episodes(
+            policies.env,
+            policy.make(weights),
+            key,
+            num_episodes=options.episodes,
+            num_steps=policies.num_steps,
+            deterministic=not options.stochastic,
+        )
+
+    # A seed has the same starts and draws whether evaluated alone or with others.
+    def fold(seed: jax.Array) -> jax.Array:
+        return jax.random.fold_in(jax.random.key(options.key), seed)
+
+    keys = jax.jit(jax.vmap(fold))(np.array(policies.seeds, np.uint32))
+    weights = jax.tree.map(lambda *x: np.stack(x), *policies.weights)
+    return jax.tree.map(np.asarray, jax.jit(jax.vmap(score))(weights, keys))
+
+
+def _score_in_gymnasium(options: Options, policies: Policies) -> dict[str, np.ndarray]:
+    scores = [
+        evaluate_in_gymnasium(
+            policies.env.unwrapped.task.gymnasium_id,
+            numpy_policy.make(weights),
+            num_episodes=options.episodes,
+            seed=options.key,
+            num_steps=policies.num_steps,
+        )
+        for weights in policies.weights
+    ]
+    return jax.tree.map(lambda *x: np.stack(x), *scores)
+
+
+@reports_errors
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit status."""
+    options = read(Options, arguments, "gasil_jax.evaluate")
+    check_minimum(options, episodes=1)
+    check_key(options.key)
+    if options.out is not None:
+        output_file.check(options.out, (".csv",))
+    with input_checked():
+        policies = load_policies(
+            options.run, options.checkpoint, options.point, seed=options.seed
+        )
+    env, seeds = policies.env, policies.seeds
+    if options.gymnasium and not (
+        environments.is_locomotion(env) and env.unwrapped.task.gymnasium_id
+    ):
+        raise InputError(
+            "gymnasium is on: the run must be of a locomotion task of Gymnasium"
+        )
+    if options.gymnasium and env.observation_size != env.unwrapped.observation_size:
+        raise InputError(
+            "gymnasium is on: the run must be without observe_phase, which Gymnasium's "
+            "observations lack"
+        )
+    if options.gymnasium and options.stochastic:
+        raise InputError("gymnasium is on: stochastic must be off")
+    if not options.gymnasium:
+        with input_checked():
+            resources.check_episodes(
+                env, options.episodes, len(seeds), jax.devices()[:1]
+            )
+    if options.out is not None:
+        output_file.make_parent(options.out)
+    jax.config.update("jax_default_matmul_precision", "highest")
+    with announced("evaluate", f"running {options.episodes} episodes per seed"):
+        score = _score_in_gymnasium if options.gymnasium else _score
+        scores = score(options, policies)
+    print("seed  episodes      return        std  length")
+    for i, seed in enumerate(seeds):
+        returns, length = scores["episode_return"][i], scores["episode_length"][i]
+        print(
+            f"{seed:4d}  {options.episodes:8d}  {returns.mean():10.2f} "
+            f"{returns.std():10.2f}  {length.mean():6.1f}"
+        )
+    over_seeds = {"return": scores["episode_return"].mean(axis=1)}
+    print(statistics.in_words(over_seeds))
+    if options.out is not None:
+        _write(options.out, seeds, scores)
+        print(f"in {options.out}")
+    return 0
+
+
+def _write(
+    path: pathlib.Path, seeds: Sequence[int], scores: Mapping[str, np.ndarray]
+) -> None:
+    """Write a row for each episode."""
+    with output_file.atomic(path) as partial, partial.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["seed", "episode", *scores])
+        for index, seed in enumerate(seeds):
+            columns = [values[index].tolist() for values in scores.values()]
+            for episode, values in enumerate(zip(*columns, strict=True)):
+                writer.writerow([seed, episode, *values])
