@@ -31,10 +31,10 @@ from experiments.store import RESULTS, ResultsFolder
 from gasil_envs import wrappers
 from gasil_jax import PPOBC, policy
 from gasil_jax.agents import AGENTS
+from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.export_minari import episodes
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.host import command_line, devices, output_file
 from gasil_jax.host.environments import Settings
 

@@ -11,7 +11,7 @@ import gasil_jax
 from experiments import __main__, two_doors
 from experiments.search import SPARSE
 from gasil_jax import export_minari
-from gasil_jax.good_trajectories import GoodTrajectories
+from gasil_jax.buffer import GoodTrajectories
 
 
 def test_it_has_no_part_in_the_comparison_of_sparse_tasks():
