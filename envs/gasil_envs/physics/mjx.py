@@ -27,8 +27,8 @@ _LEFT_OUT = {
 }
 
 
-def _left_out(model: mujoco.MjModel) -> str | None:
-    """Return what MJX would leave out of a model, or None if nothing."""
+def left_out(model: mujoco.MjModel) -> str | None:
+    """Return what both JAX engines would leave out of a model; None if nothing."""
     for what, names in _LEFT_OUT.items():
         if any(np.any(getattr(model, name)) for name in names):
             return what
@@ -80,7 +80,7 @@ class MjxPhysics:
             self._blank_data = mjx.make_data(model)
         except NotImplementedError as error:
             raise Unsupported(str(error).partition("\n")[0].rstrip(".")) from None
-        self._left_out = _left_out(model)
+        self._left_out = left_out(model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

@@ -12,10 +12,15 @@ import mujoco
 from gasil_envs.physics import dynamics
 from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
-from gasil_envs.physics.mjx import MjxPhysics, Unsupported
+from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
 from gasil_envs.precision import full_precision
 
 _LOGGER = logging.getLogger(__name__)
+
+
+def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
+    """Return why our physics does not take a model; None if it does."""
+    return dynamics.unsupported(model, fields) or left_out(model)
 
 
 def ours_or_mjx(
@@ -29,9 +34,9 @@ def ours_or_mjx(
     Raises:
       ValueError: if neither takes the model.
     """
-    reason = dynamics.unsupported(model, fields)
+    reason = unsupported(model, fields)
     if reason is None:
-        return JaxPhysics(model, fields, iterations)
+        return JaxPhysics(model, fields, iterations, ls_iterations)
     try:
         physics = MjxPhysics(model, fields, iterations, ls_iterations)
     except Unsupported as error:
@@ -51,17 +56,22 @@ class JaxPhysics:
     """Steps a MuJoCo model with our dynamics and solver; see `interface.Physics`.
 
     Args:
-      model: a model that `dynamics.unsupported` has nothing against.
+      model: a model that `unsupported` has nothing against.
       fields: names of the ``mjData`` arrays to return.
       iterations: largest number of Newton iterations.
+      ls_iterations: largest number of steps of each of its line searches.
     """
 
     name = "jax"
 
     def __init__(
-        self, model: mujoco.MjModel, fields: Sequence[str] = (), iterations: int = 4
+        self,
+        model: mujoco.MjModel,
+        fields: Sequence[str] = (),
+        iterations: int = 4,
+        ls_iterations: int = 4,
     ):
-        self._dynamics = dynamics.make(model, fields, iterations)
+        self._dynamics = dynamics.make(model, fields, iterations, ls_iterations)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
