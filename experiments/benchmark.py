@@ -44,7 +44,7 @@ from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
 
 VARIANTS = {
-    "mjx": {"solver": "mjx"},
+    "mjx": {"physics": "mjx"},
     "ours": {},
     "mujoco": {"physics": "mujoco"},
     "ours-euler": {"integrator": "euler"},
@@ -112,9 +112,9 @@ class Row:
     speed: float = 0.0
 
 
-def start_jax(num_devices: int, solver: str = "small") -> None:
+def start_jax(num_devices: int, physics: str = "mujoco") -> None:
     """Choose CPU devices and precision as commands do; call it before JAX starts."""
-    prepare(Settings(physics="mujoco", solver=solver), num_devices)
+    prepare(Settings(physics=physics), num_devices)
     jax.config.update("jax_num_cpu_devices", num_devices)
     jax.config.update("jax_default_matmul_precision", "highest")
 

@@ -54,7 +54,7 @@ class Setup:
       runs: scratch folder of the training in progress.
       resume: continue interrupted training in the scratch folder, which is otherwise
         refused. Runs that the results hold are never trained again, with or without it.
-      physics: physics engine of locomotion: mjx or mujoco.
+      physics: physics engine of locomotion: jax, mjx or mujoco.
       devices: number of CPU devices to shard members over; default one per core. All
         visible GPUs are used in any case.
       evaluate_episodes: episodes of each of the ten evaluations during training; 0
@@ -68,7 +68,7 @@ class Setup:
 
     runs: pathlib.Path = pathlib.Path("runs", "experiments")
     resume: bool = False
-    physics: str = "mjx"
+    physics: str = "jax"
     devices: int | None = None
     evaluate_episodes: int = 10
     processes: int = 1
@@ -200,6 +200,7 @@ def _add_session(stored: Program, setup: Setup) -> None:
     path = run_folder.create(stored.path) / _SESSIONS
     devices = jax.devices()[: len(stored.runs)]
     now = {
+        # Stored runs from before 2026-11-29 say "mjx" where this says "jax".
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
         "versions": metrics_files.versions(),

@@ -19,7 +19,7 @@ from gasil_jax.host.environments import Settings
 ALGORITHM_VERSION = 2
 
 #: Settings of an environment that compute the same thing in different ways.
-_WAYS = ("physics", "solver")
+_WAYS = ("physics",)
 
 #: The names of settings in a run's key and in stored runs, where they differ from those
 #: here. So a setting can be renamed, and stored runs keep their keys.

@@ -131,7 +131,7 @@ def test_a_record_is_what_make_train_gives(trained):
         for name in ("episode_return", "episode_length"):
             np.testing.assert_allclose(getattr(record, name), metrics[name], rtol=2e-3)
         assert record.provenance["commit"] == "c" and record.provenance["clean"]
-        assert record.provenance["physics"] == "mjx" and record.provenance["device"]
+        assert record.provenance["physics"] == "jax" and record.provenance["device"]
         # At most ten evaluations are spread over training.
         assert record.evaluation_steps.tolist() == [512 * i for i in range(1, 7)]
         scores = score(state, evaluation_key(each.seed, 12))
