@@ -14,12 +14,8 @@ import tyro
 from experiments import (
     benchmark,
     engine,
-    point_mass_layouts,
-    point_mass_moments,
     profile,
-    roofline,
     store,
-    two_doors,
     zoo,
 )
 from experiments.curves import Curve, Figure
@@ -241,11 +237,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "merge": (MergeOptions, _merge),
     "benchmark": (benchmark.Options, benchmark.run),
     "profile": (profile.Options, profile.run),
-    "roofline": (roofline.Options, roofline.run),
     "zoo": (zoo.Options, zoo.run),
-    "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
-    "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
-    "two_doors": (two_doors.Options, two_doors.run),
 }
 
 
