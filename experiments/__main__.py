@@ -15,15 +15,16 @@ from experiments import (
     benchmark,
     engine,
     profile,
+    report,
     store,
+    summary,
     zoo,
 )
 from experiments.curves import Curve, Figure
+from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.report import Page
 from experiments.search import PaperSearch
 from experiments.store import RESULTS, ResultsFolder, Store
-from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
@@ -34,8 +35,7 @@ from gasil_jax.sweeps.runs import Run
 class Options:
     """Train the runs that a figure lacks, then write its page.
 
-    In the default folder all else that is made from stored runs is written too: the
-    other pages, the README's tables and the tuned presets.
+    `report` writes what else is made from the runs.
 
     Attributes:
       quick: train a small version below the folder `runs`: three seeds of the first
@@ -154,11 +154,8 @@ def _train(name: str, options: Options) -> None:
         for each in engine.unfinished(missing, setup):
             print(f"  {engine.title(each)}")
         return
-    if published and not options.quick:
-        # Other pages may have some of the same runs.
-        _write_all_pages()
-    else:
-        Page(name, *stores(), figure if options.quick else None).write(results)
+    text = "{{table}}" if options.quick else None
+    report.write(name, Results(figure, *stores()), results, text)
     print(f"in {results / name}.md")
 
 
@@ -218,15 +215,8 @@ class ReportOptions:
     """Write all pages, plots and presets, and the README's tables, from stored runs."""
 
 
-def _write_all_pages() -> None:
-    summary = Summary(Store(RESULTS / "runs"))
-    for page in summary.pages.values():
-        page.write(RESULTS)
-    summary.write()
-
-
 def _report(options: ReportOptions) -> None:
-    _write_all_pages()
+    summary.write_all(Store(RESULTS / "runs"))
     print(f"in {RESULTS}")
 
 

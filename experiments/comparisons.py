@@ -42,40 +42,36 @@ class Effect(NamedTuple):
     drawn: np.ndarray
 
 
+def verdict(middle: float, p: float) -> str:
+    """Return whether a difference with a corrected p-value is better or worse."""
+    if not p <= LEVEL:
+        return "not clear"
+    return "better" if middle > 0 else "worse"
+
+
 @dataclasses.dataclass(frozen=True)
-class Difference:
-    """A difference of two curves.
+class Comparison:
+    """A difference of curves with its interval, which is its text: f"{comparison:.2f}".
 
     Attributes:
       middle: the difference.
       p: its p-value, corrected by Holm's method.
-    """
-
-    middle: float
-    p: float
-
-    @property
-    def verdict(self) -> str:
-        """Better, worse or not clear."""
-        if not self.p <= LEVEL:
-            return "not clear"
-        return "better" if self.middle > 0 else "worse"
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison(Difference):
-    """A difference with its interval, which is its text: f"{comparison:.2f}".
-
-    Attributes:
       low: the low end of its 95% interval.
       high: the high end.
       visible: the smallest true difference that would be found with a probability of
         80%, at the level of the family's smallest p-value.
     """
 
+    middle: float
+    p: float
     low: float
     high: float
     visible: float
+
+    @property
+    def verdict(self) -> str:
+        """Better, worse or not clear."""
+        return verdict(self.middle, self.p)
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
