@@ -7,9 +7,7 @@ from .agents import PPOBC as PPOBC
 from .agents import PPOGASIL as PPOGASIL
 from .agents import PPOSIL as PPOSIL
 from .agents import Agent as Agent
-from .agents import PPOBCAdaptive as PPOBCAdaptive
 from .agents import PPOBCNovelty as PPOBCNovelty
-from .agents import PPOBonus as PPOBonus
 from .agents import PPOGASILAdaptive as PPOGASILAdaptive
 from .agents import PPONovelty as PPONovelty
 from .algorithms import Algorithm as Algorithm

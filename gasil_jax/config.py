@@ -174,8 +174,6 @@ class Config(struct.PyTreeNode):
       clip_epsilon_schedule: factor that multiplies PPO's clip range, given in the same
         way as that of the learning rate.
       entropy_coefficient: weight of the policy's entropy (the paper's lambda).
-      value_coefficient: weight of the value's squared error. It hardly matters, because
-        the value has its own network, gradient clip and Adam.
       max_grad_norm: largest global norm of a gradient; the policy's and the value's
         gradients are clipped separately.
       initial_std: standard deviation of the untrained policy's actions.
@@ -199,7 +197,6 @@ class Config(struct.PyTreeNode):
     clip_epsilon: float = number(0.2, 0.0, excludes_low=True)
     clip_epsilon_schedule: Schedule = schedule()
     entropy_coefficient: float = number(0.0, 0.0)
-    value_coefficient: float = number(1.0, 0.0)
     max_grad_norm: float = number(0.5, 0.0, excludes_low=True)
     initial_std: float = number(1.0, 0.0, excludes_low=True)
 

@@ -7,9 +7,9 @@ import jax
 from flax import struct
 
 from gasil_envs import wrappers
+from gasil_jax.buffer import History
 from gasil_jax.config import Config
 from gasil_jax.distributions import Distribution
-from gasil_jax.good_trajectories import History
 from gasil_jax.normalization import Normalizer
 from gasil_jax.rollout import Rollout
 

@@ -29,8 +29,8 @@ import tyro
 
 from gasil_envs import registry
 from gasil_jax import train
+from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.errors import InputError
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.host import command_line, run_folder
 from gasil_jax.host.members import member
 from gasil_jax.sweeps import saved_states

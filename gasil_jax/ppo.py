@@ -102,8 +102,8 @@ def standardize(advantage: jax.Array) -> jax.Array:
     Mean and variance are over the whole batch, as in OpenAI baselines' ppo1.
     """
     mean = jnp.mean(advantage, axis=(0, 1), keepdims=True)
-    deviation = jnp.std(advantage, axis=(0, 1), keepdims=True)
-    return (advantage - mean) / (deviation + 1e-8)
+    std = jnp.std(advantage, axis=(0, 1), keepdims=True)
+    return (advantage - mean) / (std + 1e-8)
 
 
 def evaluate_streams(
@@ -192,11 +192,8 @@ def loss(
     ]
     value_loss = jnp.stack([0.5 * jnp.mean(x) for x in squared_errors]).sum()
     entropy = jnp.mean(distribution.entropy(parameters))
-    total = (
-        policy_loss
-        + config.value_coefficient * value_loss
-        - config.entropy_coefficient * entropy
-    )
+    # The value needs no weight: it has its own network, gradient clip and Adam.
+    total = policy_loss + value_loss - config.entropy_coefficient * entropy
     metrics = {
         "policy_loss": policy_loss,
         "value_loss": value_loss,

@@ -16,7 +16,6 @@ from gasil_envs.precision import full_precision
 from gasil_jax import (
     checks,
     distributions,
-    good_trajectories,
     learner,
     normalization,
     ppo,
@@ -25,6 +24,7 @@ from gasil_jax import (
 )
 from gasil_jax.agents.interface import Checked
 from gasil_jax.algorithms import Algorithm, check_numbers
+from gasil_jax.buffer import History, init_history, record
 from gasil_jax.context import Context, Metrics, sizes_of
 from gasil_jax.distributions import Distribution
 from gasil_jax.errors import shown
@@ -53,7 +53,7 @@ class TrainState(struct.PyTreeNode):
     actor_critic: ActorCritic
     normalizer: normalization.Normalizer
     environments: rollout.EnvironmentStates
-    history: good_trajectories.History | None
+    history: History | None
     rewards: tuple[Any, ...]
     agent: Any
     hyperparameters: dict[str, jax.Array]
@@ -161,13 +161,13 @@ def _keys(key: jax.Array, count: int) -> list[jax.Array]:
     return [key, *jax.random.split(jax.random.clone(key), max(count, 1))[1:]][:count]
 
 
-def _init_history(env: Any, algorithm: Algorithm) -> good_trajectories.History | None:
+def _init_history(env: Any, algorithm: Algorithm) -> History | None:
     """Return an empty history, as long as the longest that a part asks for."""
     agent, models, config = algorithm.agent, algorithm.rewards, algorithm.config
     episodes = [agent.history_episodes, *(model.history_episodes for model in models)]
     if max(episodes) == 0:
         return None
-    return good_trajectories.init_history(
+    return init_history(
         config.num_envs,
         config.num_steps,
         max_episode_steps(env),
@@ -309,7 +309,7 @@ class Experience(NamedTuple):
     batch: Rollout
     context: Context
     environments: rollout.EnvironmentStates
-    history: good_trajectories.History | None
+    history: History | None
     rewards: tuple[Any, ...]
     healthy: jax.Array
     metrics: Metrics
@@ -458,11 +458,9 @@ def sample_trajectories(
 
 
 @jax.named_scope("good_trajectories")
-def _record(
-    history: good_trajectories.History, batch: Rollout
-) -> good_trajectories.History:
+def _record(history: History, batch: Rollout) -> History:
     """Return the history with a batch recorded in it."""
-    return good_trajectories.record(
+    return record(
         history,
         batch.observation,
         batch.action,

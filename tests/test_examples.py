@@ -35,11 +35,10 @@ def run_script(monkeypatch, capsys):
 
 @pytest.fixture
 def small(monkeypatch):
-    """Let examples train with less; PPO+BONUS, with an alpha too, compiles sooner."""
+    """Let examples train with less."""
 
     def smaller(original):
         def make(*names, **settings):
-            names = ["ppo+bonus" if x == "ppo+gasil" else x for x in names]
             return original(*names, **settings).replace(**SMALL)
 
         return make
@@ -73,7 +72,7 @@ def test_alpha_is_swept_and_plotted(run_script, small, tmp_path):
 
 
 def test_an_environment_of_ones_own_trains(run_script, small, monkeypatch):
-    printed = run_script("user_environment.py", "--steps", 4096)
+    printed = run_script("own_environment.py", "--steps", 4096)
     assert re.findall(r"^(\S+): return", printed, re.MULTILINE) == ["ppo", "ppo+gasil"]
     # A step's reward is between 0 and 1, and nearly 0 while the pendulum hangs.
     assert all(0 < number < 200 for number in numbers(printed))

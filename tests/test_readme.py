@@ -313,8 +313,6 @@ def run_python(path):
     names = {"observation": np.zeros(env.observation_size, np.float32), "small": small}
     changes = {
         r'"(walker2d|hopper)", ': '"point_mass", ',
-        # It has an alpha too, and compiles in half the time.
-        r'"ppo\+gasil"': '"ppo+bonus"',
         r"(gasil_jax\.preset\(.*\))": r"\1.replace(**small, total_steps=1024)",
         "1_000_000": "1024",
         r"key\(0\), \d+\)": "key(0), 2)",

@@ -1,6 +1,6 @@
 """Train PPO and PPO+GASIL in your own environment: a pendulum to swing up.
 
-    python docs/examples/user_environment.py --steps 300000
+    python docs/examples/own_environment.py --steps 300000
 
 An environment is a class with Brax's interface. `reset` and `step` are pure functions
 of one environment; training vmaps them. In this folder the command line trains it too:

@@ -8,8 +8,7 @@ from collections.abc import Mapping
 
 from gasil_jax.agents.adaptive import PPOGASILAdaptive
 from gasil_jax.agents.adversarial import GAIL, GASIL, PPOGASIL
-from gasil_jax.agents.behavior_cloning import PPOBC, PPOBCAdaptive
-from gasil_jax.agents.constant_bonus import PPOBonus
+from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.interface import Agent
 from gasil_jax.agents.novelty import PPOBCNovelty, PPONovelty
 from gasil_jax.agents.ppo import PPO
@@ -21,9 +20,7 @@ AGENTS: Mapping[str, type[Agent]] = {
     agent.name: agent
     for agent in (
         PPO,
-        PPOBonus,
         PPOBC,
-        PPOBCAdaptive,
         PPONovelty,
         PPOBCNovelty,
         PPOSIL,
@@ -49,9 +46,7 @@ __all__ = [
     "PPOGASIL",
     "PPOSIL",
     "Agent",
-    "PPOBCAdaptive",
     "PPOBCNovelty",
-    "PPOBonus",
     "PPOGASILAdaptive",
     "PPONovelty",
     "agents_with",

@@ -27,11 +27,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_jax import good_trajectories
 from gasil_jax.agents.adversarial import SelfImitatingAgent
+from gasil_jax.buffer import GoodTrajectories, mean_return
 from gasil_jax.config import choice, number
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.learner import Learner
 from gasil_jax.rewards import normalization as reward_normalization
 
@@ -132,7 +131,6 @@ class PPOGASILAdaptive(SelfImitatingAgent):
     imitation_rule: str = choice("both", RULES)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Adaptive:
-        """Return the state before the first batch."""
         return Adaptive(
             discriminator=self.init_discriminator(key, sizes),
             bonus_normalizer=reward_normalization.init(sizes.num_envs),
@@ -158,8 +156,7 @@ class PPOGASILAdaptive(SelfImitatingAgent):
             batch.completed,
             return_=self.ranked_by(batch),
         )
-        metrics["bonus"] = jnp.mean(bonus)
-        metrics["bonus_deviation"] = jnp.std(bonus)
+        metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
         normalized = reward_normalization.normalize(
             normalizer, bonus, reward_normalization.CLIP
         )
@@ -175,9 +172,8 @@ class PPOGASILAdaptive(SelfImitatingAgent):
     def mix(
         self, state: Adaptive, advantages: jax.Array, context: Context
     ) -> tuple[jax.Array, Metrics]:
-        """Return (1 - w) A_r + w A_b, and w with what decides it."""
         advantage_correlation = correlation(advantages)
-        good_return = good_trajectories.mean_return(state.buffer)
+        good_return = mean_return(state.buffer)
         return_gap = gap(good_return, state.policy_return)
         factor = RULES[self.imitation_rule](
             jnp.maximum(advantage_correlation, 0.0), return_gap

@@ -27,21 +27,12 @@ from gasil_jax import learner, normalization
 from gasil_jax.agents import expert
 from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.agents.interface import Agent
-from gasil_jax.config import (
-    Schedule,
-    choice,
-    count,
-    number,
-    schedule,
-    switch,
-    text,
-    widths,
-)
+from gasil_jax.buffer import GoodTrajectories
+from gasil_jax.config import Schedule, choice, count, number, schedule, text, widths
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.learner import Learner
 from gasil_jax.networks import Discriminator
-from gasil_jax.rollout import Rollout
+from gasil_jax.normalization import Normalizer
 
 
 def softplus_bonus(logit: jax.Array) -> jax.Array:
@@ -57,15 +48,6 @@ def logit_bonus(logit: jax.Array) -> jax.Array:
     return -logit
 
 
-def dail_bonus(logit: jax.Array) -> jax.Array:
-    """Return sigmoid(x) (tanh(x) + 1) / 2 of x = -logit (DAIL, arXiv:2510.00922).
-
-    It is between 0 and 1, so it favours long episodes, but it is almost 0 where D is
-    near 1.
-    """
-    return 0.5 * jax.nn.sigmoid(-logit) * (jnp.tanh(-logit) + 1.0)
-
-
 def centered_bonus(logit: jax.Array) -> jax.Array:
     """Return -log D minus its mean over the batch: positive or negative.
 
@@ -75,56 +57,12 @@ def centered_bonus(logit: jax.Array) -> jax.Array:
     return softplus - jnp.mean(softplus)
 
 
-_ABSORBING = "absorbing"
-#: The forms of the bonus, functions of the logit of D on a batch, (time, env). With
-#: "absorbing" a step that terminates its episode is also paid for what comes after.
+#: The forms of the bonus, functions of the logit of D on a batch, (time, env).
 BONUSES: Mapping[str, Callable[[jax.Array], jax.Array]] = {
     "softplus": softplus_bonus,
     "logit": logit_bonus,
-    "dail": dail_bonus,
     "centered": centered_bonus,
-    _ABSORBING: softplus_bonus,
 }
-
-
-def absorbed_share(
-    length: jax.Array, terminated: jax.Array, counted: jax.Array, gamma: Any
-) -> jax.Array:
-    """Return the mean share of discounted time in the absorbing state, float32 ().
-
-    An episode that terminates after T steps is in the absorbing state from then on,
-    which is the share gamma^T of its discounted time. For a truncated episode the share
-    is 0. One imaginary episode with the share 1/2 is added, so that the result is never
-    0 or 1.
-
-    Args:
-      length: int32, any shape, number of steps of each episode.
-      terminated: bool, the same shape, whether the episode terminated.
-      counted: bool, the same shape, false for entries that are not the end of an
-        episode.
-      gamma: the discount factor.
-    """
-    share = jnp.where(counted & terminated, gamma**length, 0.0)
-    return (jnp.sum(share) + 0.5) / (jnp.sum(counted) + 1.0)
-
-
-def absorbing_logit(
-    buffer: GoodTrajectories, rollout: Rollout, gamma: Any
-) -> jax.Array:
-    """Return the logit of D in the absorbing state, (): its best value in closed form.
-
-    It is the log odds of the policy's absorbed share against the buffer's.
-    """
-    assert buffer.terminated is not None  # Ensured by `keeps_terminated`.
-    step = jnp.arange(buffer.capacity)
-    starts_next = jnp.append(buffer.time[1:] == 0, True) | (step + 1 >= buffer.size)
-    good = absorbed_share(
-        buffer.time + 1, buffer.terminated, starts_next & buffer.filled, gamma
-    )
-    policy = absorbed_share(
-        rollout.episode_length, rollout.terminated, rollout.completed, gamma
-    )
-    return jnp.log(policy) - jnp.log(good)
 
 
 def loss(
@@ -159,54 +97,16 @@ def loss(
     return -log_likelihood - entropy_coefficient * entropy, metrics
 
 
-def gradient_penalty(
-    logit: Callable[..., jax.Array],
-    policy_pair: Any,
-    good_pair: Any,
-    *,
-    share: jax.Array,
-) -> jax.Array:
-    """Return the mean of (|gradient of the logit| - 1)^2 between pairs, ().
-
-    See Gulrajani et al. 2017, algorithm 1.
-
-    Args:
-      logit: (observation, action) -> (minibatch,), the logit of D.
-      policy_pair: the policy's observations (minibatch, obs) and actions
-        (minibatch, action).
-      good_pair: the same, from the buffer.
-      share: (minibatch,), from 0 to 1, the weight of the policy's pair in the point at
-        which the gradient is taken.
-    """
-    between = jax.tree.map(
-        lambda x, y: share[:, None] * x + (1.0 - share[:, None]) * y,
-        policy_pair,
-        good_pair,
-    )
-    gradients = jax.grad(lambda pair: jnp.sum(logit(*pair)))(between)
-    squares = sum(jnp.sum(x**2, axis=-1) for x in gradients)
-    # The square root has no finite gradient at 0.
-    return jnp.mean((jnp.sqrt(squares + 1e-12) - 1.0) ** 2)
-
-
-# Lower bound of 1 - gamma: with gamma 1 the absorbing state's value would be infinite.
-_LEAST_ONE_MINUS_GAMMA = 1e-3
-_NORMALIZES_ACTIONS = "discriminator_normalizes_actions"
-
-
 class Source(NamedTuple):
     """The source of the pairs that the policy imitates.
 
     Attributes:
       sample: (key, n) -> observation (n, obs), action (n, action).
       is_ready: bool (), whether there is anything to sample.
-      absorbing_logit: (rollout, gamma) -> the logit of D in the absorbing state, ();
-        None where it is not known how the imitated episodes end.
     """
 
     sample: Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
     is_ready: jax.Array
-    absorbing_logit: Callable[[Rollout, Any], jax.Array] | None = None
 
 
 class AdversarialAgent(Agent):
@@ -214,9 +114,7 @@ class AdversarialAgent(Agent):
 
     Attributes:
       bonus: form of the discriminator's reward: softplus, -log D, as in the paper;
-        logit, log(1 - D) - log D; dail, between 0 and 1; centered, softplus minus its
-        mean over the batch; or absorbing, softplus, and where an episode terminates
-        also the value of an absorbing state.
+        logit, log(1 - D) - log D; or centered, softplus minus its mean over the batch.
       discriminator_learning_rate: Adam's step size for the discriminator.
       discriminator_updates: gradient steps of the discriminator in an iteration.
       discriminator_minibatch_size: steps of the policy, and as many good steps, in one
@@ -224,11 +122,6 @@ class AdversarialAgent(Agent):
       discriminator_hidden_sizes: widths of the discriminator's tanh layers.
       discriminator_entropy_coefficient: weight of the entropy of the discriminator's
         output.
-      discriminator_gradient_penalty: weight of a gradient penalty on the
-        discriminator, as in WGAN-GP: at points between good pairs and the policy's, the
-        norm of its gradient with respect to its input is pulled to 1.
-      discriminator_normalizes_actions: whether the discriminator sees actions in units
-        of the batch's mean and standard deviation; otherwise as they are.
     """
 
     bonus: str = choice("softplus", BONUSES)
@@ -237,9 +130,6 @@ class AdversarialAgent(Agent):
     discriminator_minibatch_size: int = count(128)
     discriminator_hidden_sizes: tuple[int, ...] = widths(100, 100)
     discriminator_entropy_coefficient: float = number(1e-3, 0.0)
-    # Without a penalty its gradient is not computed.
-    discriminator_gradient_penalty: float = number(0.0, 0.0, traced=False)
-    discriminator_normalizes_actions: bool = switch(False)
 
     def discriminator_network(self) -> Any:
         """Return the Flax module of the logit: (..., obs), (..., action) -> (...).
@@ -255,6 +145,13 @@ class AdversarialAgent(Agent):
         return learner.init(
             self.discriminator_network().init(key, *pair), learner.adam()
         )
+
+    def logit(
+        self, params: Any, normalizer: Normalizer, observation: Any, action: Any
+    ) -> jax.Array:
+        """Return the logit of D, (...), of observations (..., obs) and actions."""
+        observation = normalization.normalize(normalizer, observation)
+        return self.discriminator_network().apply(params, observation, action)
 
     @jax.named_scope("discriminator")
     def update_and_score(
@@ -273,16 +170,9 @@ class AdversarialAgent(Agent):
           while there is nothing to imitate; and metrics.
         """
         discriminator, metrics = self._train(discriminator, source, context, key)
-        rollout = context.rollout
-        pairs = self._preprocessor(context)(rollout.observation, rollout.action)
-        logit = self.discriminator_network().apply(discriminator.params, *pairs)
-        bonus = BONUSES[self.bonus](logit)
-        if self.bonus == _ABSORBING:
-            assert source.absorbing_logit is not None  # Ensured by `check`.
-            gamma = context.config.gamma
-            after = BONUSES[self.bonus](source.absorbing_logit(rollout, gamma))
-            horizon = gamma / jnp.maximum(1.0 - gamma, _LEAST_ONE_MINUS_GAMMA)
-            bonus += jnp.where(rollout.terminated, horizon * after, 0.0)
+        batch = context.rollout
+        pairs = context.normalizer, batch.observation, batch.action
+        bonus = BONUSES[self.bonus](self.logit(discriminator.params, *pairs))
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
 
     def discriminator(self, state: Any) -> Learner:
@@ -290,7 +180,7 @@ class AdversarialAgent(Agent):
         return state.discriminator
 
     def reward(
-        self, state: Any, normalizer: normalization.Normalizer
+        self, state: Any, normalizer: Normalizer
     ) -> Callable[[jax.Array, jax.Array], jax.Array]:
         """Return the bonus without alpha as a function of observation and action.
 
@@ -303,94 +193,61 @@ class AdversarialAgent(Agent):
         Raises:
           ValueError: if the bonus of a step depends on the batch that it is in.
         """
-        depends = self.bonus in ("centered", _ABSORBING)
-        if depends or self.discriminator_normalizes_actions:
-            name = "bonus" if depends else _NORMALIZES_ACTIONS
+        if self.bonus == "centered":
             raise ValueError(
-                f"{name} is {getattr(self, name)!r}: the reward of a step then depends "
-                "on the batch that it is in"
+                f"bonus is {self.bonus!r}: the reward of a step then depends on the "
+                "batch that it is in"
             )
-        params, network = self.discriminator(state).params, self.discriminator_network()
+        params = self.discriminator(state).params
 
         def reward(observation: jax.Array, action: jax.Array) -> jax.Array:
-            observation = normalization.normalize(normalizer, observation)
-            return BONUSES[self.bonus](network.apply(params, observation, action))
+            return BONUSES[self.bonus](
+                self.logit(params, normalizer, observation, action)
+            )
 
         return reward
-
-    def _preprocessor(
-        self, context: Context
-    ) -> Callable[[jax.Array, jax.Array], tuple[jax.Array, jax.Array]]:
-        """Return the function that makes the discriminator's inputs from pairs."""
-
-        def normalize(x: jax.Array) -> jax.Array:
-            return normalization.normalize(context.normalizer, x)
-
-        if not self.discriminator_normalizes_actions:
-            return lambda observation, action: (normalize(observation), action)
-        actions = context.rollout.action
-        batch = normalization.update(normalization.init(actions.shape[-1]), actions)
-        return lambda observation, action: (
-            normalize(observation),
-            normalization.normalize(batch, action),
-        )
 
     def _train(
         self, discriminator: Learner, source: Source, context: Context, key: jax.Array
     ) -> tuple[Learner, Metrics]:
         """Take gradient steps on the discriminator, if the source is ready."""
-        network, transform = self.discriminator_network(), learner.adam()
-        rollout = context.rollout
-        observation = rollout.observation.reshape(-1, rollout.observation.shape[-1])
-        action = rollout.action.reshape(-1, rollout.action.shape[-1])
+        batch, normalizer = context.rollout, context.normalizer
+        observation = batch.observation.reshape(-1, batch.observation.shape[-1])
+        action = batch.action.reshape(-1, batch.action.shape[-1])
         minibatch_size = self.discriminator_minibatch_size
-        preprocess = self._preprocessor(context)
-        penalty = self.discriminator_gradient_penalty
 
-        def objective(params: Any, policy_pair: Any, good_pair: Any, key: Any) -> Any:
-            value, metrics = loss(
-                network.apply(params, *policy_pair),
-                network.apply(params, *good_pair),
+        def objective(params: Any, policy_pairs: Any, good_pairs: Any) -> Any:
+            return loss(
+                self.logit(params, normalizer, *policy_pairs),
+                self.logit(params, normalizer, *good_pairs),
                 self.discriminator_entropy_coefficient,
             )
-            if penalty:
-                share = jax.random.uniform(key, (minibatch_size,))
-
-                def logit(*pair: Any) -> Any:
-                    return network.apply(params, *pair)
-
-                value += penalty * gradient_penalty(
-                    logit, policy_pair, good_pair, share=share
-                )
-            return value, metrics
 
         def step(discriminator: Learner, key: jax.Array) -> Any:
-            policy_key, good_key, between_key = jax.random.split(key, 3)
+            policy_key, good_key = jax.random.split(key)
             rows = jax.random.randint(
                 policy_key, (minibatch_size,), 0, observation.shape[0]
             )
             gradient, metrics = jax.grad(objective, has_aux=True)(
                 discriminator.params,
-                preprocess(observation[rows], action[rows]),
-                preprocess(*source.sample(good_key, minibatch_size)),
-                between_key,
+                (observation[rows], action[rows]),
+                source.sample(good_key, minibatch_size),
             )
             stepped = learner.descend(
                 discriminator,
                 gradient,
-                transform,
+                learner.adam(),
                 step_size=self.discriminator_learning_rate,
             )
             return stepped, metrics
 
         keys = jax.random.split(key, self.discriminator_updates)
         trained, metrics = jax.lax.scan(step, discriminator, keys)
-        ready = source.is_ready
         metrics = {
-            name: jnp.where(ready, jnp.mean(value), jnp.nan)
+            name: jnp.where(source.is_ready, jnp.mean(value), jnp.nan)
             for name, value in metrics.items()
         }
-        return learner.select(ready, trained, discriminator), metrics
+        return learner.select(source.is_ready, trained, discriminator), metrics
 
 
 class ShapedRewardAgent(AdversarialAgent):
@@ -410,7 +267,7 @@ class ShapedRewardAgent(AdversarialAgent):
     def shape(self, context: Context, bonus: jax.Array) -> tuple[jax.Array, Metrics]:
         """Return the rewards that PPO maximizes, (time, env), and metrics."""
         shaped = self.alpha * bonus
-        metrics = {"bonus": jnp.mean(shaped), "bonus_deviation": jnp.std(shaped)}
+        metrics = {"bonus": jnp.mean(shaped), "bonus_std": jnp.std(shaped)}
         reward = context.rollout.reward
         return (reward + shaped if self.uses_reward else shaped), metrics
 
@@ -431,11 +288,10 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
     """An agent whose discriminator learns from the buffer, `state.buffer`."""
 
     def remember(self, state: Any, context: Context) -> Any:
-        """Insert the episodes that ended in a batch into the buffer."""
-        return state.replace(buffer=self.insert(state.buffer, context))
+        buffer = self.insert(state.buffer, context, self.ranked_by(context.rollout))
+        return state.replace(buffer=buffer)
 
     def good_trajectories(self, state: Any) -> GoodTrajectories:
-        """Return the buffer in a state."""
         return state.buffer
 
     def source(self, buffer: GoodTrajectories) -> Source:
@@ -443,13 +299,7 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
         return Source(
             lambda key, num_samples: self.sample(buffer, key, num_samples),
             buffer.size > 0,
-            lambda rollout, gamma: absorbing_logit(buffer, rollout, gamma),
         )
-
-    @property
-    def keeps_terminated(self) -> bool:
-        """Whether the buffer keeps how its episodes ended."""
-        return self.bonus == _ABSORBING
 
 
 class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
@@ -458,7 +308,6 @@ class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
     name = "ppo+gasil"
 
     def init(self, key: jax.Array, sizes: Sizes) -> SelfImitation:
-        """Return an untrained discriminator and an empty buffer."""
         return SelfImitation(
             self.init_discriminator(key, sizes), self.init_buffer(sizes)
         )
@@ -466,7 +315,6 @@ class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
     def update_and_reward(
         self, state: SelfImitation, context: Context, key: jax.Array
     ) -> tuple[SelfImitation, jax.Array, Metrics]:
-        """Train the discriminator (equation 8), and shape the reward with it."""
         buffer = state.buffer
         discriminator, bonus, metrics = self.update_and_score(
             state.discriminator, self.source(buffer), context, key
@@ -497,17 +345,9 @@ class GAIL(ShapedRewardAgent):
     expert: str | None = text()
 
     def check(self, sizes: Sizes) -> None:
-        """Raise `ValueError` unless there is a fitting expert and a fitting bonus."""
-        if self.bonus == _ABSORBING:
-            others = ", ".join(x for x in BONUSES if x != _ABSORBING)
-            raise ValueError(
-                f"bonus is {_ABSORBING!r}: an expert does not say how its episodes "
-                f"end, so it must be one of {others}"
-            )
         expert.check(self.expert, sizes)
 
     def discriminator(self, state: Learner) -> Learner:
-        """Return the discriminator, which is the state."""
         return state
 
     def data(self) -> tuple[np.ndarray, np.ndarray]:
@@ -519,13 +359,11 @@ class GAIL(ShapedRewardAgent):
         return expert.load(self.expert)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Learner:
-        """Return an untrained discriminator."""
         return self.init_discriminator(key, sizes)
 
     def update_and_reward(
         self, state: Learner, context: Context, key: jax.Array
     ) -> tuple[Learner, jax.Array, Metrics]:
-        """Train the discriminator (equation 8), and reward with it alone."""
         observation, action = context.data
         size = context.rollout.action.shape[-1]
 

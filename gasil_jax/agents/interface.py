@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import user_code
+from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.ppo import ActorCritic
 
 

@@ -25,9 +25,9 @@ from flax import struct
 from gasil_jax import normalization
 from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.interface import Agent
-from gasil_jax.config import choice, number
+from gasil_jax.buffer import GoodTrajectories
+from gasil_jax.config import number
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import GoodTrajectories
 from gasil_jax.ppo import ActorCritic
 
 # The number of counters (a hash maps cells to counters, so cells may share one), and of
@@ -67,7 +67,6 @@ class PPONovelty(Agent):
     novelty_cell: float = number(0.5, 0.0, excludes_low=True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
-        """Return the state before the first batch."""
         return self.init_visits(key, sizes)
 
     def init_visits(self, key: jax.Array, sizes: Sizes) -> Visits:
@@ -110,13 +109,11 @@ class PPONovelty(Agent):
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
     def remember(self, state: Any, context: Context) -> Any:
-        """Count a batch's visits."""
         return self.count(state, context)
 
     def update_and_reward(
         self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Any, jax.Array, Metrics]:
-        """Add the centred novelty to the environment's reward."""
         novelty = self.novelty(self.visits(state), context)
         bonus = self.novelty_coefficient * (novelty - jnp.mean(novelty))
         metrics = {"novelty": jnp.mean(novelty)}
@@ -138,19 +135,11 @@ class Explorer(struct.PyTreeNode):
 
 
 class PPOBCNovelty(PPONovelty, PPOBC):
-    """PPO+NOVELTY, then cloning of the buffer.
-
-    Attributes:
-      novelty_ties: which of two episodes with the same return the buffer keeps: novel,
-        the one with the higher mean novelty; or arrival, the one that ties names.
-    """
+    """PPO+NOVELTY, then cloning of the buffer, which keeps the more novel of equals."""
 
     name = "ppo+bc+novelty"
 
-    novelty_ties: str = choice("novel", ("novel", "arrival"))
-
     def init(self, key: jax.Array, sizes: Sizes) -> Explorer:
-        """Return the state before the first batch."""
         return Explorer(
             buffer=self.init_buffer(sizes),
             visits=self.init_visits(key, sizes),
@@ -158,15 +147,12 @@ class PPOBCNovelty(PPONovelty, PPOBC):
         )
 
     def good_trajectories(self, state: Explorer) -> GoodTrajectories:
-        """Return the buffer in a state."""
         return state.buffer
 
     def visits(self, state: Explorer) -> Visits:
-        """Return the counters in a state."""
         return state.visits
 
     def remember(self, state: Explorer, context: Context) -> Explorer:
-        """Count the batch's visits, and insert its episodes into the buffer."""
         batch, visits = context.rollout, self.count(state.visits, context)
 
         def add(total: jax.Array, step: Any) -> Any:
@@ -176,16 +162,13 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
         steps = self.novelty(visits, context), batch.ended
         novelty, total = jax.lax.scan(add, state.novelty, steps)
-        ranked_by = self.ranked_by(batch)
-        if self.novelty_ties == "novel":
-            ranked_by = ranked_by + _TIE * total / batch.episode_length
-        buffer = self.insert_ranked(state.buffer, context, ranked_by)
+        return_ = self.ranked_by(batch) + _TIE * total / batch.episode_length
+        buffer = self.insert(state.buffer, context, return_)
         return Explorer(buffer, visits, novelty)
 
     def update_policy(
         self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
     ) -> tuple[Any, ActorCritic, Metrics]:
-        """Take gradient steps on the cloning loss, if the buffer is not empty."""
         buffer, actor_critic, metrics = super().update_policy(
             state.buffer, actor_critic, context, key
         )

@@ -27,9 +27,9 @@ from flax import struct
 
 from gasil_jax import learner, normalization, ppo
 from gasil_jax.agents.interface import Agent
+from gasil_jax.buffer import History
 from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import History
 from gasil_jax.ppo import ActorCritic
 
 _PRIORITY_EXPONENT = 0.6

@@ -98,8 +98,6 @@ def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
             largest = max(sizes, key=lambda size: sizes[size])
             rows = sizes[largest]
             outputs = _OUTPUTS_PER_STEP * 4 * rows * (inputs + sum(settings[widths]))
-            if name.startswith("discriminator"):
-                outputs *= 1 + bool(settings.get("discriminator_gradient_penalty"))
             words = f"{largest} {rows} and {widths} {settings[widths]}"
             steps[f"outputs of layers, with {words}"] = int(outputs)
     return steps

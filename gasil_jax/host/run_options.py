@@ -55,8 +55,8 @@ class Options:
         humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
         brax:NAME, gymnax:NAME, navix:NAME or playground:NAME, for example
         gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
-      agent: the agent: ppo, ppo+bc, ppo+bc-adaptive, ppo+sil, gasil, ppo+gasil,
-        ppo+gasil-adaptive, ppo+bonus, ppo+novelty, ppo+bc+novelty, gail, or your own as
+      agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil,
+        ppo+gasil-adaptive, ppo+novelty, ppo+bc+novelty, gail, or your own as
         MODULE:CLASS. Each has its own settings: this help shows those of the one that
         is named beside it.
       seeds: number of seeds to train.

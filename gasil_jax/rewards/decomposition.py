@@ -2,9 +2,9 @@
 
 A window is the steps between two payouts: it ends where the reward is not zero or the
 episode ends. The rewards alone show where windows end, so this works in any
-environment. A network g of (observation, action, next observation), or of the first
-two, learns the standardized reward of a step. With m and s the running mean and
-standard deviation of payout / length, it takes gradient steps on
+environment. A network g of (observation, action, next observation) learns the
+standardized reward of a step. With m and s the running mean and standard deviation of
+payout / length, it takes gradient steps on
 
     (mean_window g - (payout / length - m) / s)^2.
 
@@ -29,10 +29,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from gasil_jax import good_trajectories, learner, normalization
-from gasil_jax.config import choice, count, number, widths
+from gasil_jax import learner, normalization
+from gasil_jax.buffer import History, write
+from gasil_jax.config import count, number, widths
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.good_trajectories import History
 from gasil_jax.learner import Learner
 from gasil_jax.networks import StepReward
 from gasil_jax.normalization import Normalizer
@@ -212,10 +212,8 @@ def _train(
     num_windows = settings.decomposition_minibatch_size
     num_rows = settings.decomposition_window_steps
     steps = complete.ends.shape[1]
-    rings: tuple[jax.Array, ...] = (history.observation, history.action)
-    if settings.keeps_next_observation:
-        assert history.next_observation is not None
-        rings += (history.next_observation,)
+    assert history.next_observation is not None  # Ensured by the model.
+    rings = history.observation, history.action, history.next_observation
     mean, scale = normalization.moments(rates)
     counts = jnp.cumsum(complete.ends.ravel())
 
@@ -332,9 +330,6 @@ class Decompose(RewardModel):
         end of an episode, 1 leaves few windows.
       decomposition_hidden_sizes: widths of the tanh layers of the network that
         decomposes rewards.
-      decomposition_inputs: inputs of the network that decomposes rewards: transition,
-        the observation, the action and the next observation; or pair, without the next
-        observation.
     """
 
     switch = "decompose_rewards"
@@ -345,16 +340,13 @@ class Decompose(RewardModel):
     decomposition_window_steps: int = count(32)
     decomposition_history_episodes: int = count(1)
     decomposition_hidden_sizes: tuple[int, ...] = widths(100, 100)
-    decomposition_inputs: str = choice("transition", ("transition", "pair"))
 
     @property
     def keeps_next_observation(self) -> bool:
-        """Whether the network sees the next observation."""
-        return self.decomposition_inputs == "transition"
+        return True
 
     @property
     def history_episodes(self) -> int:
-        """Episodes of full length that windows are drawn from."""
         return self.decomposition_history_episodes
 
     @property
@@ -363,10 +355,9 @@ class Decompose(RewardModel):
         return StepReward(self.decomposition_hidden_sizes)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Decomposition:
-        """Return the state before the first window."""
         observation, action = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
         inputs = (observation, action, observation)
-        params = self._network.init(key, *inputs[: 2 + self.keeps_next_observation])
+        params = self._network.init(key, *inputs)
         return Decomposition(
             network=learner.init(params, learner.adam()),
             rates=normalization.init(1),
@@ -403,17 +394,14 @@ class Decompose(RewardModel):
             return normalization.normalize(context.normalizer, x)
 
         def predict(
-            params: Any, observation: jax.Array, action: jax.Array, *after: jax.Array
+            params: Any, observation: jax.Array, action: jax.Array, after: jax.Array
         ) -> jax.Array:
+            action = jnp.clip(action, low, high)
             return network.apply(
-                params,
-                normalize(observation),
-                jnp.clip(action, low, high),
-                *map(normalize, after),
+                params, normalize(observation), action, normalize(after)
             )
 
-        after = (batch.next_observation,) * self.keeps_next_observation
-        step = (batch.observation, batch.action, *after)
+        step = (batch.observation, batch.action, batch.next_observation)
 
         def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
             mean, scale = normalization.moments(rates)
@@ -459,7 +447,7 @@ class Decompose(RewardModel):
         state = state.replace(
             network=trained,
             rates=rates,
-            reward=good_trajectories.write(recorded, reward, cursor),
+            reward=write(recorded, reward, cursor),
             open_reward=running[0],
             open_steps=running[1],
             recorded_steps=recorded_steps,

@@ -32,10 +32,28 @@ NEWER: Mapping[str, Any] = {
     "max_episode_steps": None,
     "observe_phase": False,
     "action_noise": 0.0,
-    "decomposition_inputs": "transition",
     "policy_components": 1,
-    "sharing_distance": 0.0,
 }
+
+#: Settings that are no more: the settings beside which a run had one, and the value
+#: that all stored runs have. They stay in a run's key, so that stored runs keep theirs.
+REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
+    "value_coefficient": (("learning_rate",), 1.0),
+    "admission": (("buffer_steps",), "all"),
+    "ties": (("buffer_steps",), "oldest"),
+    "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
+    "discriminator_gradient_penalty": (("bonus",), 0.0),
+    "discriminator_normalizes_actions": (("bonus",), False),
+}
+
+
+def removed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that stood beside those of an algorithm and are no more."""
+    return {
+        name: value
+        for name, (beside, value) in REMOVED.items()
+        if settings.keys() >= {*beside}
+    }
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +101,10 @@ class Run:
             "env": self.env,
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
-            "algorithm": {STORED_NAMES.get(x, x): y for x, y in values.items()},
+            "algorithm": {
+                **{STORED_NAMES.get(x, x): y for x, y in values.items()},
+                **removed(values),
+            },
         }
 
     @functools.cached_property
@@ -126,8 +147,11 @@ def read_run(
     fields = dict(experiment)
     own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
     current = {stored: name for name, stored in STORED_NAMES.items()}
-    settings = fields.pop("algorithm")
-    algorithm = descriptions.read({current.get(x, x): y for x, y in settings.items()})
+    settings = {current.get(x, x): y for x, y in fields.pop("algorithm").items()}
+    for name, value in removed(settings).items():
+        if settings.pop(name, value) != value:
+            raise InputError(f"{name} is not {value!r}: this setting is no more")
+    algorithm = descriptions.read(settings)
     if total_steps is not None:
         algorithm = algorithm.replace(total_steps=total_steps)
     settings = json_reader.as_type(Settings, fields, "settings")

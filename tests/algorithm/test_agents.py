@@ -30,11 +30,8 @@ DISCRIMINATOR = {
 # GAIL needs an expert: test_discrete.py.
 SELF_TAUGHT = (
     gasil_jax.PPO(),
-    # A constant bonus as large as the normalized reward drowns it.
-    gasil_jax.PPOBonus(alpha=0.1),
     # The best two episodes, which differ from the others.
     gasil_jax.PPOBC(buffer_steps=100),
-    gasil_jax.PPOBCAdaptive(buffer_steps=100),
     gasil_jax.PPONovelty(),
     gasil_jax.PPOBCNovelty(buffer_steps=100),
     gasil_jax.PPOSIL(),
@@ -155,14 +152,6 @@ def test_each_stream_has_its_own_value_and_without_weight_it_is_ppo():
     # With weight it is another one.
     (kernel, *_) = jax.tree.leaves(own.policy.params)
     assert not np.allclose(kernel[0], kernel[1], atol=1e-3)
-
-
-@pytest.mark.xdist_group("agent ppo+bonus")
-def test_a_constant_bonus_of_nothing_is_ppo():
-    nothing = {"alpha": 0.0}
-    states, _ = train("ppo+bonus", 1, changes=(nothing, nothing))
-    plain, _ = train("ppo", 1)
-    jax.tree.map(close(rtol=1e-3, atol=1e-5), states.actor_critic, plain.actor_critic)
 
 
 @pytest.mark.xdist_group("agent ppo+bc")

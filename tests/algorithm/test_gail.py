@@ -183,7 +183,6 @@ def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):
     ("arguments", "message"),
     [
         ("", "expert is missing"),
-        ("--bonus absorbing", "bonus is 'absorbing'"),
         ("--expert nowhere.npz", "it must be an .npz file"),
         ("--expert minari:nothing/there-v0", "minari:nothing/there-v0"),
     ],

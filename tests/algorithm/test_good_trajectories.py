@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from gasil_jax import good_trajectories, normalization
+from gasil_jax import buffer as good_trajectories
 
 CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
 
@@ -48,7 +48,7 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
 
 def empty():
     return (
-        good_trajectories.init(CAPACITY, 1, 1),
+        good_trajectories.init_buffer(CAPACITY, 1, 1),
         good_trajectories.init_history(
             NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=1, action_size=1
         ),
@@ -140,59 +140,6 @@ def test_the_last_admitted_episode_is_cut_and_ties_go_to_the_older():
     )
 
 
-def rows_of(ends, values):
-    """A history of one environment, and its episodes, of a length and a return each."""
-    total = sum(length for length, _ in ends)
-    ended, return_, length = (np.zeros((total, 1), x) for x in (bool, float, int))
-    last = np.cumsum([length for length, _ in ends]) - 1
-    ended[last, 0] = True
-    length[last, 0], return_[last, 0] = zip(*ends)
-    history = good_trajectories.init_history(
-        1, total, total, observation_size=values.shape[1], action_size=1
-    )
-    history = good_trajectories.record(
-        history, values[:, None], np.zeros((total, 1, 1)), reward=return_, ended=ended
-    )
-    return history, good_trajectories.ended_episodes(
-        history, ended, return_, length=length, terminated=ended
-    )
-
-
-def test_with_numbers_to_rank_by_no_part_of_an_episode_is_kept():
-    history, episodes = rows_of([(3, 3.0), (5, 2.0), (2, 1.0)], np.ones((10, 1)))
-    empty = good_trajectories.init(CAPACITY, 1, 1, keep_terminated=True)
-    cut = good_trajectories.insert(empty, history, episodes)
-    np.testing.assert_array_equal(cut.time, [0, 1, 2, 0, 1, 2, 3])
-    # The end of an episode that is cut is not in the buffer.
-    np.testing.assert_array_equal(cut.terminated, [1, 1, 1, 0, 0, 0, 0])
-    keys = np.concatenate([np.zeros(CAPACITY), episodes.return_])
-    whole = good_trajectories.insert(empty, history, episodes, ranked_by=keys)
-    assert int(whole.size) == 3 and whole.terminated[:3].all()
-    # But the best one is, if it does not fit.
-    history, episodes = rows_of([(9, 3.0), (8, 2.0)], np.ones((17, 1)))
-    keys = np.concatenate([np.zeros(CAPACITY), episodes.return_])
-    long = good_trajectories.insert(empty, history, episodes, ranked_by=keys)
-    assert int(long.size) == CAPACITY and not long.terminated.any()
-
-
-def test_equal_episodes_share_whatever_an_entrys_offset():
-    ramp = np.tile(np.linspace(-1, 1, 50), 40)
-    values = np.stack([ramp, np.full(2000, 255.0)], axis=1).astype(np.float32)
-    history, episodes = rows_of([(50, 40.0 - i) for i in range(40)], values)
-    of = normalization.init(2).replace(
-        mean=jnp.array([0.0, 255.0]), m2=jnp.array([1.0, 0.0]), count=jnp.float32(1)
-    )
-    result = good_trajectories.shared_returns(
-        good_trajectories.init(100, 2, 1),
-        history,
-        episodes,
-        normalize=functools.partial(normalization.normalize, of),
-        distance=0.5,
-    )
-    expected = (39.0 - np.arange(40)) / (1 + np.arange(40))
-    np.testing.assert_allclose(result[100:][episodes.length > 0], expected, rtol=1e-5)
-
-
 def test_an_empty_buffer_samples_zeros_and_never_nan():
     buffer, _ = empty()
     observation, action = good_trajectories.sample(jax.random.key(0), buffer, 5)
@@ -266,90 +213,3 @@ def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
     assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
     history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
     assert record(history, observation).next_observation is None
-
-
-SHARING_CAPACITY = 12
-
-
-def shared_by_hand(episodes, distance, scale):
-    """What episodes, (return, observations), are ranked by; a plain double loop."""
-    order = sorted(range(len(episodes)), key=lambda i: -episodes[i][0])
-    means = [np.mean(np.array(x), axis=0) / scale for _, x in episodes]
-    lowest = min((return_ for return_, _ in episodes), default=0.0)
-    ranked = {}
-    for place, i in enumerate(order):
-        apart = [np.sqrt(np.mean((means[i] - means[j]) ** 2)) for j in order[:place]]
-        similar = sum(x < distance for x in apart)
-        ranked[i] = (episodes[i][0] - lowest) / (1 + similar)
-    return ranked
-
-
-@given(st.integers(0, 2**31 - 1), st.sampled_from([0.1, 0.5, 2.0]))
-@settings(max_examples=30, deadline=None)
-def test_similar_episodes_share_their_return_as_by_hand(seed, distance):
-    rng = np.random.default_rng(seed)
-    scale = np.float32([0.5, 2.0])
-    buffer = good_trajectories.init(SHARING_CAPACITY, 2, 1)
-    history = good_trajectories.init_history(
-        NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=2, action_size=1
-    )
-    running, ranked = [[] for _ in range(NUM_ENVS)], 0
-    for _ in range(6):
-        shape = (NUM_STEPS, NUM_ENVS)
-        observation = rng.normal(size=(*shape, 2)).astype(np.float32)
-        ended = rng.random(shape) < 0.4
-        # Distinct returns, so that no tie has to be decided.
-        return_ = rng.permutation(np.arange(6)).reshape(shape) + rng.random()
-        length, offers = np.zeros(shape, int), {}
-        for time in range(NUM_STEPS):
-            for env in range(NUM_ENVS):
-                running[env].append(observation[time, env])
-                length[time, env] = len(running[env])
-                ended[time, env] |= len(running[env]) == MAX_EPISODE
-                if ended[time, env]:
-                    offers[time, env] = return_[time, env], running[env]
-                    running[env] = []
-        history, episodes = offer(
-            history, observation, ended, np.float32(return_), np.int32(length)
-        )
-        buffer = jax.tree.map(np.asarray, buffer)
-        starts = [i for i in range(int(buffer.size)) if buffer.time[i] == 0]
-        stops = [*starts[1:], int(buffer.size)]
-        mine = [
-            (float(buffer.return_[i]), buffer.observation[i:j])
-            for i, j in zip(starts, stops)
-        ]
-        entries = starts + [
-            SHARING_CAPACITY + time * NUM_ENVS + env for time, env in offers
-        ]
-        expected = shared_by_hand(mine + list(offers.values()), distance, scale)
-        ranked_by = shared(buffer, history, episodes, scale, distance)
-        for i, entry in enumerate(entries):
-            np.testing.assert_allclose(ranked_by[entry], expected[i], rtol=1e-4)
-        buffer = insert(buffer, history, episodes, ranked_by=ranked_by)
-        ranked += len(entries)
-    assert ranked > 6
-
-
-@jax.jit
-def offer(history, observation, ended, return_, length):
-    action = jnp.zeros((*ended.shape, 1))
-    history = good_trajectories.record(
-        history, observation, action, reward=jnp.zeros(ended.shape), ended=ended
-    )
-    return history, good_trajectories.ended_episodes(
-        history, ended, return_, length=length
-    )
-
-
-insert = jax.jit(good_trajectories.insert)
-
-shared = jax.jit(
-    lambda buffer, history, episodes, scale, distance: good_trajectories.shared_returns(
-        buffer,
-        history,
-        episodes,
-        normalize=lambda x: x / scale[None, None],
-        distance=distance,
-    )
-)

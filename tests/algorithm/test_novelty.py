@@ -8,6 +8,7 @@ import numpy as np
 
 import gasil_jax
 from gasil_jax import normalization
+from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.novelty import PPOBCNovelty, PPONovelty
 from gasil_jax.testing import example_context
 
@@ -19,7 +20,7 @@ KEY = jax.random.key(0)
 @functools.cache
 def first_context():
     """Of an agent with a buffer; the others here are given the same."""
-    algorithm = gasil_jax.Algorithm(gasil_jax.PPOBC(), config=CONFIG)
+    algorithm = gasil_jax.Algorithm(PPOBC(), config=CONFIG)
     return jax.jit(lambda key: example_context(ENV, algorithm, key))(KEY)
 
 
@@ -53,66 +54,18 @@ def test_novelty_is_one_over_the_root_of_the_visits():
 
 
 def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
-    def kept(**settings):
-        agent = PPOBCNovelty(buffer_steps=8, buffer_episodes=1, **settings)
-        context = first_context()
-        batch = context.rollout
-        # Environment 2 is alone where it is; the history has its observations too.
-        places = jnp.zeros_like(batch.next_observation).at[:, 2].set(1e3)
-        context = context.replace(
-            rollout=batch.replace(next_observation=places, reward=0.0 * batch.reward),
-            normalizer=normalization.init(ENV.observation_size),
-        )
-        buffer = remembered(agent, context).buffer
-        assert buffer.size > 0
-        first = np.array(buffer.action[0])
-        return int(np.where((np.array(batch.action) == first).all(-1))[1][0])
-
-    assert kept() == 2
-    assert kept(novelty_ties="arrival") != 2
-
-
-def test_ties_and_admission_of_the_buffer():
-    def kept(**settings):
-        agent = gasil_jax.PPOBC(buffer_steps=8, buffer_episodes=1, **settings)
-        context = first_context()
-        batch, buffer = context.rollout, remembered(agent, context)
-        if buffer.size == 0:
-            return None
-        first = np.array(buffer.action[0])
-        return int(np.where((np.array(batch.action) == first).all(-1))[0][0])
-
-    # All episodes return 0.
-    assert kept() < kept(ties="newest")
-    assert kept(admission="better") is None
-
-
-def test_a_second_way_to_succeed_is_kept_where_similar_episodes_share():
-    def kept(**settings):
-        agent = gasil_jax.PPOBC(buffer_steps=16, **settings)
-        context = first_context()
-        batch, history = context.rollout, context.history
-        # Episodes of environment 1 are the best, and like no other's.
-        returns = jnp.zeros_like(batch.discounted_return)
-        returns = returns.at[:, 1].set(1.0).at[:, 2].set(0.9)
-        history = history.replace(observation=history.observation.at[1].add(100.0))
-        context = context.replace(
-            rollout=batch.replace(discounted_return=returns), history=history
-        )
-        buffer = remembered(agent, context)
-        return buffer.return_[jnp.array([0, buffer.size - 1])]
-
-    np.testing.assert_allclose(kept(), [1.0, 1.0])
-    np.testing.assert_allclose(kept(sharing_distance=1.0), [1.0, 0.9])
-
-
-def test_only_better_episodes_are_admitted():
-    agent = gasil_jax.PPOBC(admission="better")
+    agent = PPOBCNovelty(buffer_steps=8, buffer_episodes=1)
     context = first_context()
     batch = context.rollout
-    returns = jnp.zeros_like(batch.discounted_return).at[:, 1].set(1.0)
-    context = context.replace(rollout=batch.replace(discounted_return=returns))
-    buffer = remembered(agent, context)
-    count = int(np.sum(np.array(batch.ended)[:, 1] & ~np.array(batch.cut_short)[:, 1]))
-    assert buffer.size == 8 * count > 0
-    assert (buffer.return_[: buffer.size] == 1.0).all()
+    # Environment 2 is alone where it is; the history has its observations too.
+    places = jnp.zeros_like(batch.next_observation).at[:, 2].set(1e3)
+    context = context.replace(
+        rollout=batch.replace(next_observation=places, reward=0.0 * batch.reward),
+        normalizer=normalization.init(ENV.observation_size),
+    )
+    for kind, novel in ((agent, True), (PPOBC(buffer_steps=8), False)):
+        state = remembered(kind, context)
+        buffer = state.buffer if novel else state
+        first = np.array(buffer.action[0])
+        env = int(np.where((np.array(batch.action) == first).all(-1))[1][0])
+        assert buffer.size > 0 and (env == 2) == novel

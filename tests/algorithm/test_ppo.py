@@ -70,13 +70,13 @@ def test_loss_equals_numpy():
         ]
     )
     old = log_prob + rng.normal(size=n) * 0.3
-    config = Config(clip_epsilon=0.2, entropy_coefficient=0.01, value_coefficient=0.7)
+    config = Config(clip_epsilon=0.2, entropy_coefficient=0.01)
     surrogate = []
     for ratio, adv in zip(np.exp(log_prob - old), advantage, strict=True):
         surrogate.append(min(ratio * adv, min(max(ratio, 0.8), 1.2) * adv))
     entropy = sum(s + 0.5 * np.log(2 * np.pi * np.e) for s in log_std)
     squared = np.mean((value - return_) ** 2)
-    expected = -np.mean(surrogate) + 0.7 * 0.5 * squared - 0.01 * entropy
+    expected = -np.mean(surrogate) + 0.5 * squared - 0.01 * entropy
     batch = ppo.Batch(
         *(jnp.asarray(x, jnp.float32) for x in (mean, action, old, advantage)),
         returns=jnp.asarray(return_, jnp.float32)[:, None],

@@ -10,7 +10,8 @@ from brax.envs import State
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax import good_trajectories, normalization
+from gasil_jax import buffer as good_trajectories
+from gasil_jax import normalization
 from gasil_jax.context import Context, Sizes
 from gasil_jax.distributions import GAUSSIAN
 from gasil_jax.rewards import decomposition
@@ -74,54 +75,48 @@ def random_batches(seed, num_batches, delay=5):
         )
 
 
-@functools.cache
-def decompose_once(inputs):
-    def step(state, history, batch, key, learning_rate):
-        history = good_trajectories.record(
-            history,
-            batch.observation,
-            batch.action,
-            reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
-            ended=batch.ended,
-            next_observation=batch.next_observation,
-        )
-        context = Context(
-            rollout=batch,
-            history=history,
-            normalizer=normalization.init(OBS),
-            reward_scale=jnp.float32(1.0),
-            action_range=(-1.0, 1.0),
-            config=CONFIG,
-            policy=None,
-            distribution=GAUSSIAN,
-            value=None,
-        )
-        model = MODEL.replace(
-            decomposition_learning_rate=learning_rate, decomposition_inputs=inputs
-        )
-        state, context, _, metrics = model.update(state, context, key)
-        return state, history, context.rollout.reward, metrics
-
-    return jax.jit(step)
+@jax.jit
+def decompose_once(state, history, batch, key, learning_rate):
+    history = good_trajectories.record(
+        history,
+        batch.observation,
+        batch.action,
+        reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
+        ended=batch.ended,
+        next_observation=batch.next_observation,
+    )
+    context = Context(
+        rollout=batch,
+        history=history,
+        normalizer=normalization.init(OBS),
+        reward_scale=jnp.float32(1.0),
+        action_range=(-1.0, 1.0),
+        config=CONFIG,
+        policy=None,
+        distribution=GAUSSIAN,
+        value=None,
+    )
+    model = MODEL.replace(decomposition_learning_rate=learning_rate)
+    state, context, _, metrics = model.update(state, context, key)
+    return state, history, context.rollout.reward, metrics
 
 
-def decompose_all(batches, failed=(), inputs="transition"):
+def decompose_all(batches, failed=()):
     """Decompose all batches; updates of the network after some of them are infinite."""
-    model = MODEL.replace(decomposition_inputs=inputs)
     history = good_trajectories.init_history(
         NUM_ENVS,
         NUM_STEPS,
         LIMIT,
         observation_size=OBS,
         action_size=ACT,
-        keep_next=model.keeps_next_observation,
+        keep_next=True,
     )
     history_steps = history.reward.shape[1]
-    state = model.init(
+    state = MODEL.init(
         jax.random.key(0), Sizes(CONFIG.num_envs, OBS, ACT, history_steps)
     )
     for i, batch in enumerate(batches):
-        state, history, reward, metrics = decompose_once(inputs)(
+        state, history, reward, metrics = decompose_once(
             state,
             history,
             batch,
@@ -315,16 +310,13 @@ def test_long_windows_are_represented_by_steps_drawn_from_all_of_them():
     assert abs(float(offset[:, 2].mean()) - 4.0) < 0.5
 
 
-@pytest.mark.parametrize(
-    ("delay", "inputs"),
-    # Shorter and longer than the rows of a window.
-    [(2, "transition"), (12, "transition"), (2, "pair")],
-)
-def test_it_learns_the_reward_behind_the_payouts(delay, inputs):
+# Shorter and longer than the rows of a window.
+@pytest.mark.parametrize("delay", [2, 12])
+def test_it_learns_the_reward_behind_the_payouts(delay):
     batches = list(random_batches(2, 150, delay))
     errors, fits = [], []
     for batch, (_, _, reward, metrics) in zip(
-        batches, decompose_all(batches, inputs=inputs), strict=True
+        batches, decompose_all(batches), strict=True
     ):
         true = batch.observation[..., 0] + 0.5 * np.clip(batch.action[..., 0], -1, 1)
         errors.append(np.mean((reward - true - 1.0)[~batch.faulty] ** 2))

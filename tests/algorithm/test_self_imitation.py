@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_jax import good_trajectories
 from gasil_jax.agents import self_imitation
+from gasil_jax.buffer import init_history, record
 
 GAMMA = 0.9
 
@@ -14,16 +14,12 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
     """Four batches of three steps in two environments, against lists of episodes."""
     rng = np.random.default_rng(1)
     num_steps, num_envs, capacity = 3, 2, 15
-    history = good_trajectories.init_history(
-        num_envs, num_steps, 9, observation_size=1, action_size=1
-    )
+    history = init_history(num_envs, num_steps, 9, observation_size=1, action_size=1)
     replay = self_imitation.init_replay(capacity, 1, 1)
 
     @jax.jit
     def add(replay, history, observation, reward, ended):
-        history = good_trajectories.record(
-            history, observation, -observation, reward=reward, ended=ended
-        )
+        history = record(history, observation, -observation, reward=reward, ended=ended)
         replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
         return replay, history
 

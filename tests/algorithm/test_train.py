@@ -31,9 +31,7 @@ IMITATION = {
 }
 AGENTS = (
     gasil_jax.PPO(),
-    gasil_jax.PPOBonus(),
     gasil_jax.PPOBC(buffer_steps=100),
-    gasil_jax.PPOBCAdaptive(buffer_steps=100),
     gasil_jax.PPONovelty(),
     gasil_jax.PPOBCNovelty(buffer_steps=100),
     gasil_jax.PPOSIL(sil_buffer_steps=500, sil_minibatch_size=64),
@@ -244,10 +242,6 @@ def test_a_loop_of_ones_own_refuses_a_state_that_would_be_broadcast_or_cut():
         traced(state, PPO_GASIL.replace(batch_steps=2 * CONFIG.batch_steps))
     with pytest.raises(ValueError, match=r"state.agent.* is missing: .* needs float"):
         traced(plain, SMALL["ppo+bc"])
-    with pytest.raises(
-        ValueError, match=r"state.hyperparameters\['alpha'\] is missing"
-    ):
-        traced(plain, SMALL["ppo+bonus"])
     with pytest.raises(ValueError, match=r"buffer.* is float32\[100.* needs .*\[99"):
         traced(state, PPO_GASIL.replace(buffer_steps=99))
     # The state has what the models of rewards have learned.

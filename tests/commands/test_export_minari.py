@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from small_training import FLAGS
 
-from gasil_jax import export_minari, good_trajectories, run
+from gasil_jax import buffer as good_trajectories
+from gasil_jax import export_minari, run
 from gasil_jax.agents import expert
 from gasil_jax.host import checkpoint
 from gasil_jax.sweeps import saved_states
@@ -112,7 +113,7 @@ def test_the_last_episode_of_a_buffer_is_kept_if_it_is_whole():
     assert lengths(full, 50) == [30, 20, 50]
     partly = buffer((30, 20), (3.0, 2.0), 100, 4, 2)
     assert lengths(partly, 1000) == [30, 20]
-    assert lengths(good_trajectories.init(100, 4, 2), 1000) == []
+    assert lengths(good_trajectories.init_buffer(100, 4, 2), 1000) == []
 
 
 def test_bad_input_is_one_line_and_status_2(filled, untrained_point_mass, capsys):

@@ -350,11 +350,11 @@ def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
         (run, "--my-weight much", "my_weight is 'much': it must be a number"),
         (run, "--my-wieght 0.2", "--my-weight"),
         (run, "--agent ppo --my-weight 0.2", "option --my-weight is unknown"),
-        (run, "--alpha 0.2", "alpha is a setting of ppo+bonus, gasil, ppo+gasil, gail"),
+        (run, "--alpha 0.2", "alpha is a setting of gasil, ppo+gasil, gail"),
         (sweep, "--grid my_weight=0.1,2", "my_weight is 2.0: it must be 0 or more"),
         (sweep, "--grid my_wieght=0.1", "did you mean 'my_weight'?"),
         (sweep, "--agent ppo --grid my_weight=0.1", "'my_weight' can't vary"),
-        (sweep, "--grid alpha=0.1", "alpha is a setting of ppo+bonus, gasil, ppo+gas"),
+        (sweep, "--grid alpha=0.1", "alpha is a setting of gasil, ppo+gasil, gail"),
     ],
 )
 def test_its_numbers_are_checked(tmp_path, capsys, program, arguments, why):

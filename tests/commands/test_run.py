@@ -160,8 +160,8 @@ def test_a_used_folder_is_refused_and_left_alone(finished, capsys):
         ("--env hopper --agent ppo+gasill", "did you mean 'ppo+gasil'?"),
         (
             "--env hopper --agent ppo --alpha 0.7",
-            "option --alpha is unknown: alpha is a setting of ppo+bonus, gasil, "
-            "ppo+gasil, gail, not of ppo",
+            "option --alpha is unknown: alpha is a setting of gasil, ppo+gasil, "
+            "gail, not of ppo",
         ),
         (
             "--env hopper --agent ppo+sil --no-buffer-discounts",
@@ -363,10 +363,13 @@ def test_an_option_without_effect_is_told(arguments, messages, capsys):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("point_mass --agent ppo+bonus", "agent 'ppo+bonus' on point_mass with dense"),
+        (
+            "point_mass --agent ppo+novelty",
+            "agent 'ppo+novelty' on point_mass with",
+        ),
         ("point_mass --agent ppo --reward-delay 2", "on point_mass with delayed"),
         ("brax:ant", "nothing for agent 'ppo+gasil' on brax:ant with dense rewards"),
-        ("walker2d --agent ppo+bonus --preset paper", None),
+        ("walker2d --agent ppo+bc --preset paper", None),
         ("walker2d --agent ppo --reward-delay 20", None),
         ("walker2d --agent ppo --preset scaled --reward-delay 20", None),
     ],

@@ -160,8 +160,8 @@ def test_points_from_a_file(tmp_path):
         ),
         (
             "--agent ppo+sil --grid buffer_steps=9",
-            "buffer_steps is a setting of ppo+bc, ppo+bc-adaptive, ppo+bc+novelty, "
-            "gasil, ppo+gasil, ppo+gasil-adaptive, not of ppo+sil",
+            "buffer_steps is a setting of ppo+bc, ppo+bc+novelty, gasil, "
+            "ppo+gasil, ppo+gasil-adaptive, not of ppo+sil",
         ),
         (
             "--grid decomposition_learning_rate=1e-3,1e-4",

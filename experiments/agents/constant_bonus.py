@@ -1,27 +1,25 @@
-"""PPO+BONUS, the control of PPO+GASIL: the same bonus alpha in every step.
+"""The control of PPO+GASIL: PPO with the same bonus alpha in every step.
 
 The paper's bonus -alpha log D is never negative, so it favours long episodes even
 without imitation. So does this agent's bonus. How much better PPO+GASIL is than this
-agent is the effect of imitation.
+agent is the effect of imitation. It is named
+``experiments.agents.constant_bonus:PPOBonus``.
 """
 
 import jax
 
-from gasil_jax.agents.interface import Agent
+import gasil_jax
 from gasil_jax.config import Schedule, number, schedule
 from gasil_jax.context import Context, Metrics
 
 
-class PPOBonus(Agent):
+class PPOBonus(gasil_jax.Agent):
     """PPO on the environment's reward plus a constant in each step.
 
     Attributes:
       alpha: the bonus of a step.
-      alpha_schedule: factor that multiplies alpha, over environment steps: STEPS FACTOR
-        pairs (see the learning rate's).
+      alpha_schedule: factor that multiplies alpha, over environment steps.
     """
-
-    name = "ppo+bonus"
 
     alpha: float = number(0.1, 0.0)
     alpha_schedule: Schedule = schedule()

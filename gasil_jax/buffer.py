@@ -5,14 +5,9 @@ is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, 
 undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
 steps that were ever offered are ordered by (return descending, episode, time), and the
 first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
-a tie the older episode stays. That is the paper's buffer; `insert` can also limit the
-number of episodes, prefer the newer one on a tie, and rank by other numbers, such as
-`shared_returns`. All functions are pure and work under jit, vmap and shard_map; an
-empty buffer is a normal state.
+a tie the older episode stays. All functions are pure and work under jit, vmap and
+shard_map; an empty buffer is a normal state.
 """
-
-from collections.abc import Callable
-from typing import Any
 
 import chex
 import jax
@@ -32,8 +27,6 @@ class GoodTrajectories(struct.PyTreeNode):
       return_: float32 (C,), the return of the step's episode; 0 where empty.
       time: int32 (C,), the step's index in its episode.
       size: int32 (), number of filled steps; they are the first ones.
-      terminated: bool (C,), whether the step's episode terminated, and was neither
-        truncated nor cut by the capacity; None if the buffer does not keep it.
     """
 
     observation: jax.Array
@@ -41,7 +34,6 @@ class GoodTrajectories(struct.PyTreeNode):
     return_: jax.Array
     time: jax.Array
     size: jax.Array
-    terminated: jax.Array | None = None
 
     @property
     def capacity(self) -> int:
@@ -88,43 +80,24 @@ class Episodes(struct.PyTreeNode):
       length: int32 (E,), number of steps.
       env: int32 (E,), index of the environment that the episode ran in.
       last: int32 (E,), index of its last step in that environment's ring.
-      terminated: bool (E,), whether the episode terminated, and was not truncated.
     """
 
     return_: jax.Array
     length: jax.Array
     env: jax.Array
     last: jax.Array
-    terminated: jax.Array | None = None
 
 
-def init(
-    capacity: int,
-    observation_size: int,
-    action_size: int,
-    *,
-    keep_terminated: bool = False,
+def init_buffer(
+    capacity: int, observation_size: int, action_size: int
 ) -> GoodTrajectories:
-    """Return an empty buffer.
-
-    Args:
-      capacity: C, the largest number of steps.
-      observation_size: dimension of an observation.
-      action_size: dimension of an action; for discrete actions, their number.
-      keep_terminated: whether the buffer has the field `terminated`.
-
-    Raises:
-      ValueError: if the capacity is below 1.
-    """
-    if capacity < 1:
-        raise ValueError(f"buffer_steps is {capacity}: it must be 1 or more")
+    """Return an empty buffer for `capacity` steps."""
     return GoodTrajectories(
         observation=jnp.zeros((capacity, observation_size), jnp.float32),
         action=jnp.zeros((capacity, action_size), jnp.float32),
         return_=jnp.zeros(capacity, jnp.float32),
         time=jnp.zeros(capacity, jnp.int32),
         size=jnp.int32(0),
-        terminated=jnp.zeros(capacity, bool) if keep_terminated else None,
     )
 
 
@@ -205,12 +178,7 @@ def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
 
 
 def ended_episodes(
-    history: History,
-    ended: jax.Array,
-    return_: jax.Array,
-    *,
-    length: jax.Array,
-    terminated: jax.Array | None = None,
+    history: History, ended: jax.Array, return_: jax.Array, *, length: jax.Array
 ) -> Episodes:
     """Return the episodes that ended in the last recorded batch, oldest first.
 
@@ -220,8 +188,6 @@ def ended_episodes(
       return_: float32 (time, N), the episode's return up to this step, by which it is
         ranked.
       length: int32 (time, N), the episode's number of steps up to this one.
-      terminated: bool (time, N), whether it ended here without a future value; needed
-        if the buffer keeps that.
     """
     chex.assert_equal_shape([ended, return_, length])
     num_steps, num_envs = ended.shape
@@ -234,139 +200,53 @@ def ended_episodes(
         length=jnp.where(ended, length, 0).ravel(),
         env=jnp.broadcast_to(env, ended.shape).ravel(),
         last=jnp.broadcast_to(index[:, None], ended.shape).ravel(),
-        terminated=None if terminated is None else terminated.ravel(),
     )
 
 
-def _kept_lengths(good_trajectories: GoodTrajectories) -> jax.Array:
+def _kept_lengths(buffer: GoodTrajectories) -> jax.Array:
     """Return the lengths of the buffer's episodes, int32 (C,), each at its first step.
 
     All other entries are 0. An episode ends where the next one starts.
     """
-    slot = jnp.arange(good_trajectories.capacity, dtype=jnp.int32)
-    starts = good_trajectories.filled & (good_trajectories.time == 0)
-    next_start = jax.lax.cummin(
-        jnp.where(starts, slot, good_trajectories.size), reverse=True
-    )
-    following = jnp.append(next_start[1:], good_trajectories.size)
+    slot = jnp.arange(buffer.capacity, dtype=jnp.int32)
+    starts = buffer.filled & (buffer.time == 0)
+    next_start = jax.lax.cummin(jnp.where(starts, slot, buffer.size), reverse=True)
+    following = jnp.append(next_start[1:], buffer.size)
     return jnp.where(starts, following - slot, 0)
 
 
-# Number of the best episodes among which returns are shared. It bounds the table of
-# their distances; a batch and a buffer together seldom have more.
-_MOST_SHARING = 256
-
-
-def shared_returns(
-    good_trajectories: GoodTrajectories,
-    history: History,
-    episodes: Episodes,
-    *,
-    normalize: Callable[[jax.Array], jax.Array],
-    distance: float,
-) -> jax.Array:
-    """Return the numbers by which `insert` ranks episodes that share their returns.
-
-    An episode's number is its return minus the lowest return, divided by 1 + n. Here n
-    is the number of similar episodes that come before it by return (fitness sharing,
-    Goldberg and Richardson 1987). So the buffer keeps episodes that succeed in
-    different ways. Episodes are similar if the means of their normalized observations
-    differ by less than `distance` (root mean square over the entries).
-
-    Args:
-      good_trajectories: the buffer before the insertion.
-      history: the history that holds the steps of the offered episodes.
-      episodes: the offered episodes.
-      normalize: observations (..., obs) -> normalized ones, which must be around 0 and
-        bounded: sums of others would not be precise.
-      distance: the distance below which two episodes are similar.
-
-    Returns:
-      float32 (C + E,): first the buffer's episodes, each at its first step and 0 at its
-      other steps, then the offered ones. Only the best 256 episodes are compared; for
-      all others n is 256.
-    """
-
-    def means(rows: jax.Array, env: Any, *, end: jax.Array, length: Any) -> jax.Array:
-        """Return the means of `length` rows (env, row, obs) before `end`."""
-        sums = jnp.cumsum(normalize(rows), axis=1)
-        sums = jnp.pad(sums, ((0, 0), (1, 0), (0, 0)))
-        total = sums[env, end] - sums[env, end - length]
-        return total / jnp.maximum(length, 1)[:, None]
-
-    kept_length = _kept_lengths(good_trajectories)
-    end = jnp.arange(kept_length.shape[0]) + kept_length
-    rows = good_trajectories.observation[None]
-    kept = means(rows, 0, end=end, length=kept_length)
-    # An episode may begin at the end of the ring, so its end is in a second copy.
-    rows = jnp.concatenate([history.observation] * 2, axis=1)
-    end = history.observation.shape[1] + episodes.last + 1
-    offered = means(rows, episodes.env, end=end, length=episodes.length)
-
-    length = jnp.concatenate([kept_length, episodes.length])
-    return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
-    valid = (length > 0) & jnp.isfinite(return_)
-    order = jnp.argsort(jnp.where(valid, -return_, jnp.inf), stable=True)
-    best = order[:_MOST_SHARING]
-    mean = jnp.concatenate([kept, offered])[best]
-    apart = jnp.sqrt(jnp.mean((mean[:, None] - mean[None]) ** 2, axis=-1))
-    similar = (apart < distance) & valid[best][None]
-    before = jnp.sum(jnp.tril(similar, k=-1), axis=1)
-    sharing = jnp.full(return_.shape, _MOST_SHARING).at[best].set(before)
-    lowest = jnp.min(jnp.where(valid, return_, jnp.inf))
-    return jnp.where(valid, (return_ - lowest) / (1 + sharing), 0.0)
-
-
 def insert(
-    good_trajectories: GoodTrajectories,
+    buffer: GoodTrajectories,
     history: History,
     episodes: Episodes,
     *,
     max_episodes: int | None = None,
-    newest: bool = False,
-    ranked_by: jax.Array | None = None,
 ) -> GoodTrajectories:
     """Return the buffer with the best of its own and the offered episodes.
 
+    The function sorts whole episodes, not steps, and then gathers every kept step.
+
     Args:
-      good_trajectories: the buffer before the insertion.
+      buffer: the buffer before the insertion.
       history: the history that holds the steps of the offered episodes.
       episodes: the offered episodes. Those whose return is not finite are rejected, so
         an episode in which any number is not finite must have such a return.
       max_episodes: number of episodes to keep at most; None for any number.
-      newest: whether the newer of two episodes with the same return comes first.
-      ranked_by: float32 (C + E,), numbers to rank the buffer's own and the offered
-        episodes by; default their returns. With them an episode that does not fit is
-        left out, unless it is the first: later its rank may be another, and one that
-        was cut would be in the middle of the buffer.
-
-    The function sorts whole episodes, not steps, and then gathers every kept step.
     """
-    capacity = good_trajectories.capacity
+    capacity = buffer.capacity
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    kept_length = _kept_lengths(good_trajectories)
+    kept_length = _kept_lengths(buffer)
     offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
     length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
-    return_ = jnp.concatenate([good_trajectories.return_, episodes.return_])
+    return_ = jnp.concatenate([buffer.return_, episodes.return_])
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
-    keys = return_ if ranked_by is None else ranked_by
-    key = jnp.where(length > 0, -keys, jnp.inf)
-    if newest:
-        by_age = jnp.concatenate(
-            [jnp.arange(key.shape[0] - 1, capacity - 1, -1), jnp.arange(capacity)]
-        )
-        order = by_age[jnp.argsort(key[by_age], stable=True)]
-    else:
-        order = jnp.argsort(key, stable=True)
+    order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
     if max_episodes is not None:
         # Entries of length 0 come last, so the first ones are the best episodes.
         length = length.at[order[max_episodes:]].set(0)
     end = jnp.cumsum(length[order])
     size = jnp.minimum(end[-1], capacity)
-    if ranked_by is not None:
-        whole = jnp.max(jnp.where(end <= capacity, end, 0))
-        size = jnp.where(whole > 0, whole, size)
 
     rank = jnp.minimum(jnp.searchsorted(end, slot, side="right"), order.shape[0] - 1)
     source = order[rank]
@@ -381,33 +261,21 @@ def insert(
     filled = slot < size
 
     def gather(kept: jax.Array, recorded: jax.Array) -> jax.Array:
-        return jnp.where(
-            filled[:, None],
-            jnp.where(
-                is_kept[:, None], kept[kept_index], recorded[env, recorded_index]
-            ),
-            0.0,
-        )
+        steps = (kept[kept_index], recorded[env, recorded_index])
+        return jnp.where(filled[:, None], jnp.where(is_kept[:, None], *steps), 0.0)
 
-    terminated = good_trajectories.terminated
-    if terminated is not None:
-        assert episodes.terminated is not None, "this buffer keeps how episodes ended"
-        both = jnp.concatenate([terminated, episodes.terminated])
-        # Of an episode that is cut, the end is not in the buffer.
-        terminated = filled & both[source] & (end[rank] <= capacity)
     return GoodTrajectories(
-        observation=gather(good_trajectories.observation, history.observation),
-        action=gather(good_trajectories.action, history.action),
+        observation=gather(buffer.observation, history.observation),
+        action=gather(buffer.action, history.action),
         return_=jnp.where(filled, return_[source], 0.0),
         time=jnp.where(filled, time, 0),
         size=size,
-        terminated=terminated,
     )
 
 
 def sample(
     key: jax.Array,
-    good_trajectories: GoodTrajectories,
+    buffer: GoodTrajectories,
     num_samples: int,
     *,
     by_return: bool = False,
@@ -418,38 +286,36 @@ def sample(
 
     Args:
       key: random key; consumed.
-      good_trajectories: the buffer.
+      buffer: the buffer.
       num_samples: number of steps.
       by_return: draw with probabilities proportional to `return_weights`; otherwise
         uniformly.
     """
     uniform = jax.random.uniform(key, (num_samples,))
     if by_return:
-        cumulative = jnp.cumsum(return_weights(good_trajectories))
+        cumulative = jnp.cumsum(return_weights(buffer))
         index = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
     else:
-        index = (uniform * good_trajectories.size).astype(jnp.int32)
-    index = jnp.clip(index, 0, jnp.maximum(good_trajectories.size - 1, 0))
-    return good_trajectories.observation[index], good_trajectories.action[index]
+        index = (uniform * buffer.size).astype(jnp.int32)
+    index = jnp.clip(index, 0, jnp.maximum(buffer.size - 1, 0))
+    return buffer.observation[index], buffer.action[index]
 
 
-def return_weights(good_trajectories: GoodTrajectories) -> jax.Array:
+def return_weights(buffer: GoodTrajectories) -> jax.Array:
     """Return exp((R - best R) / standard deviation of R), (C,); 0 where empty.
 
     R is the return of the step's episode.
     """
-    filled = good_trajectories.filled
-    return_ = jnp.where(filled, good_trajectories.return_, 0.0)
-    deviation = jnp.std(return_, where=filled)
+    filled = buffer.filled
+    return_ = jnp.where(filled, buffer.return_, 0.0)
+    std = jnp.std(return_, where=filled)
     # The best episode comes first.
-    excess = (return_ - return_[0]) / jnp.maximum(deviation, 1e-8)
+    excess = (return_ - return_[0]) / jnp.maximum(std, 1e-8)
     return jnp.where(filled, jnp.exp(excess), 0.0)
 
 
-def mean_return(good_trajectories: GoodTrajectories) -> jax.Array:
+def mean_return(buffer: GoodTrajectories) -> jax.Array:
     """Return the mean of `return_` over all kept steps, (); NaN if there are none."""
-    filled = good_trajectories.filled
-    total = jnp.sum(jnp.where(filled, good_trajectories.return_, 0.0))
-    return jnp.where(good_trajectories.size > 0, total, jnp.nan) / jnp.maximum(
-        good_trajectories.size, 1
-    )
+    filled = buffer.filled
+    total = jnp.sum(jnp.where(filled, buffer.return_, 0.0))
+    return jnp.where(buffer.size > 0, total / jnp.maximum(buffer.size, 1), jnp.nan)

@@ -1,4 +1,4 @@
-"""PPO+BC-ADAPTIVE: its weight of cloning against NumPy, and PPO where that is 0."""
+"""The agents of the experiments: a constant bonus, and cloning that fades."""
 
 import functools
 
@@ -6,13 +6,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_train import SMALL
+from small_training import SETTINGS
 
 import gasil_jax
+from experiments.agents.adaptive_cloning import PPOBCAdaptive
+from experiments.agents.constant_bonus import PPOBonus
 from gasil_jax.testing import example_context
 
 ENV, KEY = gasil_jax.make_env("point_mass"), jax.random.key(0)
-CLONING = SMALL["ppo+bc-adaptive"]
+CONFIG = gasil_jax.Config(**SETTINGS).replace(batch_steps=256)
+CLONING = gasil_jax.Algorithm(PPOBCAdaptive(buffer_steps=100), config=CONFIG)
+
+
+def test_a_constant_bonus_is_paid_for_every_step():
+    algorithm = gasil_jax.Algorithm(PPOBonus(alpha=0.7), config=CONFIG)
+    context = jax.jit(lambda key: example_context(ENV, algorithm, key))(KEY)
+    _, rewards, _ = algorithm.agent.update_and_reward((), context, KEY)
+    np.testing.assert_allclose(rewards - context.rollout.reward, 0.7, rtol=1e-5)
 
 
 @functools.cache
