@@ -83,13 +83,13 @@ class Comparison:
         return f"not clear (visible from {number(self.visible, spec)} on)"
 
 
-def judged(effects: Mapping[Any, Effect]) -> dict[Any, Comparison]:
-    """Return the comparisons of a family of tests."""
-    p_values = corrected({key: effect.p for key, effect in effects.items()})
+def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Comparison]:
+    """Return the comparisons of a family of tests, of which some may be dropped."""
+    p_values = corrected({key: effect.p for key, effect in effects.items()}, dropped)
     compared = {}
     for key, (middle, _, drawn) in effects.items():
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
-        visible = visible_effect(drawn, len(effects))
+        visible = visible_effect(drawn, len(effects) + dropped)
         compared[key] = Comparison(middle, p_values[key], low, high, visible)
     return compared
 
@@ -128,7 +128,9 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     return float((1 + as_far.sum()) / (1 + _DRAWS))
 
 
-def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
+def compare(
+    scores: Scores, family: Comparisons, dropped: int = 0
+) -> dict[tuple[str, ...], Comparison]:
     """Return the comparisons of a family whose curves all have scores.
 
     The p-value is the percentile bootstrap's: twice the share of draws on the other
@@ -153,7 +155,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
         effects[key] = Effect(middle, p_value, drawn)
-    return judged(effects)
+    return judged(effects, dropped)
 
 
 def bootstrap_p(drawn: np.ndarray) -> float:
@@ -175,11 +177,14 @@ def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
     return errors * float(np.std(drawn))
 
 
-def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:
-    """Return the p-values of a family, corrected by Holm's method."""
+def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
+    """Return the p-values of a family, corrected by Holm's method.
+
+    Those that are dropped, because their runs are, count as if they were the largest.
+    """
     higher, least = {}, 0.0
     for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
-        least = max(least, min(1.0, p_values[key] * (len(p_values) - i)))
+        least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
         higher[key] = least
     return {key: higher[key] for key in p_values}
 

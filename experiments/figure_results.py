@@ -92,8 +92,11 @@ class Results:
 
     def compare(self, scores: Scores) -> dict[tuple[str, ...], Comparison]:
         """Return the figure's comparisons of scores, corrected family by family."""
-        families = self.figure.families()
-        return {k: x for one in families for k, x in compare(scores, one).items()}
+        dropped = self.figure.dropped_pairs * len(self.figure.panels)
+        compared: dict[tuple[str, ...], Comparison] = {}
+        for family in self.figure.families():
+            compared |= compare(scores, family, dropped)
+        return compared
 
     @functools.cached_property
     def steps(self) -> shares.Steps:

@@ -62,7 +62,8 @@ def page(name: str, results: Results, text: str) -> str:
             words += f", and at least {searched} of the searches"
         parts.append(f"{words}.")
     if results.curves:
-        sizes = " and ".join(f"{len(family)}" for family in figure.families())
+        dropped = figure.dropped_pairs * len(figure.panels)
+        sizes = " and ".join(f"{len(x) + dropped}" for x in figure.families())
         reading = note("how_to_read_shares" if figure.solved_from else "how_to_read")
         parts += [fill(reading, lambda _: sizes).strip(), "## Settings"]
         parts.append(tables.settings(results))

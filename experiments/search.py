@@ -20,8 +20,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from experiments.agents import algorithm
 from experiments.store import Store
-from gasil_jax.algorithms import Algorithm, algorithm
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings, make_env
 from gasil_jax.sweeps.points import PAPER_RANGES
 from gasil_jax.sweeps.runs import Run

@@ -60,7 +60,7 @@ def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
 
 
 def verdicts(
-    solved: Solved, pairs: Sequence[tuple[str, str, str]]
+    solved: Solved, pairs: Sequence[tuple[str, str, str]], dropped: int = 0
 ) -> dict[tuple[str, str, str], str]:
     """Return the verdicts of a family of (panel, ours, other)."""
     middle, p_values = {}, {}
@@ -69,7 +69,7 @@ def verdicts(
         middle[key] = float(first.mean() - second.mean())
         counts = (int(first.sum()), len(first), int(second.sum()), len(second))
         p_values[key] = fisher_p(*counts)
-    return {k: verdict(middle[k], p) for k, p in corrected(p_values).items()}
+    return {k: verdict(middle[k], p) for k, p in corrected(p_values, dropped).items()}
 
 
 def _mean_lead(

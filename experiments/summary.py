@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import plots, report
+from experiments.agents import OWN
 from experiments.curves import name_of
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
@@ -303,11 +304,12 @@ def tuned(pages: Pages) -> str:
                 search, "normalize_rewards", True
             )
             # On the sparse tasks each agent has one setting for all, and so has
-            # adaptive imitation where that returns about as much as its searches.
+            # adaptive imitation where that returns about as much as its searches. The
+            # experiments' own agents have no presets.
             kind = "delayed" if search.reward_delay > 1 else "dense"
             is_own = kind == "delayed" and search.env in ("ant", "humanoid")
             single = search.agent == ADAPTIVE and not is_own
-            single |= isinstance(search, SparseSearch)
+            single |= isinstance(search, SparseSearch) or search.agent in OWN
             # The best of its own values and of those that PPO's and PPO+GASIL's
             # searches chose, by the final returns on the pages.
             others = [dataclasses.replace(search, chooser=x) for x in PAIR]

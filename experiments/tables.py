@@ -431,8 +431,10 @@ def lead(results: Results, ours: str = "", kind: str = "", *others: str) -> str:
     """
     solved, having = results.solved, _panels_by_pair(results, ours, kind)
     pairs = [(panel, *x) for x, panels in having.items() for panel in panels]
-    verdict_of = statistics.verdicts(solved, pairs)
-    mean = judged({x: statistics.overall(solved, on, x) for x, on in having.items()})
+    dropped, panels = results.figure.dropped_pairs, panels_of(results.figure, kind)
+    verdict_of = statistics.verdicts(solved, pairs, dropped * len(panels))
+    every = {x: statistics.overall(solved, on, x) for x, on in having.items()}
+    mean = judged(every, dropped)
     return "\n".join(
         f"- {first} against {second}: mean share {one:+z.2f}, "
         f"{one.verdict_in_words('.2f')}; "
@@ -448,7 +450,7 @@ def sooner(results: Results, ours: str = "", kind: str = "", *others: str) -> st
     """Return whether a curve's seeds solve their tasks sooner; otherwise as `lead`."""
     having, lines = _panels_by_pair(results, ours, kind), []
     every = {x: statistics.sooner(results.steps, on, x) for x, on in having.items()}
-    for (first, second), one in judged(every).items():
+    for (first, second), one in judged(every, results.figure.dropped_pairs).items():
         if second in (others or [second]):
             ends = (0.5 + x for x in (one.middle, one.low, one.high))
             lines.append(

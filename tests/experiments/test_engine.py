@@ -241,7 +241,7 @@ def toy(monkeypatch):
     """A figure of two small curves on the point mass."""
     changes = {**SMALL, "total_steps": 512}
     curve = Curve("point_mass", "ppo", seeds=4, changes=changes)
-    other = dataclasses.replace(curve, changes={**curve.changes, "learning_rate": 1e-4})
+    other = dataclasses.replace(curve, agent="ppo+bonus")
     figure = Figure("Toy", "None.", {"a": {"x": curve, "y": other}}, favourite="x")
     monkeypatch.setitem(FIGURES, "matrix", figure)
     return figure
