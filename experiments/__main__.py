@@ -14,20 +14,17 @@ import tyro
 from experiments import (
     benchmark,
     engine,
-    point_mass_layouts,
-    point_mass_moments,
     profile,
-    roofline,
+    report,
     store,
-    two_doors,
+    summary,
     zoo,
 )
 from experiments.curves import Curve, Figure
+from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.report import Page
 from experiments.search import PaperSearch
 from experiments.store import RESULTS, ResultsFolder, Store
-from experiments.summary import Summary
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import command_line
 from gasil_jax.sweeps import shards
@@ -38,8 +35,7 @@ from gasil_jax.sweeps.runs import Run
 class Options:
     """Train the runs that a figure lacks, then write its page.
 
-    In the default folder all else that is made from stored runs is written too: the
-    other pages, the README's tables and the tuned presets.
+    `report` writes what else is made from the runs.
 
     Attributes:
       quick: train a small version below the folder `runs`: three seeds of the first
@@ -158,11 +154,8 @@ def _train(name: str, options: Options) -> None:
         for each in engine.unfinished(missing, setup):
             print(f"  {engine.title(each)}")
         return
-    if published and not options.quick:
-        # Other pages may have some of the same runs.
-        _write_all_pages()
-    else:
-        Page(name, *stores(), figure if options.quick else None).write(results)
+    text = "{{table}}" if options.quick else None
+    report.write(name, Results(figure, *stores()), results, text)
     print(f"in {results / name}.md")
 
 
@@ -222,15 +215,8 @@ class ReportOptions:
     """Write all pages, plots and presets, and the README's tables, from stored runs."""
 
 
-def _write_all_pages() -> None:
-    summary = Summary(Store(RESULTS / "runs"))
-    for page in summary.pages.values():
-        page.write(RESULTS)
-    summary.write()
-
-
 def _report(options: ReportOptions) -> None:
-    _write_all_pages()
+    summary.write_all(Store(RESULTS / "runs"))
     print(f"in {RESULTS}")
 
 
@@ -241,11 +227,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "merge": (MergeOptions, _merge),
     "benchmark": (benchmark.Options, benchmark.run),
     "profile": (profile.Options, profile.run),
-    "roofline": (roofline.Options, roofline.run),
     "zoo": (zoo.Options, zoo.run),
-    "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
-    "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
-    "two_doors": (two_doors.Options, two_doors.run),
 }
 
 

@@ -42,40 +42,36 @@ class Effect(NamedTuple):
     drawn: np.ndarray
 
 
+def verdict(middle: float, p: float) -> str:
+    """Return whether a difference with a corrected p-value is better or worse."""
+    if not p <= LEVEL:
+        return "not clear"
+    return "better" if middle > 0 else "worse"
+
+
 @dataclasses.dataclass(frozen=True)
-class Difference:
-    """A difference of two curves.
+class Comparison:
+    """A difference of curves with its interval, which is its text: f"{comparison:.2f}".
 
     Attributes:
       middle: the difference.
       p: its p-value, corrected by Holm's method.
-    """
-
-    middle: float
-    p: float
-
-    @property
-    def verdict(self) -> str:
-        """Better, worse or not clear."""
-        if not self.p <= LEVEL:
-            return "not clear"
-        return "better" if self.middle > 0 else "worse"
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison(Difference):
-    """A difference with its interval, which is its text: f"{comparison:.2f}".
-
-    Attributes:
       low: the low end of its 95% interval.
       high: the high end.
       visible: the smallest true difference that would be found with a probability of
         80%, at the level of the family's smallest p-value.
     """
 
+    middle: float
+    p: float
     low: float
     high: float
     visible: float
+
+    @property
+    def verdict(self) -> str:
+        """Better, worse or not clear."""
+        return verdict(self.middle, self.p)
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
@@ -87,13 +83,13 @@ class Comparison(Difference):
         return f"not clear (visible from {number(self.visible, spec)} on)"
 
 
-def judged(effects: Mapping[Any, Effect]) -> dict[Any, Comparison]:
-    """Return the comparisons of a family of tests."""
-    p_values = corrected({key: effect.p for key, effect in effects.items()})
+def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Comparison]:
+    """Return the comparisons of a family of tests, of which some may be dropped."""
+    p_values = corrected({key: effect.p for key, effect in effects.items()}, dropped)
     compared = {}
     for key, (middle, _, drawn) in effects.items():
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
-        visible = visible_effect(drawn, len(effects))
+        visible = visible_effect(drawn, len(effects) + dropped)
         compared[key] = Comparison(middle, p_values[key], low, high, visible)
     return compared
 
@@ -132,7 +128,9 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     return float((1 + as_far.sum()) / (1 + _DRAWS))
 
 
-def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
+def compare(
+    scores: Scores, family: Comparisons, dropped: int = 0
+) -> dict[tuple[str, ...], Comparison]:
     """Return the comparisons of a family whose curves all have scores.
 
     The p-value is the percentile bootstrap's: twice the share of draws on the other
@@ -157,7 +155,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
         effects[key] = Effect(middle, p_value, drawn)
-    return judged(effects)
+    return judged(effects, dropped)
 
 
 def bootstrap_p(drawn: np.ndarray) -> float:
@@ -179,11 +177,14 @@ def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
     return errors * float(np.std(drawn))
 
 
-def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:
-    """Return the p-values of a family, corrected by Holm's method."""
+def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
+    """Return the p-values of a family, corrected by Holm's method.
+
+    Those that are dropped, because their runs are, count as if they were the largest.
+    """
     higher, least = {}, 0.0
     for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
-        least = max(least, min(1.0, p_values[key] * (len(p_values) - i)))
+        least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
         higher[key] = least
     return {key: higher[key] for key in p_values}
 

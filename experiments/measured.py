@@ -13,7 +13,7 @@ from typing import Any
 import jax
 
 from experiments import engine
-from experiments.report import markdown_table
+from experiments.tables import markdown_table
 from gasil_jax.errors import InputError
 from gasil_jax.host import command_line, environments, output_file
 

@@ -20,9 +20,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from experiments.agents import algorithm
 from experiments.store import Store
-from gasil_jax import statistics
-from gasil_jax.algorithms import Algorithm, algorithm
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings, make_env
 from gasil_jax.sweeps.points import PAPER_RANGES
 from gasil_jax.sweeps.runs import Run
@@ -453,26 +453,6 @@ class SingleSetting(Search):
                 return None
             ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
-
-
-def importance(agent: str, store: Store) -> dict[str, float]:
-    """Return the share of the scores' variance that each hyperparameter explains alone.
-
-    It is the mean of `statistics.importance` over tasks, dense and delayed, or 0 if
-    that is negative. Only tasks count whose drawn points are all stored and all ended
-    an episode; without such a task the result is empty.
-    """
-    points, shares = draw(agent), []
-    for env, delay in CELLS:
-        scores = Search(env, agent, delay).scores(points, store)
-        if scores is not None and np.isfinite(scores).all():
-            means = scores.mean(axis=1)
-            values = {name: [point[name] for point in points] for name in points[0]}
-            explained = {n: statistics.importance(x, means) for n, x in values.items()}
-            shares.append({name: share or 0.0 for name, share in explained.items()})
-    if not shares:
-        return {}
-    return {n: max(0.0, float(np.mean([x[n] for x in shares]))) for n in points[0]}
 
 
 def mean_ranks(

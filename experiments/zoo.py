@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
-from experiments import report
+from experiments import report, tables
 from experiments.curves import name_of
 from gasil_jax import npz, numpy_policy
 from gasil_jax.errors import InputError
@@ -109,7 +109,7 @@ def table() -> str:
         agent = about["agent"] + " (decomposed)" * about["decompose_rewards"]
         rows.append([f"`zoo:{name}`", agent, steps, score])
     head = ["policy", "trained with", "steps", "return in Gymnasium"]
-    return report.markdown_table(head, rows)
+    return tables.markdown_table(head, rows)
 
 
 def run(options: Options) -> None:

@@ -6,8 +6,9 @@ import itertools
 import numpy as np
 import pytest
 
-from experiments import __main__, search
-from experiments.report import Page
+from experiments import __main__, search, tables
+from experiments.figure_results import Results
+from experiments.figures import FIGURES
 from experiments.search import (
     AGENTS,
     CELLS,
@@ -127,25 +128,9 @@ def test_which_values_suit_a_task_is_told(tmp_path):
     low, high = search.mean_ranks("gamma", "ant", 20, store=store).values()
     assert low == pytest.approx(high) == pytest.approx(0.5)
     assert search.mean_ranks("alpha", "ant", 20, store=store) == {}
-    row = next(
-        x for x in Page("matrix", store).ranks("gamma").splitlines() if "| ant" in x
-    )
+    printed = tables.ranks(Results(FIGURES["matrix"], store), "gamma")
+    row = next(x for x in printed.splitlines() if "| ant" in x)
     assert row == "| ant-delayed | 0.50 | 0.50 |"
-
-
-def test_what_matters_is_told(tmp_path):
-    store, points = Store(tmp_path), search.draw("ppo")
-    assert search.importance("ppo", store) == {}
-    for env, delay in CELLS:
-        one = Search(env, "ppo", delay)
-        fill(store, one, points, [1e4 * x["gamma"] for x in points])
-    shares = search.importance("ppo", store)
-    assert shares["gamma"] == pytest.approx(1.0)
-    assert max(shares["gae_lambda"], shares["initial_std"]) < 0.3
-    row = next(
-        x for x in Page("matrix", store).importance().splitlines() if "| ppo |" in x
-    )
-    assert "| 100% |" in row
 
 
 def test_holes_of_the_plan_are_told(tmp_path, capsys):
