@@ -7,9 +7,7 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
-
-import tyro
+from typing import Any
 
 from experiments import (
     benchmark,
@@ -24,11 +22,12 @@ from experiments.curves import Curve, Figure
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
 from experiments.search import PaperSearch
-from experiments.store import RESULTS, ResultsFolder, Store
+from experiments.store import RESULTS, Store
+from gasil_jax.cli import parsing
+from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import command_line
-from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
+from gasil_jax.host.sweep import parse_shard
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,10 +54,8 @@ class Options:
     list: bool = False
     only: tuple[str, ...] = ()
     shard: str = "1/1"
-    results: ResultsFolder = RESULTS
-    setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=engine.Setup
-    )
+    results: pathlib.Path = RESULTS
+    setup: engine.Setup = dataclasses.field(default_factory=engine.Setup)
 
 
 def _selected(figure: Figure, names: Sequence[str]) -> Figure:
@@ -113,10 +110,8 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then write its page."""
     setup, results, figure = options.setup, options.results, FIGURES[name]
-    shard = shards.parse(options.shard)
-    command_line.check_minimum(
-        setup, devices=1, evaluate_episodes=0, processes=1, members=1
-    )
+    shard = parse_shard(options.shard)
+    parsing.check_minimum(setup, devices=1, evaluate_episodes=0, processes=1, members=1)
     published = results.resolve() == RESULTS.resolve()
     if options.quick and not published:
         raise InputError(
@@ -168,8 +163,8 @@ class MergeOptions:
       results: folder of the results to add them to.
     """
 
-    folder: Annotated[pathlib.Path, tyro.conf.Positional]
-    results: ResultsFolder = RESULTS
+    folder: pathlib.Path = dataclasses.field(metadata=parsing.POSITIONAL)
+    results: pathlib.Path = RESULTS
 
 
 def _merge(options: MergeOptions) -> None:
@@ -189,7 +184,7 @@ class CoverageOptions:
       results: folder of the results that are counted.
     """
 
-    results: ResultsFolder = RESULTS
+    results: pathlib.Path = RESULTS
 
 
 def _coverage(options: CoverageOptions) -> int:
@@ -231,7 +226,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
 }
 
 
-@command_line.reports_errors
+@reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
@@ -243,10 +238,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for listed, title in titles.items():
             print(f"  {listed:20} {title}")
     elif name in FIGURES:
-        _train(name, command_line.parse(Options, rest, f"experiments {name}"))
+        _train(name, parsing.read(Options, rest, f"experiments {name}"))
     elif name in COMMANDS:
         options, function = COMMANDS[name]
-        return function(command_line.parse(options, rest, f"experiments {name}")) or 0
+        return function(parsing.read(options, rest, f"experiments {name}")) or 0
     else:
         raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
     return 0

@@ -38,8 +38,9 @@ from experiments.comparisons import interval
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
+from gasil_jax.cli import parsing
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, metrics_files
+from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
 
@@ -291,7 +292,7 @@ def training_row(
     algorithm = algorithm.replace(
         num_envs=num_envs, total_steps=50 * options.iterations * batch_steps
     )
-    with command_line.input_checked():
+    with parsing.input_checked():
         batch = make_members(
             env, algorithm, range(seeds), devices=jax.devices()[:devices]
         )
@@ -487,7 +488,7 @@ def run(options: Options) -> None:
             )
     if (fewest := min(options.num_envs, default=0)) < 1:
         raise InputError(f"num_envs is {fewest}: it must be 1 or more")
-    command_line.check_minimum(
+    parsing.check_minimum(
         options, repeats=1, seeds=1, iterations=1, devices=1, training_envs=1
     )
     if "peers" in options.tables:
@@ -496,7 +497,7 @@ def run(options: Options) -> None:
         measured.find("benchmark", options)
     start_jax(options.devices or available_cores())
     print(measured.machine())
-    versions = metrics_files.versions()
+    versions = driver.versions()
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     every: list[Row] = []
     for table in options.tables:

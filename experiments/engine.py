@@ -26,11 +26,12 @@ import numpy as np
 
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Store
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host import interruption, metrics_files, run_folder, run_options
-from gasil_jax.sweeps import assembly, programs
-from gasil_jax.sweeps.programs import Program
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host import driver, folders, interruption, json_files, programs, training
+from gasil_jax.host.programs import Program
+from gasil_jax.host.runs import Run
+from gasil_jax.host.sweep import Recording, Sweep
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -131,7 +132,7 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     rank, scratch = {run: rank for rank, run in enumerate(missing)}, _scratch(setup)
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
-    begun, others = programs.unfinished(ordered, programs.read(scratch))
+    begun, others = programs.unfinished(ordered, programs.read(scratch, ordered))
     # Runs of a search are not evaluated.
     groups = programs.group(others, setup.members, lambda x: x.seed in FINALIST_SEEDS)
     new = [
@@ -170,22 +171,28 @@ def train(
     of_search = run.seed in FINALIST_SEEDS
     episodes = None if of_search else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
-    options = run_options.Options(
-        env=run.env,
-        out=stored.path,
+    recording = Recording(
         keep_checkpoints=1,
         evaluate_every=episodes and math.ceil(total_steps / EVALUATIONS),
-        evaluate_episodes=episodes,
-        devices=setup.devices,
-        settings=dataclasses.replace(run.settings, physics=setup.physics),
-        **run_options.algorithm_options(run.algorithm),
+        evaluate_episodes=episodes or Recording.evaluate_episodes,
     )
-    env = assembly.prepare(options, [stored])
+    settings = dataclasses.replace(run.settings, physics=setup.physics)
+    sweep = Sweep(
+        run.env, run.algorithm, (run.seed,), settings=settings, recording=recording
+    )
+    with input_checked():
+        env = training.prepare(sweep, [stored], stored.path, num_devices=setup.devices)
     _add_session(stored, setup)
-    with interruption.noted(_HOW_TO_CONTINUE):
-        assembly.train(
-            options, env, [stored], title=title(stored), on_restored=on_restored
+    with (
+        interruption.noted(_HOW_TO_CONTINUE),
+        interruption.Interruption() as received,
+    ):
+        on_restored()
+        (outcome,) = training.train_programs(
+            env, [stored], recording, title=title(stored), interruption=received
         )
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
     return records(stored)
 
 
@@ -197,18 +204,18 @@ def records(stored: Program) -> dict[Run, Record]:
 
 def _add_session(stored: Program, setup: Setup) -> None:
     """Add to a program's provenance.json how it is trained in this process."""
-    path = run_folder.create(stored.path) / _SESSIONS
+    path = folders.create(stored.path) / _SESSIONS
     devices = jax.devices()[: len(stored.runs)]
     now = {
         # Stored runs from before 2026-11-29 say "mjx" where this says "jax".
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
-        "versions": metrics_files.versions(),
+        "versions": driver.versions(),
         **source(setup.commit),
     }
     sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
     if now not in sessions:
-        metrics_files.write_json(path, {"sessions": [*sessions, now]})
+        json_files.write(path, {"sessions": [*sessions, now]})
 
 
 def _provenance(stored: Program) -> dict[str, Any]:
@@ -261,7 +268,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
         is not set.
     """
     asked = set(missing)
-    begun = programs.read(_scratch(setup))
+    begun = programs.read(_scratch(setup), missing)
     used = [x for x in begun if not asked.isdisjoint(x.runs)]
     if used and not setup.resume:
         raise InputError(
@@ -271,7 +278,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
         )
     for each in used:
         # It was stopped before its runs were stored.
-        if each.training:
+        if each.is_finished:
             store.add(records(each))
     return unfinished(missing, setup)
 

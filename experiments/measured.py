@@ -14,8 +14,9 @@ import jax
 
 from experiments import engine
 from experiments.tables import markdown_table
+from gasil_jax.cli import parsing
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, environments, output_file
+from gasil_jax.host import environments, output_file
 
 PAGE = pathlib.Path(__file__).parent.parent / "docs/performance.md"
 _TABLE = re.compile(
@@ -40,7 +41,7 @@ def find(name: str, options: Any) -> re.Match[str]:
     for part in _TABLE.finditer(PAGE.read_text()):
         if part[1] == name:
             arguments = [*shlex.split(part[2]), "--page"]
-            if command_line.parse(type(options), arguments, name) == options:
+            if parsing.read(type(options), arguments, name) == options:
                 return part
     raise InputError(f"page is set, but {PAGE} has no command with these options")
 

@@ -16,18 +16,19 @@ import re
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
 import gasil_envs
 from experiments import measured
 from gasil_envs.registry import Settings
 from gasil_jax import presets
-from gasil_jax.host import command_line, devices, metrics_files
+from gasil_jax.cli import parsing
+from gasil_jax.host import devices
 from gasil_jax.host.members import make_members
+from gasil_jax.host.tables import TableWriter
 
 #: Named scopes by part. An operation belongs to the first part whose scope it is in.
 PARTS: Mapping[str, str] = {
@@ -76,9 +77,7 @@ class Options:
     iterations: int = 10
     repeats: int = 5
     page: bool = False
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=Settings
-    )
+    settings: Settings = dataclasses.field(default_factory=Settings)
 
 
 def operations(program: str) -> dict[str, str]:
@@ -150,13 +149,13 @@ def trace(call: Any, program: str) -> dict[str, float]:
 
 def run(options: Options) -> None:
     """Print the table."""
-    command_line.check_minimum(options, seeds=1, iterations=1, repeats=1)
+    parsing.check_minimum(options, seeds=1, iterations=1, repeats=1)
     if options.page:
         measured.find("profile", options)
     devices.use_devices(options.settings, 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
-    with command_line.input_checked():
+    with parsing.input_checked():
         delay = options.settings.reward_delay
         algorithm = presets.preset(
             options.env, options.agent, options.preset, reward_delay=delay
@@ -184,7 +183,7 @@ def run(options: Options) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "metrics.csv"
         labels = {"seed": range(options.seeds)}
-        writer = metrics_files.MetricsWriter(path, labels, None)
+        writer = TableWriter(path, labels)
         began = time.perf_counter()
         writer.write({name: np.asarray(x)[:, :1] for name, x in metrics.items()})
         totals["host: metrics.csv"] = time.perf_counter() - began

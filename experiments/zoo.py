@@ -8,17 +8,17 @@ table in docs/zoo.md is written from the policies.
 import dataclasses
 import json
 import pathlib
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
 from experiments import report, tables
 from experiments.curves import name_of
 from gasil_jax import npz, numpy_policy
+from gasil_jax.cli import parsing
 from gasil_jax.errors import InputError
-from gasil_jax.evaluate import evaluate_in_gymnasium
-from gasil_jax.host import command_line, environments, output_file, run_folder
+from gasil_jax.evaluation import evaluate_in_gymnasium
+from gasil_jax.host import environments, output_file, sweep
 
 TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
 
@@ -32,7 +32,7 @@ class Options:
       episodes: number of episodes of each score.
     """
 
-    runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
+    runs: tuple[pathlib.Path, ...] = dataclasses.field(metadata=parsing.POSITIONAL)
     episodes: int = 100
 
 
@@ -51,10 +51,10 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
       InputError: if it is not the folder of a finished run on a locomotion task, or
         none of its seeds has a return.
     """
-    description = run_folder.read(folder)
-    algorithm, delay = description["algorithm"], description["settings"].reward_delay
-    with command_line.input_checked():
-        env = environments.make_env(description["env"])
+    trained = sweep.read(folder)
+    algorithm, delay = trained.algorithm, trained.settings.reward_delay
+    with parsing.input_checked():
+        env = environments.make_env(trained.env)
         saved = npz.read(folder / "policy.npz")
     if not environments.is_locomotion(env):
         raise InputError(f"run is {folder}: it must be of a locomotion task")
@@ -70,7 +70,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         num_episodes=episodes,
     )["episode_return"]
     about = {
-        "env": description["env"],
+        "env": trained.env,
         "reward_delay": delay,
         "agent": algorithm.agent.name,
         "decompose_rewards": algorithm.settings["decompose_rewards"],
@@ -80,7 +80,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         "deviation": round(float(returns.std()), 1),
         "episodes": episodes,
     }
-    path = zoo / f"{name_of(description['env'], delay)}.npz"
+    path = zoo / f"{name_of(trained.env, delay)}.npz"
     words = f"{path.stem}: {about['mean']} in Gymnasium"
     if path.exists():
         before = json.loads(str(npz.read(path)["about"]))["mean"]
@@ -114,7 +114,7 @@ def table() -> str:
 
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
-    command_line.check_minimum(options, episodes=1)
+    parsing.check_minimum(options, episodes=1)
     if not options.runs:
         raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:

@@ -72,8 +72,8 @@ class Parser(argparse.ArgumentParser):
         """Add an option for each field of a dataclass, as a group of the help.
 
         Args:
-          kind: the dataclass. A field with the metadata "positional" is no option but
-            an argument, and one with "option" False is left out.
+          kind: the dataclass. A field with the metadata `POSITIONAL` is no option but
+            an argument. One that is a dataclass is a group of its own, see `read`.
           title: title of the group.
           default: an instance with the values of options that are not given; by default
             those of the dataclass.
@@ -83,9 +83,9 @@ class Parser(argparse.ArgumentParser):
         texts, hints = _texts(kind), get_type_hints(kind)
         own = self._of[title] = []
         for field in dataclasses.fields(kind):
-            if not field.metadata.get("option", True):
+            if _is_group(hints[field.name]):
                 continue
-            value = field.default if default is None else getattr(default, field.name)
+            value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
             own.append(field.name)
@@ -167,7 +167,24 @@ def read(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     positional = [x.name.upper() for x in fields if x.metadata.get("positional")]
     parser = Parser(program, f"{' '.join(positional)} [options]", kind)
     parser.add_fields(kind, "options")
-    return kind(**parser.fields(parser.read(arguments), "options"))
+    hints = get_type_hints(kind)
+    groups = {x.name: hints[x.name] for x in fields if _is_group(hints[x.name])}
+    for name, group in groups.items():
+        parser.add_fields(group, name)
+    values = parser.read(arguments)
+    own = {name: group(**parser.fields(values, name)) for name, group in groups.items()}
+    return kind(**parser.fields(values, "options"), **own)
+
+
+def _is_group(hint: Any) -> bool:
+    """Return whether the fields of a field's type are options."""
+    return dataclasses.is_dataclass(hint)
+
+
+def _default(field: Any) -> Any:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
 
 
 def _similar(name: str, names: Sequence[str]) -> str | None:
