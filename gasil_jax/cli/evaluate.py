@@ -4,54 +4,37 @@ import csv
 import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import jax
 import numpy as np
 
 from gasil_jax import numpy_policy, policy, statistics
-from gasil_jax.cli.parsing import (
-    POSITIONAL,
-    check_key,
-    check_minimum,
-    input_checked,
-    read,
-)
+from gasil_jax.cli.parsing import check_minimum, read
+from gasil_jax.cli.policies import PolicyOptions
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate_in_gymnasium, run_episodes
 from gasil_jax.host import environments, output_file, resources
 from gasil_jax.host.progress import announced
-from gasil_jax.host.saved import Policies, load_policies
+from gasil_jax.host.saved import Policies
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(PolicyOptions):
     """Evaluate the policies of a run, or of a point of a sweep.
 
     Attributes:
-      run: folder of the run or sweep, or zoo:NAME, one of the package's policies.
-      point: number of a sweep's point in results.csv; default the one with the
-        highest mean final return, of those whose seeds all stayed finite.
-      checkpoint: checkpoint of the policies: last, or best, which has the best
-        evaluation or, without evaluations, the best mean return in training.
       seed: evaluate only this seed; default all seeds.
       episodes: number of episodes for each seed.
-      stochastic: draw actions from the policy instead of taking its mean.
       gymnasium: evaluate in Gymnasium, with C MuJoCo, without delay and noise. Only for
         locomotion, and not with stochastic.
-      key: random key of the episodes' starts and actions.
       out: new CSV file, to which the return and length of each episode are written.
     """
 
-    run: pathlib.Path = dataclasses.field(metadata=POSITIONAL)
-    point: int | None = None
-    checkpoint: Literal["last", "best"] = "last"
     seed: int | None = None
     episodes: int = 20
-    stochastic: bool = False
     gymnasium: bool = False
-    key: int = 0
     out: pathlib.Path | None = None
 
 
@@ -94,13 +77,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     options = read(Options, arguments, "gasil_jax.evaluate")
     check_minimum(options, episodes=1)
-    check_key(options.key)
     if options.out is not None:
         output_file.check(options.out, (".csv",))
-    with input_checked():
-        policies = load_policies(
-            options.run, options.checkpoint, options.point, seed=options.seed
-        )
+    policies = options.load(options.seed)
     env, seeds = policies.env, policies.seeds
     if options.gymnasium and not (
         environments.is_locomotion(env) and env.unwrapped.task.gymnasium_id
@@ -116,10 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.gymnasium and options.stochastic:
         raise InputError("gymnasium is on: stochastic must be off")
     if not options.gymnasium:
-        with input_checked():
-            resources.check_episodes(
-                env, options.episodes, len(seeds), jax.devices()[:1]
-            )
+        resources.check_episodes(env, options.episodes, len(seeds), jax.devices()[:1])
     if options.out is not None:
         output_file.make_parent(options.out)
     jax.config.update("jax_default_matmul_precision", "highest")

@@ -317,9 +317,3 @@ def check_minimum(options: Any, **minimum: int) -> None:
         value = getattr(options, name)
         if value is not None and not low <= value < 2**63:
             raise InputError(f"{name} is {value}: it must be from {low} to {2**63 - 1}")
-
-
-def check_key(key: int) -> None:
-    """Raise `InputError` unless both JAX and Gymnasium accept the number as a seed."""
-    if not 0 <= key < 2**32:
-        raise InputError(f"key is {key}: it must be from 0 to {2**32 - 1}")

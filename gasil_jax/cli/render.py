@@ -12,7 +12,7 @@ import sys
 from collections.abc import Sequence
 from ctypes.util import find_library
 from importlib.util import find_spec
-from typing import Any, Literal
+from typing import Any
 
 # MuJoCo reads this variable on import. Without a display, EGL can draw on a CPU too.
 if sys.platform == "linux" and not os.environ.get("DISPLAY"):
@@ -23,18 +23,12 @@ import numpy as np
 
 from gasil_envs import pictures, wrappers
 from gasil_jax import policy
-from gasil_jax.cli.parsing import (
-    POSITIONAL,
-    check_key,
-    check_minimum,
-    input_checked,
-    read,
-)
+from gasil_jax.cli.parsing import check_minimum, input_checked, read
+from gasil_jax.cli.policies import PolicyOptions
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
 from gasil_jax.host import environments, output_file
 from gasil_jax.host.progress import announced
-from gasil_jax.host.saved import best_seed, load_policies
 
 _PICTURES = (".mp4", ".gif", ".png")
 # Limit of a frame's width and height in pixels, because all frames are in memory at
@@ -43,36 +37,23 @@ _LARGEST_SIZE = 4096
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class Options(PolicyOptions):
     """Draw an episode of a run's policy.
 
     Attributes:
-      run: folder of the run or sweep, which need not be finished, or zoo:NAME, one of
-        the package's policies.
       out: file to write: .mp4 (needs the package imageio-ffmpeg), .gif or .png (a strip
         of eight pictures in two rows).
       seed: seed of the policy; default the one with the highest final return.
-      point: number of a sweep's point in results.csv; default the one with the
-        highest mean final return, of those whose seeds all stayed finite.
-      checkpoint: checkpoint of the policy: last, or best, which has the best
-        evaluation or, without evaluations, the best mean return in training.
       steps: largest number of steps.
       width: width of a frame in pixels.
       height: height of a frame in pixels.
-      stochastic: draw actions from the policy instead of taking its mean.
-      key: random key of the episode's start and actions.
     """
 
-    run: pathlib.Path = dataclasses.field(metadata=POSITIONAL)
     out: pathlib.Path = pathlib.Path("episode.mp4")
     seed: int | None = None
-    point: int | None = None
-    checkpoint: Literal["last", "best"] = "last"
     steps: int = 1000
     width: int = 480
     height: int = 360
-    stochastic: bool = False
-    key: int = 0
 
 
 def episode(
@@ -231,14 +212,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 f"{name} is {getattr(options, name)}: it must be from 1 to "
                 f"{_LARGEST_SIZE}"
             )
-    check_key(options.key)
     # The encoder of films needs even numbers of pixels.
     size = (options.width + options.width % 2, options.height + options.height % 2)
-    with input_checked():
-        seed = best_seed(options.run, options.point, options.seed)
-        env, num_steps, seeds, weights = load_policies(
-            options.run, options.checkpoint, options.point, seed=seed
-        )
+    env, num_steps, seeds, weights = options.load(options.seed, only_best=True)
     if not environments.can_be_drawn(env):
         raise InputError(
             "run is of an environment that can't be drawn: it must have a function "

@@ -55,13 +55,13 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     return described["env"], agent, programs.labelled(folder / "programs", chosen)
 
 
-def best_seed(folder: pathlib.Path, point: int | None, seed: int | None) -> int | None:
-    """Return the seed, by default that with the highest final return of a point.
+def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
+    """Return the seed with the highest final return of a point; None if unknown.
 
-    It is None for a policy of the zoo, which has one seed.
+    A policy of the zoo has one seed, which needs no name.
     """
-    if seed is not None or str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        return seed
+    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
+        return None
     scores = {}
     for each in find(folder, point)[2]:
         table = each.table("metrics.csv", ("episode_return",))
