@@ -200,10 +200,7 @@ def read(
 
 
 def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
-    """Return the options that decide which others there are, and their defaults.
-
-    The parser of all options reports what is wrong with their values.
-    """
+    """Return the options that decide which others there are, and their defaults."""
 
     def delay(text: str) -> int:
         try:
@@ -375,14 +372,7 @@ def _note_without_effect(
     default: Algorithm,
     off: Mapping[str, Mapping[str, Any]],
 ) -> None:
-    """Print a note for each option that was changed but has no effect.
-
-    Args:
-      options: the options.
-      requested: what they train.
-      default: the algorithm with options that are not given.
-      off: the settings of each model of rewards that is off, by its switch.
-    """
+    """Print a note for each option that was changed but has no effect."""
     algorithm, settings = requested.algorithm, requested.settings
     for name in environments.without_effect(options.env, settings):
         value = getattr(settings, name)

@@ -94,11 +94,6 @@ def _read_tables(
     programs: Sequence[Program], name: str, column: str
 ) -> dict[str, np.ndarray]:
     """Return the columns of tables for all members, up to the last row that all have.
-
-    The result is empty if a table is missing or has no rows yet.
-
-    Raises:
-      InputError: if a table is damaged.
     """
     every = [own for each in programs for own in each.table(name, (column,))]
     if not all(every):

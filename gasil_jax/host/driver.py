@@ -203,15 +203,7 @@ class _Checkpoints:
 def _restored(
     members: Members, root: pathlib.Path, progress: Progress
 ) -> tuple[_Training, checkpoint.Record | None]:
-    """Return the training after the newest undamaged checkpoint, and its record.
-
-    Without one, training is at its beginning and the record is None. Newer, damaged
-    checkpoints are renamed with a warning, and partial ones are deleted.
-
-    Raises:
-      InputError: if the checkpoint has another state, or if there is none although the
-        folder holds training that has ended.
-    """
+    """Return the training after the newest undamaged checkpoint, and its record."""
     with progress.aside("reading the checkpoints"):
         newest, errors = checkpoint.latest(root)
     if newest is None and (root.parent / "training.json").exists():

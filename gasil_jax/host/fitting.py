@@ -201,11 +201,7 @@ def _states(
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:
-    """Return the numbers of the seeds, which may also be an array of integers.
-
-    Raises:
-      ValueError: if they are none, not different or out of range.
-    """
+    """Return the numbers of the seeds, which may also be an array of integers."""
     # A random key's dtype has no kind, and NumPy's durations are integers.
     if getattr(getattr(seeds, "dtype", None), "kind", "") in ("i", "u"):
         seeds = np.asarray(seeds).tolist()
@@ -251,11 +247,7 @@ def _describe(
 
 
 def _begin(folder: pathlib.Path, requested: Sweep, *, resume: bool) -> Sweep:
-    """Write config.json, and return the sweep with the points that it had before.
-
-    Raises:
-      ValueError: if the folder holds other files, or training that is not the same.
-    """
+    """Write config.json, and return the sweep with the points that it had before."""
     with folders.lock(folder, option="folder", seconds=60.0):
         if not folders.has_config(folder):
             folders.refuse_used(folder, option="folder")

@@ -70,11 +70,7 @@ def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]
 
 
 def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
-    """Return the values by name from entries NAME=VALUE,VALUE,...
-
-    Raises:
-      InputError: if a name can't vary or is given twice, or if a value is not a number.
-    """
+    """Return the values by name from entries NAME=VALUE,VALUE,..."""
     values: dict[str, tuple[Any, ...]] = {}
     kinds = _kinds(algorithm)
     for entry in grid:
@@ -96,11 +92,7 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
 
 
 def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
-    """Return the points that a JSON file lists.
-
-    Raises:
-      InputError: if the file can't be read or is not a list of points.
-    """
+    """Return the points that a JSON file lists."""
     source = f"points_file is {path}"
     try:
         every = json.loads(path.read_text())

@@ -23,11 +23,7 @@ class _Unfinished(Exception):
 
 
 def _run_module(program: str, arguments: Sequence[str]) -> int:
-    """Run a command line in this process and return its exit status.
-
-    Raises:
-      _Unfinished: if it was interrupted or its folder could not be written.
-    """
+    """Run a command line in this process and return its exit status."""
     status = importlib.import_module(program).main(arguments)
     if status not in (0, _BAD_INPUT):
         raise _Unfinished(f"status {status}")

@@ -103,11 +103,7 @@ def _equal(first: Columns, second: Columns) -> bool:
 
 
 def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
-    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row.
-
-    Raises:
-      InputError: if runs have other columns than the first one.
-    """
+    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row."""
     (first, *_), columns = sweep.runs, every[0]
     for (point, seed), own in zip(sweep.runs, every, strict=True):
         if differing := ", ".join(sorted(columns.keys() ^ own.keys())):
@@ -183,10 +179,7 @@ def write_policies(
 
 
 def _write_results(path: pathlib.Path, results: Results) -> None:
-    """Write results.csv, a row for each point and seed.
-
-    A cell is empty where a final value is NaN.
-    """
+    """Write results.csv, a row for each point and seed."""
     with output_file.atomic(path) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file)
         names = list(results.sweep.points[0])
@@ -238,9 +231,6 @@ def summary(results: Results) -> dict[str, Any]:
 
 def _speed(trainings: Sequence[Training]) -> dict[str, Any]:
     """Return the seconds, steps/s and devices of programs trained one after the other.
-
-    For shards, which run in parallel, "env_steps_per_second" is the average speed of
-    one shard; None if no step was taken.
     """
     evaluations = [x["evaluation_seconds"] for x in trainings]
     seconds = sum(x["train_seconds"] for x in trainings)

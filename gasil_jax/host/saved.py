@@ -77,13 +77,7 @@ def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
 def _choose_point(
     folder: pathlib.Path, points: Sequence[Mapping[str, Any]], point: int | None
 ) -> int:
-    """Return the number of the requested point; by default the best by mean.
-
-    Of several points a note says which one was taken.
-
-    Raises:
-      InputError: if the folder has no such point, or no best one yet.
-    """
+    """Return the number of the requested point; by default the best by mean."""
     last = len(points) - 1
     if point is None and last > 0:
         if (point := results.best_point(folder)) is None:
@@ -100,11 +94,7 @@ def _choose_point(
 
 
 def _programs(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
-    """Return the programs that hold a point's runs, with no other runs.
-
-    Raises:
-      InputError: if there are none yet.
-    """
+    """Return the programs that hold a point's runs, with no other runs."""
     runs = {stored.runs[point, seed] for seed in stored.seeds}
     of_point = []
     for each in stored.stored(folder):

@@ -117,10 +117,7 @@ def _lacks_key() -> bool:
 
 
 def _identifier(path: pathlib.Path) -> str:
-    """Return the random identifier in a file, which is created if it is missing.
-
-    It distinguishes runs whose folders have the same name.
-    """
+    """Return the random identifier in a file, which is created if it is missing."""
     with contextlib.suppress(FileExistsError), path.open("x") as file:
         file.write(uuid.uuid4().hex)
     return path.read_text()
