@@ -136,9 +136,6 @@ def read(
 
     With --resume, options that are not given are those of the sweep in the folder,
     whose points come first; otherwise they are the preset's.
-
-    Raises:
-      InputError: if an option or a value is not allowed. Nothing is built before.
     """
     first, stored = _first_options(arguments), None
     if first.resume:
@@ -397,11 +394,7 @@ def _note_without_effect(
 
 
 def make_folder(options: Options) -> pathlib.Path:
-    """Create the folder if it is missing, and return it.
-
-    Raises:
-      InputError: if it can't be written.
-    """
+    """Create the folder if it is missing, and return it."""
     if options.out is not None:
         return folders.create(options.out)
     stamp = time.strftime("%Y%m%d-%H%M%S")
@@ -410,11 +403,7 @@ def make_folder(options: Options) -> pathlib.Path:
 
 
 def check_agent(env: Any, algorithm: Algorithm) -> None:
-    """Check that the agent can run in the environment; trace an agent of the user's.
-
-    Raises:
-      InputError: if it can't.
-    """
+    """Check that the agent can run in the environment; trace an agent of the user's."""
 
     def begin() -> Any:
         state = train.init(env, algorithm, jax.random.key(0))

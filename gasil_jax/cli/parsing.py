@@ -69,16 +69,7 @@ class Parser(argparse.ArgumentParser):
     def add_fields(
         self, kind: Any, title: str, default: Any = None, *, all_shown: bool = False
     ) -> None:
-        """Add an option for each field of a dataclass, as a group of the help.
-
-        Args:
-          kind: the dataclass. A field with the metadata `POSITIONAL` is no option but
-            an argument. One that is a dataclass is a group of its own, see `read`.
-          title: title of the group.
-          default: an instance with the values of options that are not given; by default
-            those of the dataclass.
-          all_shown: whether `--help` shows all of them.
-        """
+        """Add an option for each field of a dataclass, as a group of the help."""
         group = self.add_argument_group(title)
         texts, hints = _texts(kind), get_type_hints(kind)
         own = self._of[title] = []
@@ -90,7 +81,8 @@ class Parser(argparse.ArgumentParser):
             shown = all_shown or self._shown is None or field.name in self._shown
             own.append(field.name)
             if field.metadata.get("positional"):
-                group.add_argument(field.name, help=text, **_of_type(hints[field.name]))
+                of_type = _of_type(hints[field.name]) | {"metavar": field.name.upper()}
+                group.add_argument(field.name, help=text, **of_type)
                 continue
             self._names.append(field.name)
             required = value is dataclasses.MISSING
@@ -111,16 +103,7 @@ class Parser(argparse.ArgumentParser):
         arguments: Sequence[str] | None,
         why_not: Callable[[str], str | None] = lambda name: None,
     ) -> argparse.Namespace:
-        """Return the values of a command line.
-
-        Args:
-          arguments: the command line; default that of this process.
-          why_not: returns why there is no option of a name, if that is known.
-
-        Raises:
-          HelpShown: with --help, --help-all or --version, once that is printed.
-          InputError: if an option or a value is not allowed; the message is one line.
-        """
+        """Return the values of a command line."""
         given = words(arguments)
         if "--version" in given:
             print(importlib.import_module("gasil_jax").__version__)
@@ -304,15 +287,7 @@ def input_checked() -> Iterator[None]:
 
 
 def check_minimum(options: Any, **minimum: int) -> None:
-    """Check that fields are from their lowest allowed values to 2**63 - 1, or None.
-
-    Args:
-      options: a dataclass.
-      **minimum: the lowest allowed value of each field to check, by name.
-
-    Raises:
-      InputError: if a number is out of range.
-    """
+    """Check that fields are from their lowest allowed values to 2**63 - 1, or None."""
     for name, low in minimum.items():
         value = getattr(options, name)
         if value is not None and not low <= value < 2**63:

@@ -62,16 +62,7 @@ class Curves(NamedTuple):
 def read(
     folder: pathlib.Path, label: str | None = None, point: int | None = None
 ) -> Curves:
-    """Return the curves of a run, or of a sweep's point, which need not be finished.
-
-    Args:
-      folder: folder of the run or sweep.
-      label: label in the legend; default the environment and the agent.
-      point: number of a sweep's point; default the best by mean.
-
-    Raises:
-      InputError: if it is not the folder of a run, or if no episode has ended in it.
-    """
+    """Return the curves of a run, or of a sweep's point, which need not be finished."""
     env, agent, programs = saved.find(folder, point)
     metrics = _read_tables(programs, "metrics.csv", "episode_return")
     if not metrics:
@@ -93,8 +84,7 @@ def read(
 def _read_tables(
     programs: Sequence[Program], name: str, column: str
 ) -> dict[str, np.ndarray]:
-    """Return the columns of tables for all members, up to the last row that all have.
-    """
+    """Return columns of tables for all members, up to the last row that all have."""
     every = [own for each in programs for own in each.table(name, (column,))]
     if not all(every):
         return {}

@@ -62,12 +62,6 @@ def episode(
     """Return the physics states of an episode, from its start on, and its true return.
 
     A step in which the physics fails ends the episode; the step is left out of both.
-
-    Args:
-      env: one environment.
-      act: (observation, key) -> action.
-      key: random key; consumed.
-      num_steps: largest number of steps.
     """
     reset_key, key = jax.random.split(key)
     state = jax.jit(env.reset)(reset_key)
@@ -92,16 +86,7 @@ _FRAMES_PER_SECOND = 25.0
 def frames_of(
     env: Any, states: Sequence[Any], size: tuple[int, int]
 ) -> tuple[list[np.ndarray], float]:
-    """Return pictures (height, width, 3) uint8 of physics states, and frames/s.
-
-    Args:
-      env: the environment.
-      states: its physics states from an episode's start on.
-      size: width and height of a picture in pixels.
-
-    Raises:
-      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
-    """
+    """Return pictures (height, width, 3) uint8 of physics states, and frames/s."""
     with contextlib.closing(pictures.painter(env, size)) as painter:
         every = max(1, round(1.0 / (_FRAMES_PER_SECOND * painter.seconds_per_step)))
         counts = range(1, len(states) + 1, every)
@@ -112,12 +97,7 @@ def frames_of(
 def save(
     env: Any, states: Sequence[Any], size: tuple[int, int], path: pathlib.Path
 ) -> int:
-    """Draw physics states in the format of the path's suffix; return the frame count.
-
-    Raises:
-      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
-      OSError: if the file can't be written.
-    """
+    """Draw states in the format of the path's suffix; return the frame count."""
     if path.suffix == ".png":
         return write_strip(env, states, size, path=path)
     frames, fps = frames_of(env, states, size)
@@ -126,11 +106,7 @@ def save(
 
 
 def write_film(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> None:
-    """Write frames as a film, .mp4 or .gif.
-
-    Raises:
-      OSError: if the file can't be written.
-    """
+    """Write frames as a film, .mp4 or .gif."""
     from PIL import Image
 
     if path.suffix == ".mp4":
@@ -163,13 +139,6 @@ def write_strip(
 
     The times are large enough to read when the strip, four pictures wide, fills a
     column of a paper.
-
-    Returns:
-      The number of pictures.
-
-    Raises:
-      NoOpenGL: if locomotion is to be drawn and MuJoCo finds no OpenGL.
-      OSError: if the file can't be written.
     """
     from matplotlib import font_manager
     from PIL import Image, ImageDraw, ImageFont

@@ -29,21 +29,9 @@ def train(
 ) -> tuple[pathlib.Path, Results | None, Any]:
     """Train the runs of a shard that are missing in the folder of the options.
 
-    Args:
-      options: the options.
-      requested: all points and seeds of the folder.
-      program: name of the module that was started, and options if it needs any to
-        continue.
-      shard: the number of the part to train, from 1 on, and the number of parts.
-
     Returns:
       The folder; the results, written to it, None while runs of other shards are
       missing; and the environment.
-
-    Raises:
-      InputError: if something does not fit, see `training`.
-      Interrupted: if a signal was received; a checkpoint was written first.
-      WriteError: if the folder can no longer be written.
     """
     runs = requested.part(*shard)
     place = options.out or NOWHERE

@@ -61,9 +61,6 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     Orbax takes a path with brackets or stars for a pattern, so no character of the
     other path means anything. What fails in Orbax's threads is raised once, and not
     logged.
-
-    Raises:
-      OSError: if the operating system has refused something.
     """
     logger, before = logging.getLogger("absl"), sys.unraisablehook
     level = logger.level
@@ -116,9 +113,6 @@ def save(folder: pathlib.Path, state: Any) -> None:
     """Write `state`, a pytree of arrays, to a new folder, and read it again.
 
     Arrays of no size, which Orbax refuses, are left out; `restore` makes them anew.
-
-    Raises:
-      OSError: if it can't be written, or if other numbers are read than were written.
     """
     arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
     arrays = {name: x for name, x in arrays.items() if x.size}
@@ -147,14 +141,6 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     """Read a state that `save` wrote, as NumPy arrays and random keys.
 
     They are not put on a device, which may be too small for all members together.
-
-    Args:
-      folder: the folder that `save` wrote to.
-      like: a state of the same structure, shapes and dtypes; its leaves may be
-        `jax.ShapeDtypeStruct`.
-
-    Raises:
-      ValueError: if the saved state has another structure, shape or dtype.
     """
     expected = jax.eval_shape(_as_arrays, like)
     arrays = _read_arrays(folder)
@@ -232,18 +218,7 @@ class WriteError(output_file.WriteError):
 
 
 def write(root: pathlib.Path, iteration: int, state: Any, record: Record) -> None:
-    """Write a checkpoint into the folder `root`, unless an undamaged one is there.
-
-    Args:
-      root: folder of the checkpoints, created if it is missing.
-      iteration: number of iterations so far.
-      state: a pytree of arrays.
-      record: facts about it.
-
-    Raises:
-      WriteError: if it can't be written, for example because the disk is full, or if
-        it can't be read after it was written.
-    """
+    """Write a checkpoint into the folder `root`, unless an undamaged one is there."""
     folder = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
     try:
@@ -268,11 +243,7 @@ def write(root: pathlib.Path, iteration: int, state: Any, record: Record) -> Non
 
 
 def check_writable(root: pathlib.Path) -> None:
-    """Write a tiny checkpoint below the folder `root`, and delete it.
-
-    Raises:
-      WriteError: if it can't be written and read.
-    """
+    """Write a tiny checkpoint below the folder `root`, and delete it."""
     # `delete_partial` deletes it if the process is killed.
     tiny = root / f"check{_PARTIAL}"
     try:
@@ -312,12 +283,7 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
 
 
 def read(folder: pathlib.Path) -> Checkpoint:
-    """Return the checkpoint in `folder` after checking its manifest and its hashes.
-
-    Raises:
-      ValueError: if it is damaged.
-      OSError: if it can't be read now.
-    """
+    """Return the checkpoint in `folder` after checking its manifest and its hashes."""
     try:
         manifest = json_files.read(folder / _MANIFEST, _Manifest)
         hashes = _hashes(folder)
@@ -344,11 +310,7 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 
 def best(root: pathlib.Path) -> Checkpoint | None:
-    """Return the checkpoint with the highest score, None if none has one.
-
-    Raises:
-      ValueError: if it is damaged.
-    """
+    """Return the checkpoint with the highest score, None if none has one."""
     scores = _scores(_folders(root))
     return read(max(scores, key=scores.__getitem__)) if scores else None
 

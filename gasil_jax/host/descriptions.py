@@ -16,14 +16,7 @@ from gasil_jax.rewards import REWARD_MODELS
 
 
 def find_agent(name: Any) -> type[Agent]:
-    """Return the class of an agent's name.
-
-    Args:
-      name: a key of `AGENTS`, or MODULE:CLASS of an agent of your own.
-
-    Raises:
-      ValueError: if the name is unknown, or if it names no agent.
-    """
+    """Return the class of an agent's name."""
     if not isinstance(name, str):
         raise refusal("agent", name, "a string")
     if ":" not in name:
@@ -61,9 +54,6 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     """Return the algorithm that `describe` describes, also after a way through JSON.
 
     Settings that are missing have their defaults.
-
-    Raises:
-      ValueError: if a name is unknown, or a value of another type.
     """
     if "agent" not in values:
         raise InputError("agent is missing")

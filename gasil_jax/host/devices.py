@@ -17,13 +17,7 @@ from gasil_jax.host.output_file import note
 
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
-    """Make JAX use the host's cores as devices; call it before JAX starts.
-
-    Args:
-      settings: settings of the environment.
-      requested: number of devices; None for one per core.
-      num_members: number of members, which is the largest number of devices used.
-    """
+    """Make JAX use the host's cores as devices; call it before JAX starts."""
     count = min(requested or environments.available_cores(), num_members)
     environments.prepare(settings, count)
     try:

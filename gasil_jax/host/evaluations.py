@@ -89,10 +89,6 @@ class Evaluation:
     def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
         """Evaluate the policies, write the scores and log them to the trackers.
 
-        Args:
-          states: the members' training states, padded as in training; not donated.
-          done: number of iterations so far.
-
         Returns:
           The columns of evaluations.csv, (members,) each.
         """

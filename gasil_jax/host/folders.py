@@ -23,15 +23,7 @@ _NO_LOCKS = (*output_file.MISSING_CALL, errno.ENOLCK)
 
 
 def create(folder: pathlib.Path, *, option: str = "out") -> pathlib.Path:
-    """Create a folder if it is missing, and return it.
-
-    Args:
-      folder: the folder.
-      option: what the error message calls it.
-
-    Raises:
-      InputError: if it can't be written.
-    """
+    """Create a folder if it is missing, and return it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=_PROBE, dir=folder):
@@ -42,11 +34,7 @@ def create(folder: pathlib.Path, *, option: str = "out") -> pathlib.Path:
 
 
 def create_new(name: str) -> pathlib.Path:
-    """Create a folder under runs/, with a number after its name if that is taken.
-
-    Raises:
-      InputError: if it can't be written.
-    """
+    """Create a folder under runs/, with a number after its name if that is taken."""
     runs = create(pathlib.Path("runs"))
     number = 1
     while True:
@@ -92,14 +80,6 @@ def lock(
 
     The operating system frees the lock when the process ends, however it ends. Where
     the file system has no locks, a note says so, and nothing is locked.
-
-    Args:
-      folder: the folder.
-      option: what the error message calls it.
-      seconds: how long to wait for another process that holds the lock.
-
-    Raises:
-      InputError: if another process still holds the lock.
     """
     deadline = time.monotonic() + seconds
     with (folder / _LOCK).open("a+") as file:

@@ -62,34 +62,13 @@ def blamed(path: pathlib.Path) -> Iterator[None]:
 
 
 def read(path: pathlib.Path, kind: Any) -> Any:
-    """Return the content of a JSON file, checked against a type.
-
-    Args:
-      path: the file.
-      kind: the type: a dataclass, of which an instance is returned; a `TypedDict`,
-        whose undeclared fields are returned unchecked; str, int (0 or more), float
-        (finite), bool or None; a tuple, which is a list in the file; a dict; a union of
-        these; or `Any`, which is not checked, but whose lists become tuples.
-
-    Raises:
-      InputError: if the content has another type, which the message names.
-      OSError: if there is no such file.
-    """
+    """Return the content of a JSON file, checked against a type."""
     with blamed(path):
         return as_type(kind, json.loads(path.read_text()), "")
 
 
 def as_type(kind: Any, value: Any, name: str) -> Any:
-    """Return a value of a JSON file as a type; see `read`.
-
-    Args:
-      kind: the type.
-      value: the value.
-      name: name of the field that holds it, such as "config.alpha".
-
-    Raises:
-      InputError: if the value has another type.
-    """
+    """Return a value of a JSON file as a type; see `read`."""
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
         return _with_tuples(value)

@@ -74,11 +74,7 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 
 def make_parent(path: pathlib.Path) -> None:
-    """Create the folder of a file, and check that a file can be written in it.
-
-    Raises:
-      InputError: if it can't be created or written to.
-    """
+    """Create the folder of a file, and check that a file can be written in it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = _partial(path)
@@ -104,9 +100,6 @@ def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
 
     A reader never sees a half written file, and several processes may write the same
     file. If the block raises an error, the temporary file is deleted.
-
-    Raises:
-      WriteError: if it can't be written.
     """
     partial = _partial(path)
     try:

@@ -95,13 +95,7 @@ def draw_returns(
 def label_ends(
     axes: Any, ends: Mapping[str, float], color_of: Mapping[str, Any]
 ) -> None:
-    """Write names beside the ends of lines, apart from each other.
-
-    Args:
-      axes: where the lines are, which must all be drawn.
-      ends: the y value at which each line ends, by its name, the highest first.
-      color_of: the color of each name.
-    """
+    """Write names beside the ends of lines, apart from each other."""
     low, high = axes.get_ylim()
     gap = 0.06  # Of the height of the axes, for this font size.
     heights = [(y - low) / (high - low) for y in ends.values()]
@@ -118,13 +112,7 @@ def label_ends(
 
 
 def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:
-    """Write below a figure what its lines and intervals are.
-
-    Args:
-      figure: the figure.
-      num_seeds: number of seeds of each line.
-      more: what else there is to say.
-    """
+    """Write below a figure what its lines and intervals are."""
     *others, largest = sorted(set(num_seeds))
     seeds = f"{', '.join(map(str, others))}{' or ' if others else ''}{largest}"
     seeds += " seed" if largest == 1 else " seeds"

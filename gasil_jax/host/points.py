@@ -30,11 +30,7 @@ PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
 
 
 def whole_number(text: str) -> int:
-    """Return the whole number in a text, which may be written as 1e6.
-
-    Raises:
-      ValueError: if the text is not a whole number.
-    """
+    """Return the whole number in a text, which may be written as 1e6."""
     try:
         return int(text)
     except ValueError:
@@ -107,12 +103,7 @@ def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
 
 
 def check(every: Iterable[Point], algorithm: Algorithm, source: str = "") -> None:
-    """Check that points change what can vary, to values that are allowed.
-
-    Raises:
-      InputError: if one does not; the message, which begins with `source`, names the
-        value and the range.
-    """
+    """Check that points change what can vary, to values that are allowed."""
     allowed = _kinds(algorithm)
     unused = without_effect(algorithm)
     try:
@@ -155,21 +146,7 @@ def make_points(
     seed: int,
     algorithm: Algorithm,
 ) -> list[Point]:
-    """Return the points of a sweep.
-
-    Args:
-      grid: NAME=VALUE,VALUE,... for each name that varies.
-      random: number of points to draw from the grid or, without a grid, from
-        `PAPER_RANGES`; None takes the whole grid. More points are those of a smaller
-        number, and others.
-      points_file: a file that lists the points, instead of grid and random.
-      seed: seed of the draws.
-      algorithm: what the points change. Names that it does not have are left out of
-        `PAPER_RANGES`.
-
-    Raises:
-      InputError: if nothing varies, or if a name or value is not allowed.
-    """
+    """Return the points of a sweep."""
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file can't be combined with grid or random")

@@ -125,12 +125,7 @@ class Program:
 
     @contextlib.contextmanager
     def opened(self) -> Iterator[None]:
-        """Create and lock the folder inside the `with` block, and list its runs.
-
-        Raises:
-          InputError: if another process trains the program, or if the folder can't be
-            written.
-        """
+        """Create and lock the folder inside the `with` block, and list its runs."""
         with folders.lock(folders.create(self.path)):
             if not (self.path / _PROGRAM).exists():
                 every = list(dict.fromkeys(run.experiment for run in self.runs))
@@ -148,11 +143,7 @@ class Program:
 
     @property
     def training(self) -> Training | None:
-        """What `finish` wrote; None if training has not ended.
-
-        Raises:
-          InputError: if the file is damaged.
-        """
+        """What `finish` wrote; None if training has not ended."""
         try:
             return json_files.read(self.path / _TRAINING, Training)
         except (FileNotFoundError, NotADirectoryError):
@@ -168,9 +159,6 @@ class Program:
         """Return the metrics and the scores of each run, (rows,); {} without scores.
 
         Training must have ended.
-
-        Raises:
-          InputError: if a table is damaged.
         """
         training = self.training
         assert training is not None
@@ -186,11 +174,7 @@ class Program:
         return list(zip(metrics, scores))
 
     def table(self, name: str, required: Sequence[str]) -> list[Columns]:
-        """Return a table's columns, (rows,), by run; {} if it has no rows yet.
-
-        Raises:
-          InputError: if it is damaged.
-        """
+        """Return a table's columns, (rows,), by run; {} if it has no rows yet."""
         path = self.path / name
         try:
             columns = tables.read(path, self.labels, required)
@@ -227,9 +211,6 @@ def read(parent: pathlib.Path, requested: Collection[Run]) -> list[Program]:
     """Return the programs in a folder's subfolders that hold some requested runs.
 
     The length of a run's training is that of the requested one, which may have grown.
-
-    Raises:
-      InputError: if a program.json is damaged.
     """
     known, stored = {run.identity: run for run in requested}, []
     for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
@@ -270,10 +251,8 @@ def unfinished(
 ) -> tuple[list[Program], list[Run]]:
     """Return the programs to continue, and the requested runs that no program holds.
 
-    Args:
-      requested: the runs that are needed.
-      stored: the programs that hold requested runs. One that is continued trains all of
-        its runs. One that is not finished and has members that nobody knows can't be.
+    A program that is continued trains all of its runs, so one with members that nobody
+    asked for is not.
     """
     begun = [x for x in stored if not (x.is_finished or x.others)]
     held = {run for x in stored if x.is_finished or not x.others for run in x.runs}

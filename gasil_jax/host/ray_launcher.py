@@ -37,19 +37,6 @@ def run_on_ray(
 
     The cluster is RAY_ADDRESS's, else a running one, else a new one. If a task's worker
     or node dies, the task is run again elsewhere.
-
-    Args:
-      program: name of the module to start, which workers must have installed.
-      jobs: the arguments of each job, by the job's name in messages. Folders in the
-        arguments must be the same on every node.
-      devices: number of CPU devices of a job and of CPUs that it reserves; default 1.
-        Where the cluster has GPUs, a job reserves one of them and one CPU instead.
-
-    Raises:
-      ChildProcessError: if jobs have failed; the others are done.
-      InputError: if Ray is not installed, if no node has that many CPUs, or if all jobs
-        have failed because of bad input.
-      Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     try:
         import ray

@@ -50,15 +50,7 @@ def check(
     devices: Sequence[jax.Device],
     folder: pathlib.Path,
 ) -> None:
-    """Raise `InputError`, with the sizes, if programs do not fit memory or disk.
-
-    Args:
-      env: one environment.
-      programs: the programs, which are trained one after the other.
-      recording: what is recorded.
-      devices: the devices to train on.
-      folder: the folder of the checkpoints; it need not exist.
-    """
+    """Raise `InputError`, with the sizes, if programs do not fit memory or disk."""
     sizes = []
     for each in programs:
         count, one = len(each.runs), need(env, each.algorithm)
@@ -192,14 +184,7 @@ def _padded(count: int, devices: Sequence[jax.Device]) -> int:
 def check_memory(
     one: Need, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
-    """Raise `InputError` if members, trained at once, do not fit the devices' memory.
-
-    Args:
-      one: what one run needs.
-      algorithm: the algorithm of the runs.
-      num_members: number of members that are trained at once.
-      devices: the devices that they are sharded over, at most one for each member.
-    """
+    """Raise `InputError` if members, trained at once, do not fit into memory."""
     used = devices[:num_members]
     required = _padded(num_members, used) * one.memory + len(used) * one.shared
     if (free := available(used)) is None or required <= free:
@@ -228,15 +213,7 @@ def check_episodes(
     *,
     option: str = "episodes",
 ) -> None:
-    """Raise `InputError` if an evaluation's episodes do not fit the devices' memory.
-
-    Args:
-      env: one environment.
-      num_episodes: number of episodes of each policy, all at once.
-      num_policies: number of policies that are evaluated at once.
-      devices: the devices that they are sharded over, at most one for each policy.
-      option: name of the option that sets the number of episodes.
-    """
+    """Raise `InputError` if an evaluation's episodes do not fit the devices' memory."""
     state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
     used = devices[:num_policies]
     each, free = _STATES_PER_EPISODE * state * num_episodes, available(used)

@@ -61,12 +61,7 @@ class Results:
 
 
 def read(sweep: Sweep, trained: Sequence[Program]) -> Results:
-    """Return the results of a sweep from programs whose training has ended.
-
-    Raises:
-      InputError: if a run is missing or has two different results, if a table is
-        damaged, or if one has other columns than the others.
-    """
+    """Return the results of a sweep from programs whose training has ended."""
     if missing := sweep.missing(trained):
         point, seed = missing[0]
         raise InputError(
@@ -230,8 +225,7 @@ def summary(results: Results) -> dict[str, Any]:
 
 
 def _speed(trainings: Sequence[Training]) -> dict[str, Any]:
-    """Return the seconds, steps/s and devices of programs trained one after the other.
-    """
+    """Return seconds, steps/s and devices of programs trained one after the other."""
     evaluations = [x["evaluation_seconds"] for x in trainings]
     seconds = sum(x["train_seconds"] for x in trainings)
     steps = sum(x["env_steps"] for x in trainings)

@@ -141,16 +141,7 @@ def identity(experiment: Mapping[str, Any], seed: int) -> tuple[str, int]:
 
 
 def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
-    """Return a stored run.
-
-    Args:
-      experiment: its `Run.experiment`, parsed from JSON. Settings that are missing,
-        because they are newer than the stored run, have their defaults.
-      seed: its seed.
-
-    Raises:
-      ValueError: if a name is unknown, or a value of another type.
-    """
+    """Return a stored run."""
     fields = dict(experiment)
     own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
     current = {stored: name for name, stored in STORED_NAMES.items()}

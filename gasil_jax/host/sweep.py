@@ -98,9 +98,6 @@ class Sweep:
 
         They do not depend on which runs are trained already. The sizes of shards differ
         by one run at most, and the runs of a program are divided as little as possible.
-
-        Raises:
-          InputError: if there are more shards than runs.
         """
         ordered = [x for each in programs.group(self.runs.values()) for x in each.runs]
         total = len(ordered)
@@ -168,13 +165,8 @@ class Sweep:
     def continued_from(self, folder: pathlib.Path, *, option: str = "out") -> "Sweep":
         """Return this sweep with the points of the one in the folder before its own.
 
-        Args:
-          folder: the folder; if no sweep has begun there, this one is returned.
-          option: what the error message calls the folder.
-
-        Raises:
-          InputError: if the folder's sweep has other settings. Its training may become
-            longer, and it may get more seeds and points.
+        If none has begun there, it is this one. What is there must be the same but for
+        longer training and more seeds and points.
         """
         if not folders.has_config(folder):
             return self
@@ -205,11 +197,7 @@ class Config(TypedDict, total=False):
 
 
 def described(folder: pathlib.Path) -> Config:
-    """Return the content of config.json, also of what only Python can make.
-
-    Raises:
-      InputError: if there is none, or if it is damaged.
-    """
+    """Return the content of config.json, also of what only Python can make."""
     path = folder / folders.CONFIG
     try:
         content: Config = json_files.read(path, Config)
@@ -228,14 +216,7 @@ def described(folder: pathlib.Path) -> Config:
 def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
     """Return the sweep in a folder.
 
-    Args:
-      folder: the folder.
-      algorithm: the algorithm of training that only Python can describe; default what
-        config.json describes.
-
-    Raises:
-      InputError: if it holds no sweep, if config.json is damaged, or if only Python can
-        make its algorithm, which is then an argument.
+    An algorithm that only Python can make is an argument.
     """
     stored = described(folder)
     if algorithm is None and (why := stored["only_python"]) is not None:
@@ -305,11 +286,7 @@ def _expert_hash(algorithm: Algorithm) -> str | None:
 
 
 def parse_shard(text: str) -> tuple[int, int]:
-    """Return the number of a shard, from 1 on, and their count, from text like "3/8".
-
-    Raises:
-      InputError: if the text has another form.
-    """
+    """Return the number of a shard, from 1 on, and their count, from "3/8"."""
     with contextlib.suppress(ValueError):
         number, count = map(int, text.split("/"))
         if 1 <= number <= count and text == f"{number}/{count}":

@@ -83,12 +83,7 @@ class TableWriter:
         self._columns = tuple(next(csv.reader([header] if header else []), ())) or None
 
     def write(self, metrics: Mapping[str, np.ndarray]) -> None:
-        """Write arrays (members, iterations), one for each metric.
-
-        Raises:
-          output_file.WriteError: if they can't be written, or if the file is not at its
-            path any more.
-        """
+        """Write arrays (members, iterations), one for each metric."""
         self._check_in_place()
         lines = io.StringIO(newline="")
         writer = csv.writer(lines)
@@ -158,10 +153,6 @@ def read(
       path: the file; an empty cell becomes NaN.
       labels: columns that identify the members, (members,) each.
       required: columns that it must have besides "env_steps".
-
-    Raises:
-      InputError: if the file is damaged or lacks a column.
-      OSError: if there is no such file.
     """
     num_members = len(labels["seed"])
     header: list[str] = []

@@ -168,18 +168,7 @@ def make(
     config: _Config,
     members: _Members,
 ) -> list[Tracker]:
-    """Return the trackers of a run.
-
-    Args:
-      names: names in `TRACKERS`.
-      folder: folder of the run, or of a program of a sweep.
-      run_name: name that the run has in the trackers.
-      config: settings to show with the run.
-      members: those that each member has of its own, such as its seed, by its label.
-
-    Raises:
-      InputError: if a tracker can't start.
-    """
+    """Return the trackers of a run."""
     kinds = [TRACKERS[name][1] for name in names]
     return [kind(folder, run_name, config, members) for kind in kinds]
 

@@ -35,16 +35,6 @@ def prepare(
     """Start the devices, check that everything fits, and return the environment.
 
     Nothing is compiled before this is done.
-
-    Args:
-      sweep: what is trained.
-      programs: the programs to train, one after the other.
-      folder: where they are written.
-      num_devices: number of CPU devices; None for one per core.
-
-    Raises:
-      ValueError: if the environment can't be built, if the agent can't run in it, or if
-        the programs do not fit the devices or the disk.
     """
     num_members = sum(len(each.runs) for each in programs)
     devices.use_devices(sweep.settings, num_devices, num_members)
@@ -90,22 +80,6 @@ def train_programs(
 
     Each program's folder is locked and lists its runs; once its training has ended it
     has a training.json.
-
-    Args:
-      env: the environment, as from `prepare`.
-      programs: the programs.
-      recording: what is recorded.
-      title: title of the progress display.
-      interruption: records signals.
-      callback: called after each chunk; if it returns true, training ends there.
-      shown: whether progress is shown.
-
-    Raises:
-      InputError: if another process trains one of them, or if one that is continued
-        does not fit its checkpoint.
-      Interrupted: if a signal was received; a checkpoint was written first.
-      OSError: if a folder can no longer be written. If only the last checkpoint of a
-        program can't, its outcome has the error.
     """
     num_members = sum(len(each.runs) for each in programs)
     configs = [each.algorithm.config for each in programs for _ in each.runs]
