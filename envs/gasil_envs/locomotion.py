@@ -16,9 +16,9 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.envs import Env, State
 from flax import struct
 
+from gasil_envs.base import Env, State
 from gasil_envs.physics import batching
 from gasil_envs.physics.dynamics import FIELDS
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState

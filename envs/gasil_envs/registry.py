@@ -1,7 +1,6 @@
 """Build environments by name; check names and settings."""
 
 import dataclasses
-import difflib
 import importlib.util
 import numbers
 from collections.abc import Callable, Iterable
@@ -9,16 +8,16 @@ from typing import Any
 
 import jax
 import numpy as np
-from brax.envs import Env
 
 from gasil_envs import (
     locomotion,
     point_mass,
-    user_code,
     user_environment,
     worlds,
     wrappers,
 )
+from gasil_envs.base import Env
+from gasil_envs.errors import InputError, nearest, refusal, unknown
 from gasil_envs.physics import batching, native
 
 
@@ -60,40 +59,13 @@ class Settings:
 _EPISODE_LENGTH = 1000
 
 
-def _refusal(name: str, value: Any, allowed: str) -> ValueError:
-    """Return the error for a value that is not allowed, in one short line."""
-    return ValueError(f"{name} is {user_code.shown(value)}: it must be {allowed}")
-
-
 def _refuse_unknown(
     kind: str, name: Any, allowed: Iterable[str], *, forms: Iterable[str] = ()
 ) -> None:
-    """Raise `ValueError` for a name that is not among the allowed ones.
-
-    Args:
-      kind: the kind of thing that is named, such as "env".
-      name: the name.
-      allowed: the names that exist.
-      forms: the forms of other allowed names, such as MODULE:NAME, for the message.
-    """
+    """Raise `ValueError` for a name that is not among the allowed ones."""
     allowed = tuple(allowed)
-    listed = ", ".join((*allowed, *forms))
-    if not isinstance(name, str):
-        raise _refusal(kind, name, f"one of {listed}")
-    if name in allowed:
-        return
-    name = name[:300]
-    # The prefix, which all names have, must not make them similar.
-    bare = {x.rpartition(":")[2].lower(): x for x in allowed}
-    given = name.rpartition(":")[2].lower()  # Gymnasium writes "Hopper-v5".
-    near = difflib.get_close_matches(given, bare, n=1, cutoff=0.7)
-    if not near and len(given) > 2:
-        near = [x for x in bare if given in x]
-    if not near:
-        raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
-    raise ValueError(
-        f"{kind} {name!r} is unknown: did you mean {bare[near[0]]!r}? (one of {listed})"
-    )
+    if not isinstance(name, str) or name not in allowed:
+        raise InputError(unknown(kind, name, allowed, forms=tuple(forms)))
 
 
 def names() -> tuple[str, ...]:
@@ -122,9 +94,9 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
 
 def _refuse_unknown_family(name: str, family: str) -> None:
     """Raise `ValueError` if a family's name is misspelled and is no module."""
-    near = difflib.get_close_matches(family.lower(), worlds.FAMILIES, n=1, cutoff=0.7)
-    if near and not _is_module(family):
-        meant = f"{near[0]}:{name.partition(':')[2]}"
+    near = nearest(family, worlds.FAMILIES)
+    if near is not None and not _is_module(family):
+        meant = f"{near}:{name.partition(':')[2]}"
         listed = ", ".join((*worlds.forms(), "MODULE:NAME"))
         raise ValueError(
             f"env {name!r} is of an unknown family: did you mean {meant!r}? (one of "
@@ -183,22 +155,22 @@ def check(name: str, settings: Settings) -> None:
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
     for field in ("terminal_limits", "observe_phase"):
         if not isinstance(value := getattr(settings, field), bool):
-            raise _refusal(field, value, "True or False")
+            raise refusal(field, value, "True or False")
     if settings.observe_phase and settings.reward_delay == 1:
         raise ValueError("observe_phase is True: it needs a reward_delay above 1")
     delay = settings.reward_delay
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
-        raise _refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
+        raise refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
     for field in ("obs_noise", "action_noise"):
         noise = getattr(settings, field)
         # NumPy would convert the limit to the number's own type, such as float16.
         noise = noise.item() if isinstance(noise, np.generic) else noise
         # Numbers are float32.
         if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
-            raise _refusal(field, getattr(settings, field), "finite and 0 or more")
+            raise refusal(field, getattr(settings, field), "finite and 0 or more")
     if settings.action_noise and name.startswith("sparse:") and "_noisy" in name:
-        raise _refusal("action_noise", settings.action_noise, f"0: {name} has its own")
+        raise refusal("action_noise", settings.action_noise, f"0: {name} has its own")
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:
@@ -245,11 +217,11 @@ def make(name: str, **settings: Any) -> Env:
     if chosen.max_episode_steps is not None:
         if not _is_whole(chosen.max_episode_steps, 1, limit):
             own_limit = f"a whole number from 1 to {limit}, the environment's own limit"
-            raise _refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
+            raise refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
         limit = int(chosen.max_episode_steps)
     if chosen.action_noise > 0:
         if wrappers.is_discrete(env) and chosen.action_noise > 1:
-            raise _refusal(
+            raise refusal(
                 "action_noise", chosen.action_noise, f"at most 1, a share, for {name}"
             )
         env = wrappers.ActionNoise(env, float(chosen.action_noise))
