@@ -5,16 +5,15 @@ Gymnasium. It replaces the package's policy for the task if its score is higher.
 table in docs/zoo.md is written from the policies.
 """
 
-import dataclasses
 import json
 import pathlib
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
 from experiments import report, tables
 from experiments.curves import name_of
+from experiments.options import Options, Parser, at_least
 from gasil_jax import npz, numpy_policy
 from gasil_jax.errors import InputError
 from gasil_jax.evaluate import evaluate_in_gymnasium
@@ -23,17 +22,14 @@ from gasil_jax.host import command_line, environments, output_file, run_folder
 TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Score runs' best policies and add them to the package's.
-
-    Attributes:
-      runs: folders of finished runs on locomotion tasks.
-      episodes: number of episodes of each score.
-    """
-
-    runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
-    episodes: int = 100
+def parser() -> Parser:
+    """Return the reader of the command's options."""
+    parser = Parser("zoo", "Score runs' best policies and add them to the package's.")
+    words = "folders of finished runs on locomotion tasks"
+    parser.add_argument("runs", nargs="+", type=pathlib.Path, help=words)
+    words = "episodes of each score"
+    parser.add_argument("--episodes", type=at_least(1), default=100, help=words)
+    return parser
 
 
 def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
@@ -114,9 +110,6 @@ def table() -> str:
 
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
-    command_line.check_minimum(options, episodes=1)
-    if not options.runs:
-        raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:
         print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
     text = report.fill_blocks(TABLE.read_text(), lambda _: table())
