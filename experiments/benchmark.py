@@ -35,11 +35,11 @@ from jax.sharding import PartitionSpec as P
 import gasil_envs
 from experiments import measured, peers
 from experiments.comparisons import interval
+from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
-from gasil_jax.cli import parsing
-from gasil_jax.errors import InputError
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
@@ -56,34 +56,29 @@ _NUM_STEPS, _BASELINE_STEPS = 20, 3 * 2048
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Measure the speed and fidelity of physics and training.
-
-    Attributes:
-      tables: tables to print: physics, training, scaling, peers.
-      envs: names of the tasks; the table peers has its own.
-      variants: ways of building a task; default all in the physics table, and ours and
-        mujoco in the training table.
-      num_envs: numbers of environments in the physics table.
-      repeats: number of times that each row is timed.
-      devices: number of CPU devices; default one per core.
-      seeds: number of seeds to train; in the scaling table on each device.
-      training_envs: number of environments per seed; default the paper preset's.
-      iterations: training iterations in a repeat; in the table peers, of each training.
-      page: write the tables into docs/performance.md too, below the same command.
-    """
-
-    tables: tuple[str, ...] = ("physics", "training")
-    envs: tuple[str, ...] = ("walker2d",)
-    variants: tuple[str, ...] = ()
-    num_envs: tuple[int, ...] = (64,)
-    repeats: int = 5
-    devices: int | None = None
-    seeds: int = 10
-    training_envs: int | None = None
-    iterations: int = 2
-    page: bool = False
+def parser() -> Parser:
+    """Return the reader of the command's options."""
+    about = "Measure the speed and fidelity of physics and training."
+    parser, whole = Parser("benchmark", about), at_least(1)
+    add = parser.add_argument
+    for name, choices, default, words in (
+        ("tables", TABLES, ["physics", "training"], "tables to print"),
+        ("envs", TASKS, ["walker2d"], "tasks; the table peers has its own"),
+        ("variants", VARIANTS, [], "ways of building a task, instead of the table's"),
+    ):
+        add(f"--{name}", nargs="+", choices=choices, default=default, help=words)
+    words = "numbers of environments in the physics table"
+    add("--num-envs", type=whole, nargs="+", default=[64], help=words)
+    for name, number, words in (
+        ("repeats", 5, "times that each row is timed"),
+        ("devices", None, "CPU devices, instead of one per core"),
+        ("seeds", 10, "seeds to train; in the scaling table on each device"),
+        ("training-envs", None, "environments per seed, instead of the preset's"),
+        ("iterations", 2, "iterations in a repeat; of each training in table peers"),
+    ):
+        add(f"--{name}", type=whole, default=number, help=words)
+    parser.add_page()
+    return parser
 
 
 @dataclasses.dataclass
@@ -292,7 +287,7 @@ def training_row(
     algorithm = algorithm.replace(
         num_envs=num_envs, total_steps=50 * options.iterations * batch_steps
     )
-    with parsing.input_checked():
+    with input_checked():
         batch = make_members(
             env, algorithm, range(seeds), devices=jax.devices()[:devices]
         )
@@ -481,20 +476,9 @@ TABLES = {
 
 def run(options: Options) -> None:
     """Print the tables."""
-    for name, allowed in (("tables", TABLES), ("envs", TASKS), ("variants", VARIANTS)):
-        if others := set(getattr(options, name)) - set(allowed):
-            raise InputError(
-                f"{name} has {min(others)!r}: allowed {', '.join(allowed)}"
-            )
-    if (fewest := min(options.num_envs, default=0)) < 1:
-        raise InputError(f"num_envs is {fewest}: it must be 1 or more")
-    parsing.check_minimum(
-        options, repeats=1, seeds=1, iterations=1, devices=1, training_envs=1
-    )
     if "peers" in options.tables:
         peers.check()
-    if options.page:
-        measured.find("benchmark", options)
+    page = measured.find(parser(), options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
     versions = driver.versions()
@@ -508,5 +492,5 @@ def run(options: Options) -> None:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)
                 every += rows
-    if options.page:
-        measured.write("benchmark", options, *for_page(every))
+    if page:
+        measured.write(page, *for_page(every))

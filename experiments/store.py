@@ -24,7 +24,6 @@ _NONE = np.empty(0)
 _STORED = {agent.name: name for name, agent in OWN.items()}
 _CURRENT = {name: agent for agent, name in _STORED.items()}
 RESULTS = pathlib.Path(__file__).parent / "results"
-#: The type of an option with this default, which the help need not say in full.
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,20 +215,3 @@ class Store:
                     write(self._path(env), stored)
             added += len(new)
         return added
-
-
-def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
-    """Add the runs of another store; return how many are new, and how many it has.
-
-    The source is the folder of that store, or of the results that contain it. A run
-    that the target has is not changed.
-
-    Raises:
-      InputError: if there are no runs in the folder.
-    """
-    folder = source / "runs" if (source / "runs").is_dir() else source
-    paths = sorted(folder.glob("[!.]*.npz"))
-    if not paths:
-        raise InputError(f"folder is {source}: it must have TASK.npz files of runs")
-    records = {run: record for path in paths for run, record in read(path).items()}
-    return target.add(records), len(records)

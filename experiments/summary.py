@@ -19,6 +19,7 @@ from experiments.agents import OWN
 from experiments.curves import name_of
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
+from experiments.options import Options, Parser
 from experiments.search import (
     ADAPTIVE,
     DELAY,
@@ -324,8 +325,15 @@ def tuned(pages: Pages) -> str:
     return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
 
-def write_all(store: Store) -> None:
-    """Write all pages with their plots, the README's blocks and the presets."""
+def parser() -> Parser:
+    """Return the reader of the command's options, of which there are none."""
+    about = "Write all pages, plots and presets, and the README's text on results."
+    return Parser("report", about)
+
+
+def run(options: Options) -> None:
+    """Write all that is made from stored runs."""
+    store = Store(RESULTS / "runs")
     pages = all_results(store)
     for name, results in pages.items():
         report.write(name, results, RESULTS)
@@ -341,3 +349,4 @@ def write_all(store: Store) -> None:
     ):
         with output_file.atomic(path) as partial:
             partial.write_text(content)
+    print(f"in {RESULTS}")

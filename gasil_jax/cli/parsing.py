@@ -74,8 +74,6 @@ class Parser(argparse.ArgumentParser):
         texts, hints = _texts(kind), get_type_hints(kind)
         own = self._of[title] = []
         for field in dataclasses.fields(kind):
-            if _is_group(hints[field.name]):
-                continue
             value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
@@ -150,18 +148,7 @@ def read(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     positional = [x.name.upper() for x in fields if x.metadata.get("positional")]
     parser = Parser(program, f"{' '.join(positional)} [options]", kind)
     parser.add_fields(kind, "options")
-    hints = get_type_hints(kind)
-    groups = {x.name: hints[x.name] for x in fields if _is_group(hints[x.name])}
-    for name, group in groups.items():
-        parser.add_fields(group, name)
-    values = parser.read(arguments)
-    own = {name: group(**parser.fields(values, name)) for name, group in groups.items()}
-    return kind(**parser.fields(values, "options"), **own)
-
-
-def _is_group(hint: Any) -> bool:
-    """Return whether the fields of a field's type are options."""
-    return dataclasses.is_dataclass(hint)
+    return kind(**parser.fields(parser.read(arguments), "options"))
 
 
 def _default(field: Any) -> Any:

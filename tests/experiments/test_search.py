@@ -6,7 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
-from experiments import __main__, search, tables
+from experiments import search, tables
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
 from experiments.search import (
@@ -131,29 +131,6 @@ def test_which_values_suit_a_task_is_told(tmp_path):
     printed = tables.ranks(Results(FIGURES["matrix"], store), "gamma")
     row = next(x for x in printed.splitlines() if "| ant" in x)
     assert row == "| ant-delayed | 0.50 | 0.50 |"
-
-
-def test_holes_of_the_plan_are_told(tmp_path, capsys):
-    store, one = Store(tmp_path / "runs"), Search("hopper", "ppo", 20)
-    drawn = one.points(store)
-    fill(store, one, drawn, range(len(drawn)))
-    assert __main__.main(["coverage", "--results", str(tmp_path)]) == 1
-    printed = capsys.readouterr().out
-    of_matrix, _ = printed.split("paper_protocol")
-    _, *lines = of_matrix.splitlines()
-    # Where rewards are delayed, there is PPO with decomposed rewards too.
-    assert len(lines) == len(CELLS) * len(AGENTS) + len(TASKS)
-    planned = len(one.requested(store))
-    assert planned > 2 * len(drawn)
-    line = next(x for x in lines if x.startswith("hopper-delayed"))
-    assert line.split() == (
-        f"hopper-delayed ppo {2 * len(drawn)} of {planned} 0 of 20".split()
-    )
-    words = " ".join(printed.split())
-    assert f"hopper ppo 0 of {2 * len(drawn)} 0 of 10" in words
-    # With its schedule of alpha two of the 32 points are as others.
-    assert "humanoid (raw) ppo+gasil 0 of 60 0 of 10" in words
-    assert "humanoid-delayed (raw) ppo+gasil 0 of 64 0 of 10" in words
 
 
 def test_the_papers_protocol_has_the_appendix_s_values():

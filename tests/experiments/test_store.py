@@ -16,7 +16,6 @@ from experiments.store import (
     Record,
     Store,
     from_stored,
-    merge,
     read,
     to_stored,
     write,
@@ -213,17 +212,6 @@ def test_a_run_that_is_there_stays(tmp_path):
     for fresh in (store, Store(tmp_path)):
         assert fresh[run()].episode_return.tolist() == [1.0] * 3
         assert fresh.missing([run(), run(2), run(1), run(2)]) == [run(2)]
-
-
-def test_the_runs_of_another_machine_are_added(tmp_path):
-    here, there = Store(tmp_path / "here"), Store(tmp_path / "results" / "runs")
-    here.add({run(): record(1.0)})
-    there.add({run(): record(2.0), run(1): record(2.0), run(env="ant"): record(2.0)})
-    assert merge(tmp_path / "results", here) == (2, 3)
-    assert merge(tmp_path / "results" / "runs", here) == (0, 3)
-    assert here[run()].episode_return[0] == 1.0 and here[run(1)].episode_return[0] == 2
-    with pytest.raises(InputError, match=r"must have TASK\.npz"):
-        merge(tmp_path, here)
 
 
 def test_runs_are_added_side_by_side(tmp_path):
