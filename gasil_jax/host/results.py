@@ -277,6 +277,7 @@ def _labels(results: Results) -> list[str]:
     """Return a label for each point: the values in which points differ."""
     points = results.sweep.points
     varied = [x for x in points[0] if len({point[x] for point in points}) > 1]
+    varied = varied or [*points[0]]
     return [", ".join(f"{x}={point[x]:g}" for x in varied) for point in points]
 
 

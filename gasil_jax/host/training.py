@@ -37,13 +37,13 @@ def prepare(
     Nothing is compiled before this is done.
     """
     num_members = sum(len(each.runs) for each in programs)
-    devices.use_devices(sweep.settings, num_devices, num_members)
+    devices.use_devices(sweep.settings, num_devices, max(1, num_members))
     env = make_env(sweep)
     with announced(sweep.env, "starting the devices"):
         every = jax.devices()
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, every, folder)
-    if num_devices is not None and num_devices > num_members:
+    if num_devices is not None and 0 < num_members < num_devices:
         note(
             f"devices is {num_devices}, of which {num_members} are used, one for each "
             "run"
