@@ -81,6 +81,8 @@ def train_programs(
     Each program's folder is locked and lists its runs; once its training has ended it
     has a training.json.
     """
+    if not programs:
+        return []
     num_members = sum(len(each.runs) for each in programs)
     configs = [each.algorithm.config for each in programs for _ in each.runs]
     total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
