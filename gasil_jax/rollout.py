@@ -276,3 +276,21 @@ def collect(
         return carry, transition
 
     return jax.lax.scan(step, environments, jax.random.split(key, num_steps))
+
+
+def metrics(batch: Rollout) -> dict[str, jax.Array]:
+    """Return the metrics of a batch, (time, env, ...).
+
+    Means over the whole episodes that ended in the batch are NaN if none did.
+    """
+    completed = batch.completed
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
+
+    return {
+        "episode_return": mean(batch.episode_return),
+        "episode_length": mean(batch.episode_length),
+        "episodes": jnp.sum(completed),
+        "faulty_steps": jnp.sum(batch.faulty),
+    }

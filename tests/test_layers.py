@@ -8,8 +8,13 @@ import pytest
 
 ROOT = pathlib.Path(__file__).parent.parent
 COMMANDS = ("run", "sweep", "merge", "evaluate", "render", "plot", "export_minari")
+#: What reads files. The algorithm imports none of it, but for what stands above it, and
+#: for the expert that GAIL imitates.
+OF_FILES = {"io", "json", "os", "pathlib", "shutil", "tempfile", "gasil_jax.npz"}
+OF_FILES |= {"gasil_jax.numpy_policy"}
+READS_FILES = {"agents.expert", "policy", "npz", "numpy_policy"}
 #: What modules of each layer may import of the package; "algorithms" is every other
-#: module at the top, and those of `imitation` and `rewards`.
+#: module at the top, and those of `agents` and `rewards`.
 ALLOWED = {
     "errors": set(),
     "config": {"errors"},
@@ -91,6 +96,13 @@ def test_imports_point_one_way():
         if layer(imported) not in ALLOWED[layer(name)]
     ]
     assert not wrong
+
+
+def test_the_algorithm_reads_no_files():
+    for name, path in modules(ROOT / "gasil_jax"):
+        is_core = layer(name) in ("errors", "config", "algorithms")
+        if is_core and name not in READS_FILES:
+            assert not OF_FILES.intersection(imports(path)), name
 
 
 def test_no_module_imports_itself_by_way_of_others():

@@ -73,7 +73,7 @@ def train(agent, seeds=2, **changes):
 
 # The others use nothing of an action that one of these does not. GAIL's discriminator
 # is that of PPO+GASIL, which is trained below.
-@pytest.mark.parametrize("agent", ["ppo", "ppo+bc", "ppo+sil", "gail"])
+@pytest.mark.parametrize("agent", ["ppo", "ppo+sil", "gail"])
 def test_agents_learn(agent, expert):
     more = {"expert": expert} if agent == "gail" else {}
     env, algorithm, states, metrics = train(agent, **more)
