@@ -24,7 +24,7 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
       requested: number of devices; None for one per core.
       num_members: number of members, which is the largest number of devices used.
     """
-    count = min(requested or environments.available_cores(), num_members)
+    count = min(requested or environments.available_cores(), max(1, num_members))
     environments.prepare(settings, count)
     try:
         jax.config.update("jax_num_cpu_devices", count)

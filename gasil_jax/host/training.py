@@ -53,7 +53,7 @@ def prepare(
         every = jax.devices()
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, every, folder)
-    if num_devices is not None and num_devices > num_members:
+    if num_devices is not None and num_devices > num_members > 0:
         note(
             f"devices is {num_devices}, of which {num_members} are used, one for each "
             "run"
@@ -111,6 +111,8 @@ def train_programs(
     configs = [each.algorithm.config for each in programs for _ in each.runs]
     total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
     outcomes: list[Outcome] = []
+    if not programs:
+        return outcomes
     steps_before = 0
     with Progress(title, total_steps, num_members, shown=shown) as progress:
         for each in programs:
