@@ -241,8 +241,9 @@ def labelled(parent: pathlib.Path, point: int) -> list[Program]:
         labels = json_files.read(path, _Listed)["labels"]
         with json_files.blamed(path):
             indices = tuple(i for i, x in enumerate(labels["point"]) if x == point)
-        if indices:
-            every.append(Program((), path.parent, labels, len(labels), indices))
+            if indices:
+                others = len(labels["seed"])
+                every.append(Program((), path.parent, labels, others, indices))
     return every
 
 

@@ -37,7 +37,7 @@ def prepare(
     Nothing is compiled before this is done.
     """
     num_members = sum(len(each.runs) for each in programs)
-    devices.use_devices(sweep.settings, num_devices, max(1, num_members))
+    devices.use_devices(sweep.settings, num_devices, num_members)
     env = make_env(sweep)
     with announced(sweep.env, "starting the devices"):
         every = jax.devices()
@@ -87,6 +87,8 @@ def train_programs(
     configs = [each.algorithm.config for each in programs for _ in each.runs]
     total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
     outcomes: list[Outcome] = []
+    if not programs:
+        return outcomes
     steps_before = 0
     with Progress(title, total_steps, num_members, shown=shown) as progress:
         for each in programs:
