@@ -51,7 +51,7 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("", "run is missing: see --help"),
+        ("", "RUN is missing: see --help"),
         ("RUN --checkpoint first", "checkpoint is 'first': it must be one of last, be"),
         ("RUN --episodes 0", "episodes is 0: it must be from 1 to"),
         ("RUN --episodes 1000000000000", "GB of memory"),
