@@ -44,6 +44,7 @@ def train(
             num_devices=options.devices,
         )
         options_.check_agent(env, requested.algorithm)
+    options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):
         if not (options.resume or shard[1] > 1) or not folders.has_config(folder):

@@ -90,7 +90,11 @@ def train_programs(
     if not programs:
         return outcomes
     steps_before = 0
-    with Progress(title, total_steps, num_members, shown=shown) as progress:
+    points = {run.experiment for each in programs for run in each.runs}
+    called = "seeds" if len(points) == 1 else "runs"
+    with Progress(
+        title, total_steps, num_members, members=called, shown=shown
+    ) as progress:
         for each in programs:
             if interruption.signal is not None:
                 raise Interrupted(interruption.signal)
