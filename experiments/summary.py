@@ -90,13 +90,7 @@ def _ahead(
 
 
 def _on_tasks(words: str, delay: int, share: float) -> Claim:
-    """Return the claim that PPO+GASIL is ahead of the paper's other agents on tasks.
-
-    Args:
-      words: the claim as text.
-      delay: the tasks' reward delay.
-      share: the share of the tasks on which it must be ahead, for the claim to hold.
-    """
+    """Return the claim to be ahead of the paper's other agents on a share of tasks."""
     equal = tuple(x if x == "ppo" else f"{x} (PPO's values)" for x in _OTHERS)
     of = {
         "paper_protocol": _ahead(delay, _OTHERS),
@@ -108,12 +102,7 @@ def _on_tasks(words: str, delay: int, share: float) -> Claim:
 
 
 def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
-    """Expect the first of two curves to be better, in each comparison of a figure.
-
-    Args:
-      name: name of the figure.
-      prefix: only panels whose names begin with it count.
-    """
+    """Expect the first curve to be better, on panels that begin with a prefix."""
     keys = [key for key in FIGURES[name].compared() if key[0].startswith(prefix)]
     return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
 
