@@ -7,8 +7,6 @@
   environments and, if it is installed (the extra "benchmark"), Stable-Baselines3's PPO
   on Gymnasium's task: a run in one process, a run whose environments have processes of
   their own, and a run on every core.
-- "peers": PPO of this package, rejax and purejaxrl, with the same sizes on the same
-  environments, 1 and 10 seeds at once (see `peers`; a line says what to install).
 - "scaling": training on 1, 2, 4 ... devices, with as many seeds on each device. A
   perfect ratio is the number of devices.
 
@@ -33,12 +31,12 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
-from experiments import measured, peers
-from experiments.comparisons import interval
+from experiments import measured
 from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
@@ -63,7 +61,7 @@ def parser() -> Parser:
     add = parser.add_argument
     for name, choices, default, words in (
         ("tables", TABLES, ["physics", "training"], "tables to print"),
-        ("envs", TASKS, ["walker2d"], "tasks; the table peers has its own"),
+        ("envs", TASKS, ["walker2d"], "tasks"),
         ("variants", VARIANTS, [], "ways of building a task, instead of the table's"),
     ):
         add(f"--{name}", nargs="+", choices=choices, default=default, help=words)
@@ -74,7 +72,7 @@ def parser() -> Parser:
         ("devices", None, "CPU devices, instead of one per core"),
         ("seeds", 10, "seeds to train; in the scaling table on each device"),
         ("training-envs", None, "environments per seed, instead of the preset's"),
-        ("iterations", 2, "iterations in a repeat; of each training in table peers"),
+        ("iterations", 2, "training iterations in a repeat"),
     ):
         add(f"--{name}", type=whole, default=number, help=words)
     parser.add_page()
@@ -92,8 +90,6 @@ class Row:
       run: takes some steps and returns how many per second.
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
-      returns: what trained policies return, (seeds,); None if it is not measured.
-      states: of physics, the environments after some steps, from which it is timed.
       speed: steps per second, the median of the repeats, once it is measured.
     """
 
@@ -103,8 +99,6 @@ class Row:
     run: Callable[[], float]
     compile_seconds: float = 0.0
     error: float | None = None
-    returns: np.ndarray | None = None
-    states: Any = None
     speed: float = 0.0
 
 
@@ -129,10 +123,8 @@ def random_step(env: Any, states: Any, key: jax.Array) -> Any:
 
 
 def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
-    def step(states: Any, key: Any) -> Any:
-        return (random_step(env, states, key), None)
-
-    return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
+    keys = jax.random.split(key, _NUM_STEPS)
+    return jax.lax.scan(lambda x, k: (random_step(env, x, k), None), states, keys)[0]
 
 
 def _keys(number: int, count: int) -> jax.Array:
@@ -152,7 +144,7 @@ def _serve(pipe: Any, flags: str, num_devices: int, build: Callable[[], Row]) ->
     start_jax(num_devices, "mjx")
     row = build()
     # A compiled program cannot be sent.
-    pipe.send(dataclasses.replace(row, run=float, states=None))
+    pipe.send(dataclasses.replace(row, run=float))
     with contextlib.suppress(EOFError):
         while pipe.recv():
             pipe.send(row.run())
@@ -178,32 +170,36 @@ def _row(variant: str, build: Callable[[], Row]) -> Row:
     return dataclasses.replace(pipe.recv(), run=run)
 
 
+def _rollout_row(
+    env: str, name: str, num_envs: int, rollout: Any, *, states: Any, keys: int
+) -> Row:
+    """Return a row of a compiled rollout, (states, keys) -> states."""
+    began = time.perf_counter()
+    advance = rollout.lower(states, _keys(0, keys)).compile()
+    # Timed after some steps, when most bodies lie on the ground, as they do later. Warp
+    # compiles its kernels at the first call.
+    states = jax.block_until_ready(advance(states, _keys(0, keys)))
+    seconds, again = time.perf_counter() - began, _keys(1, keys)
+    steps = num_envs * _NUM_STEPS
+    run = functools.partial(speed_of, lambda: advance(states, again), steps)
+    return Row(env, name, num_envs, run, seconds)
+
+
 def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     """Random actions in environments that are spread over the devices."""
     env = make(env_name, variant)
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
-    mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
-
-    def shard(function: Any) -> Any:
-        return jax.jit(
-            jax.shard_map(
-                function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
-            )
-        )
-
-    states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
-    rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
-    began = time.perf_counter()
-    advance = rollout.lower((states, _keys(0, count))).compile()
-    compile_seconds = time.perf_counter() - began
-    # Timed after some steps, when most bodies lie on the ground, as they do later.
-    states, _ = jax.block_until_ready(advance((states, _keys(0, count))))
-
-    def rollouts() -> Any:
-        return advance((states, _keys(1, count)))
-
-    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
-    return Row(env_name, variant, num_envs, run, compile_seconds, states=states)
+    mesh = Mesh(np.array(jax.devices()[:count]), ("envs",))
+    shard = functools.partial(
+        jax.shard_map,
+        mesh=mesh,
+        in_specs=P("envs"),
+        out_specs=P("envs"),
+        check_vma=False,
+    )
+    states = jax.jit(shard(jax.vmap(env.reset)))(_keys(0, num_envs))
+    rollout = jax.jit(shard(lambda states, keys: _random_steps(env, states, keys[0])))
+    return _rollout_row(env_name, variant, num_envs, rollout, states=states, keys=count)
 
 
 def warp_row(env_name: str, num_envs: int) -> Row:
@@ -230,17 +226,9 @@ def warp_row(env_name: str, num_envs: int) -> Row:
 
     rollout = jax.jit(lambda data, keys: jax.lax.scan(random_step, data, keys)[0])
     states = jax.vmap(start)(_keys(0, num_envs))
-    began = time.perf_counter()
-    advance = rollout.lower(states, _keys(0, _NUM_STEPS)).compile()
-    states = jax.block_until_ready(advance(states, _keys(0, _NUM_STEPS)))
-    # Warp compiles its kernels at the first call.
-    compile_seconds = time.perf_counter() - began
-
-    def rollouts() -> Any:
-        return advance(states, _keys(1, _NUM_STEPS))
-
-    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
-    return Row(env_name, "warp", num_envs, run, compile_seconds)
+    return _rollout_row(
+        env_name, "warp", num_envs, rollout, states=states, keys=_NUM_STEPS
+    )
 
 
 def one_step_error(env_name: str, variant: str) -> float:
@@ -275,22 +263,23 @@ def physics_table(env_name: str, options: Options) -> Iterator[list[Row]]:
         yield rows
 
 
+def _algorithm(env_name: str, options: Options) -> Algorithm:
+    algorithm = presets.preset(env_name, "ppo+gasil", "paper")
+    num_envs = options.training_envs or algorithm.config.num_envs
+    # As many iterations in a call as the command line does at most.
+    total_steps = 50 * options.iterations * algorithm.config.batch_steps
+    return algorithm.replace(num_envs=num_envs, total_steps=total_steps)
+
+
 def training_row(
     env_name: str, variant: str, options: Options, *, devices: int, seeds: int
 ) -> Row:
     """PPO+GASIL with the paper's preset."""
     env = gasil_envs.make(env_name, **VARIANTS[variant])
-    algorithm = presets.preset(env_name, "ppo+gasil", "paper")
-    num_envs = options.training_envs or algorithm.config.num_envs
-    batch_steps = algorithm.config.batch_steps
-    # As many iterations in a call as the command line does at most.
-    algorithm = algorithm.replace(
-        num_envs=num_envs, total_steps=50 * options.iterations * batch_steps
-    )
+    algorithm, used = _algorithm(env_name, options), jax.devices()[:devices]
+    num_envs, batch_steps = algorithm.config.num_envs, algorithm.config.batch_steps
     with input_checked():
-        batch = make_members(
-            env, algorithm, range(seeds), devices=jax.devices()[:devices]
-        )
+        batch = make_members(env, algorithm, range(seeds), devices=used)
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began
@@ -333,13 +322,9 @@ def _train_baseline(
 def baseline_row(
     env_name: str, runs: int, num_envs: int, *, spread: bool = False
 ) -> Row:
-    """Stable-Baselines3's PPO.
+    """Stable-Baselines3's PPO: `runs` at once, each of `num_envs` environments.
 
-    Args:
-      env_name: name of the task.
-      runs: number of runs that train at once.
-      num_envs: number of environments of a run.
-      spread: whether each environment has its own process; otherwise a run is one.
+    If they are spread, each environment has its own process; otherwise a run is one.
     """
     task = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
     context = multiprocessing.get_context("spawn")
@@ -377,9 +362,8 @@ def baseline_row(
 
 def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """Training beside physics alone and Stable-Baselines3."""
-    config = presets.preset(env_name, "ppo+gasil", "paper").config
-    num_envs = options.seeds * (options.training_envs or config.num_envs)
-    rows, devices = [], len(jax.devices())
+    num_envs = options.seeds * _algorithm(env_name, options).config.num_envs
+    rows, sizes = [], {"devices": len(jax.devices()), "seeds": options.seeds}
     if importlib.util.find_spec("stable_baselines3"):
         for runs in sorted({1, available_cores()}):
             rows += [baseline_row(env_name, runs, n) for n in (1, 8)]
@@ -388,15 +372,8 @@ def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
         physics = functools.partial(physics_row, env_name, variant, num_envs)
         row = _row(variant, physics)
         rows.append(dataclasses.replace(row, name=f"physics alone, {variant}"))
-        training = functools.partial(
-            training_row,
-            env_name,
-            variant,
-            options,
-            devices=devices,
-            seeds=options.seeds,
-        )
-        rows.append(_row(variant, training))
+        train = functools.partial(training_row, env_name, variant, options, **sizes)
+        rows.append(_row(variant, train))
     yield rows
 
 
@@ -412,26 +389,12 @@ def scaling_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     yield rows
 
 
-def peers_table(env_name: str, options: Options) -> Iterator[list[Row]]:
-    """The rows of each number of seeds."""
-    for seeds in (1, 10):
-        rows = []
-        for name, train, seconds, steps, returns in peers.programs(
-            env_name, seeds, options.iterations
-        ):
-            name = f"{name}, {seeds} seed{'s' * (seeds > 1)}"
-            run = functools.partial(speed_of, train, steps)
-            rows.append(Row(env_name, name, 32 * seeds, run, seconds, returns=returns))
-        yield rows
-
-
 def measure(rows: Sequence[Row], repeats: int) -> None:
     """Time the rows of a task in turn and print them."""
     speeds = np.median([[row.run() for row in rows] for _ in range(repeats)], axis=0)
     for row, speed in zip(rows, speeds, strict=True):
         row.speed = speed
         error = "" if row.error is None else f"{row.error:17.1e}"
-        error += "" if row.returns is None else f"  {interval(row.returns)}"
         print(
             f"{row.env:16} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
             f"{speed / speeds[0]:6.2f} {row.compile_seconds:9.1f}{error}",
@@ -470,14 +433,11 @@ TABLES = {
     "physics": physics_table,
     "training": training_table,
     "scaling": scaling_table,
-    "peers": peers_table,
 }
 
 
 def run(options: Options) -> None:
     """Print the tables."""
-    if "peers" in options.tables:
-        peers.check()
     page = measured.find(parser(), options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
@@ -485,10 +445,8 @@ def run(options: Options) -> None:
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     every: list[Row] = []
     for table in options.tables:
-        print(
-            f"{table:54}  envs     steps/s  ratio compile s  error of a step, or return"
-        )
-        for env_name in peers.ENVS if table == "peers" else options.envs:
+        print(f"{table:54}  envs     steps/s  ratio compile s  error of a step")
+        for env_name in options.envs:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)
                 every += rows

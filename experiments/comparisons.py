@@ -29,13 +29,7 @@ Scores = Mapping[tuple[str, str], np.ndarray]
 
 
 class Effect(NamedTuple):
-    """A difference before its p-value is corrected.
-
-    Attributes:
-      middle: the difference.
-      p: its p-value.
-      drawn: bootstrap samples of it, (draws,).
-    """
+    """A difference, its p-value before correction, and bootstrap samples, (draws,)."""
 
     middle: float
     p: float
@@ -167,10 +161,7 @@ def bootstrap_p(drawn: np.ndarray) -> float:
 def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
     """Return the smallest true effect that would be found with a probability of 80%.
 
-    Args:
-      drawn: bootstrap samples of the effect, (draws,).
-      comparisons: n, the number of comparisons in the family. The level of the test is
-        `LEVEL` / n, as in Holm's method for the smallest p-value.
+    The level of the test is `LEVEL` / `comparisons`, as for Holm's smallest p-value.
     """
     quantile = statistics.NormalDist().inv_cdf
     errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
@@ -189,19 +180,14 @@ def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, floa
     return {key: higher[key] for key in p_values}
 
 
+def more(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return 1 where one is more than the other, and one half where they are equal."""
+    return np.add(one > other, one >= other, dtype=np.int8) / 2
+
+
 def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the share of pairs of seeds in which ours is more; equal ones count half.
-
-    Args:
-      ours: our seeds, (..., seeds).
-      others: the other seeds, (..., other seeds).
-
-    Returns:
-      The shares, (...).
-    """
-    one, two = ours[..., :, None], others[..., None, :]
-    points = np.add(one > two, one >= two, dtype=np.int8)
-    return points.mean(axis=(-1, -2)) / 2
+    """Return the share of pairs of seeds in which ours is more, from (..., seeds)."""
+    return more(ours[..., :, None], others[..., None, :]).mean(axis=(-1, -2))
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:
@@ -255,12 +241,9 @@ def interval(scores: np.ndarray) -> str:
 def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
     """Return the interquartile mean over the seeds of all tasks, as text.
 
-    Every task has the same weight. The 95% interval is the percentile bootstrap's over
-    seeds, drawn within each task.
-
-    Args:
-      name: seeds the random numbers of the bootstrap.
-      scores: the scores of each task, (seeds,), in one unit.
+    Every task has the same weight; its scores are (seeds,), in one unit. The 95%
+    interval is the percentile bootstrap's over seeds, drawn within each task; `name`
+    seeds its random numbers.
     """
     most = math.lcm(*map(len, scores))
     rng = generator(name)

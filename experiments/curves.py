@@ -191,13 +191,7 @@ class Figure:
         return list(families.values())
 
     def requested(self, searched: Store) -> list[Run]:
-        """Return all runs of the figure whose settings are decided, panel by panel.
-
-        Runs that depend on the result of an incomplete search are left out.
-
-        Args:
-          searched: the store of the searches' runs.
-        """
+        """Return all runs of the figure whose settings are decided, panel by panel."""
         runs: list[Run] = []
         for curves in self.panels.values():
             own = [x.search for x in curves.values() if x.search]

@@ -14,6 +14,7 @@ from experiments.comparisons import (
     Effect,
     bootstrap_p,
     corrected,
+    more,
     verdict,
 )
 from experiments.search import generator
@@ -43,11 +44,7 @@ def steps_until_solved(record: Record, success: float) -> float:
 def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
     """Return the p-value of Fisher's exact test, two-sided.
 
-    Args:
-      ours: number of our seeds that solve the task.
-      our_seeds: number of our seeds.
-      other: number of the other curve's seeds that solve it.
-      other_seeds: number of its seeds.
+    `ours` of our seeds and `other` of the other curve's solve the task.
     """
     solved, seeds = ours + other, our_seeds + other_seeds
 
@@ -130,11 +127,11 @@ def sooner(steps: Steps, panels: Sequence[str], pair: Pair) -> Effect:
         both = [steps[panel, curve] for curve in pair]
         ours, other = map(len, both)
         # Ours is sooner where the other's steps are more: (our seeds, other seeds).
-        wins = _more(both[1][None, :], both[0][:, None]) - 0.5
+        wins = more(both[1][None, :], both[0][:, None]) - 0.5
         middle += float(wins.mean())
         # The sum of the other's ranks says how often its steps are more.
         pooled = np.concatenate(both)
-        ranks = np.tile(_more(pooled[:, None], pooled).sum(axis=1), (_DRAWS, 1))
+        ranks = np.tile(more(pooled[:, None], pooled).sum(axis=1), (_DRAWS, 1))
         sums = rng.permuted(ranks, axis=1)[:, ours:].sum(axis=1)
         dealt += (sums - other**2 / 2) / (ours * other) - 0.5
         first, second = (_resampled(size, rng) for size in (ours, other))
@@ -142,11 +139,6 @@ def sooner(steps: Steps, panels: Sequence[str], pair: Pair) -> Effect:
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
     p_value = (1 + as_far) / (1 + _DRAWS)
     return Effect(middle / len(panels), p_value, drawn / len(panels))
-
-
-def _more(one: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Return 1 where one is more than the other, and one half where they are equal."""
-    return np.add(one > other, one >= other, dtype=np.int8) / 2
 
 
 def _resampled(size: int, rng: np.random.Generator) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import plots, report
+from experiments import report
 from experiments.agents import OWN
 from experiments.curves import name_of
 from experiments.figure_results import Results
@@ -25,12 +25,9 @@ from experiments.search import (
     DELAY,
     PAIR,
     PAPERS,
-    SPARSE,
     TASKS,
     PaperSearch,
-    Search,
     SparseSearch,
-    best_of,
 )
 from experiments.store import RESULTS, Store
 from experiments.tables import changed, markdown_table
@@ -90,13 +87,7 @@ def _ahead(
 
 
 def _on_tasks(words: str, delay: int, share: float) -> Claim:
-    """Return the claim that PPO+GASIL is ahead of the paper's other agents on tasks.
-
-    Args:
-      words: the claim as text.
-      delay: the tasks' reward delay.
-      share: the share of the tasks on which it must be ahead, for the claim to hold.
-    """
+    """Return the claim to be ahead of the paper's other agents on a share of tasks."""
     equal = tuple(x if x == "ppo" else f"{x} (PPO's values)" for x in _OTHERS)
     of = {
         "paper_protocol": _ahead(delay, _OTHERS),
@@ -108,12 +99,7 @@ def _on_tasks(words: str, delay: int, share: float) -> Claim:
 
 
 def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
-    """Expect the first of two curves to be better, in each comparison of a figure.
-
-    Args:
-      name: name of the figure.
-      prefix: only panels whose names begin with it count.
-    """
+    """Expect the first curve to be better, on panels that begin with a prefix."""
     keys = [key for key in FIGURES[name].compared() if key[0].startswith(prefix)]
     return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
 
@@ -268,27 +254,6 @@ def text(pages: Pages, note: str) -> str:
     return report.fill(report.note(note), functools.partial(value, pages))
 
 
-def budgets(store: Store) -> plots.Budgets:
-    """Return what the best of k points returns, by rewards and agent of the paper.
-
-    The unit of a task is what the best of all of PPO's points returns with dense
-    rewards. The values are means over the tasks whose searches are all stored.
-    """
-    budgets: plots.Budgets = {}
-    for (delay, rewards), agent in itertools.product(
-        ((DELAY, "delayed"), (1, "dense")), PAPERS
-    ):
-        curves = []
-        for env in TASKS:
-            unit = best_of(Search(env, "ppo"), store)
-            curve = best_of(Search(env, agent, delay), store)
-            if unit is not None and curve is not None:
-                curves.append(curve / unit[-1])
-        if curves:
-            budgets[rewards, agent] = np.mean(curves, axis=0)
-    return budgets
-
-
 def tuned(pages: Pages) -> str:
     """Return the tuned presets as JSON, updated by what complete searches chose."""
     rows = json.loads(presets.TUNED.read_text())
@@ -333,14 +298,9 @@ def parser() -> Parser:
 
 def run(options: Options) -> None:
     """Write all that is made from stored runs."""
-    store = Store(RESULTS / "runs")
-    pages = all_results(store)
+    pages = all_results(Store(RESULTS / "runs"))
     for name, results in pages.items():
         report.write(name, results, RESULTS)
-    plots.save_png(plots.draw_starts(SPARSE), RESULTS / "sparse_tasks.png")
-    plots.save_png(
-        plots.draw_search_budget(budgets(store)), RESULTS / "search_budget.png"
-    )
     blocks = report.fill_blocks(README.read_text(), functools.partial(value, pages))
     for path, content in (
         *((RESULTS / f"{page}.md", text(pages, page)) for page in SUMMARIES),

@@ -35,11 +35,9 @@ from experiments.search import (
     BEYOND,
     CELLS,
     DELAY,
-    PROTOCOL,
     SEEDS,
     SPACES,
     SPARSE_GRIDS,
-    SPARSE_PROTOCOL,
     SPARSE_ROBOTS,
     TASKS,
     mean_ranks,
@@ -280,11 +278,6 @@ def published(results: Results, rewards: str, *names: str) -> str:
     return markdown_table(columns, rows)
 
 
-def protocol(results: Results) -> str:
-    """Return the text that says how a search chooses its point."""
-    return SPARSE_PROTOCOL if results.figure.solved_from else PROTOCOL
-
-
 def grids(results: Results) -> str:
     """Return a table of the searches' grids and the values beyond them."""
     rows = []
@@ -489,7 +482,7 @@ SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(table, returns, differences, tally, evaluated, better, aggregate, passing),
-        *(published, protocol, grids, searches, ranks),
+        *(published, grids, searches, ranks),
         *(shares, means, lead, sooner, noise),
     )
 }

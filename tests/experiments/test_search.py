@@ -1,7 +1,6 @@
 """The plan of all agents and tasks: alike for every agent, and its holes are told."""
 
 import collections
-import itertools
 
 import numpy as np
 import pytest
@@ -163,25 +162,3 @@ def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
     fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
     assert one.chosen(store) == {"learning_rate": 5e-5}
     assert not store.missing(one.requested(store)) and raw.chosen(store) is None
-
-
-def test_the_best_of_k_points_is_chosen_by_one_seed_and_measured_with_the_other(
-    tmp_path,
-):
-    """Against all subsets of points."""
-    store, one = Store(tmp_path), Search("hopper", "ppo", 20)
-    assert search.best_of(one, store) is None
-    points, rng = search.draw("ppo"), np.random.default_rng(0)
-    scores = rng.permuted(np.tile(np.arange(12.0), (2, 1)), axis=1)
-    for seed, of_seed in zip((1000, 1001), scores, strict=True):
-        fill(store, one, points, of_seed, [seed])
-    expected = []
-    for k in range(1, 13):
-        subsets = list(itertools.combinations(range(12), k))
-        both = [
-            other[max(subset, key=chosen.__getitem__)]
-            for subset in subsets
-            for chosen, other in (scores, scores[::-1])
-        ]
-        expected.append(np.mean(both))
-    np.testing.assert_allclose(search.best_of(one, store), expected)
