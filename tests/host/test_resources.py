@@ -21,9 +21,7 @@ from gasil_jax.host.members import make_members
             marks=pytest.mark.compiled_as_for_users,
         ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
-        pytest.param(
-            "ppo+sil", {"sil_minibatch_size": 50_000}, marks=pytest.mark.slow
-        ),
+        pytest.param("ppo+sil", {"sil_minibatch_size": 50_000}, marks=pytest.mark.slow),
         pytest.param(
             *("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
             marks=pytest.mark.slow,
