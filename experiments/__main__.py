@@ -6,63 +6,78 @@ Without a name it lists the figures and the other commands.
 import dataclasses
 import pathlib
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any
+from collections.abc import Mapping, Sequence
+from types import ModuleType
+from typing import Any
 
-import tyro
-
-from experiments import (
-    benchmark,
-    engine,
-    point_mass_layouts,
-    point_mass_moments,
-    profile,
-    roofline,
-    store,
-    two_doors,
-    zoo,
-)
+from experiments import benchmark, engine, profile, report, summary, zoo
 from experiments.curves import Curve, Figure
+from experiments.engine import Setup
+from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.report import Page
+from experiments.options import Options, Parser, at_least, shard
 from experiments.search import PaperSearch
-from experiments.store import RESULTS, ResultsFolder, Store
-from experiments.summary import Summary
+from experiments.store import RESULTS, Store
+from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import command_line
-from gasil_jax.sweeps import shards
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
+
+#: Commands other than figures: each module has a `parser` and a `run`.
+COMMANDS: Mapping[str, ModuleType] = {
+    "report": summary,
+    "benchmark": benchmark,
+    "profile": profile,
+    "zoo": zoo,
+}
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Train the runs that a figure lacks, then write its page.
-
-    In the default folder all else that is made from stored runs is written too: the
-    other pages, the README's tables and the tuned presets.
-
-    Attributes:
-      quick: train a small version below the folder `runs`: three seeds of the first
-        panel, or of those that `only` names, for 100,000 steps each.
-      list: only print the missing runs.
-      only: panels and searches to train; default all. A panel without its searches
-        trains only what complete searches chose.
-      shard: train only this part of the runs, NUMBER/COUNT with numbers from 1 on.
-        Other processes or machines train the others, and `merge` adds another
-        machine's results.
-      results: folder of the pages and, below runs/, of the stored runs. Runs that are
-        stored there are not trained again.
-      setup: how runs are trained.
-    """
-
-    quick: bool = False
-    list: bool = False
-    only: tuple[str, ...] = ()
-    shard: str = "1/1"
-    results: ResultsFolder = RESULTS
-    setup: Annotated[engine.Setup, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=engine.Setup
+def _parser(name: str) -> Parser:
+    """Return the reader of a figure's options."""
+    parser = Parser(name, "Train the runs that a figure lacks, then write its page.")
+    add = parser.add_argument
+    add(
+        "--quick",
+        action="store_true",
+        help="train a small version below the folder of --runs: three seeds of the "
+        "first panel, or of those of --only, for 100,000 steps each",
     )
+    add("--list", action="store_true", help="only print the missing runs")
+    add(
+        "--only",
+        nargs="+",
+        default=(),
+        help="panels and searches to train, instead of all. A panel without its "
+        "searches trains only what complete searches chose",
+    )
+    add(
+        "--shard",
+        type=shard,
+        default="1/1",
+        help="train only this part of the runs, as NUMBER/COUNT",
+    )
+    parser.add_results("folder of the pages and, below runs/, of the stored runs")
+    add("--runs", type=pathlib.Path, help="scratch folder of the training in progress")
+    add("--resume", action="store_true", help="continue interrupted training")
+    add(
+        "--physics",
+        choices=("jax", "mjx", "mujoco"),
+        help="physics engine of locomotion",
+    )
+    add("--devices", type=at_least(1), help="CPU devices, instead of one per core")
+    add(
+        "--evaluate-episodes",
+        type=at_least(0),
+        help="episodes of each of ten evaluations; runs of a search have none",
+    )
+    add(
+        "--processes",
+        type=at_least(1),
+        help="programs that are trained at once, each in a process on one core",
+    )
+    add("--members", type=at_least(1), help="largest number of runs in a program")
+    add("--commit", help="commit of the code, where there is no repository")
+    parser.set_defaults(**{x.name: x.default for x in dataclasses.fields(Setup)})
+    return parser
 
 
 def _selected(figure: Figure, names: Sequence[str]) -> Figure:
@@ -116,17 +131,16 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 
 def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then write its page."""
-    setup, results, figure = options.setup, options.results, FIGURES[name]
-    shard = shards.parse(options.shard)
-    command_line.check_minimum(
-        setup, devices=1, evaluate_episodes=0, processes=1, members=1
+    setup = Setup(
+        **{x.name: getattr(options, x.name) for x in dataclasses.fields(Setup)}
     )
-    published = results.resolve() == RESULTS.resolve()
-    if options.quick and not published:
-        raise InputError(
-            f"results is {results}: --quick writes below --runs instead, leave it out"
-        )
+    results, figure = options.results, FIGURES[name]
     if options.quick:
+        if results.resolve() != RESULTS.resolve():
+            raise InputError(
+                f"results is {results}: --quick writes below --runs instead, leave it "
+                "out"
+            )
         setup = dataclasses.replace(setup, runs=setup.runs / "quick")
         results, figure = setup.runs / "results", _small(figure, options.only)
     chosen = figure if options.quick else _selected(figure, options.only)
@@ -142,7 +156,7 @@ def _train(name: str, options: Options) -> None:
         """Return the store of the figure's runs, and the runs that it lacks."""
         stored, searched = stores()
         requested = chosen.requested(searched)
-        return stored, stored.missing(engine.select_by_key(requested, *shard))
+        return stored, stored.missing(engine.select_by_key(requested, *options.shard))
 
     while True:
         stored, missing = lacking()
@@ -158,113 +172,24 @@ def _train(name: str, options: Options) -> None:
         for each in engine.unfinished(missing, setup):
             print(f"  {engine.title(each)}")
         return
-    if published and not options.quick:
-        # Other pages may have some of the same runs.
-        _write_all_pages()
-    else:
-        Page(name, *stores(), figure if options.quick else None).write(results)
+    text = "{{table}}" if options.quick else None
+    report.write(name, Results(figure, *stores()), results, text)
     print(f"in {results / name}.md")
 
 
-@dataclasses.dataclass(frozen=True)
-class MergeOptions:
-    """Add the runs of another machine's results to the stored ones.
-
-    Attributes:
-      folder: folder of the other machine's results.
-      results: folder of the results to add them to.
-    """
-
-    folder: Annotated[pathlib.Path, tyro.conf.Positional]
-    results: ResultsFolder = RESULTS
-
-
-def _merge(options: MergeOptions) -> None:
-    new, total = store.merge(options.folder, Store(options.results / "runs"))
-    print(f"{new} of {total} runs are new, in {options.results / 'runs'}")
-
-
-@dataclasses.dataclass(frozen=True)
-class CoverageOptions:
-    """Print how much of the plan of all agents and tasks is stored.
-
-    Points beyond the grid and the further seeds of the best points are only planned
-    once they are known, and an incomplete search has no final runs yet. The exit status
-    is 1 while runs are missing.
-
-    Attributes:
-      results: folder of the results that are counted.
-    """
-
-    results: ResultsFolder = RESULTS
-
-
-def _coverage(options: CoverageOptions) -> int:
-    store, complete = Store(options.results / "runs"), True
-    for name in ("matrix", "paper_protocol"):
-        print(f"{name:22} agent                   search    seeds")
-        for panel, label, curve in FIGURES[name].curves():
-            cells = []
-            requested = curve.search.requested(store) if curve.search else []
-            for runs, planned in (
-                (requested, len(requested)),
-                (curve.runs(store), curve.seeds),
-            ):
-                stored = sum(run in store for run in runs)
-                complete &= stored == planned
-                cells.append(f"{stored} of {planned}")
-            print(f"{panel:22} {label:20} {cells[0]:>9} {cells[1]:>8}")
-    return int(not complete)
-
-
-@dataclasses.dataclass(frozen=True)
-class ReportOptions:
-    """Write all pages, plots and presets, and the README's tables, from stored runs."""
-
-
-def _write_all_pages() -> None:
-    summary = Summary(Store(RESULTS / "runs"))
-    for page in summary.pages.values():
-        page.write(RESULTS)
-    summary.write()
-
-
-def _report(options: ReportOptions) -> None:
-    _write_all_pages()
-    print(f"in {RESULTS}")
-
-
-#: Commands other than figures, by name: the class of their options, and a function.
-COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
-    "report": (ReportOptions, _report),
-    "coverage": (CoverageOptions, _coverage),
-    "merge": (MergeOptions, _merge),
-    "benchmark": (benchmark.Options, benchmark.run),
-    "profile": (profile.Options, profile.run),
-    "roofline": (roofline.Options, roofline.run),
-    "zoo": (zoo.Options, zoo.run),
-    "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
-    "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
-    "two_doors": (two_doors.Options, two_doors.run),
-}
-
-
-@command_line.reports_errors
+@reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print("python -m experiments NAME (--help for its options)\n")
-        titles = {listed: figure.title for listed, figure in FIGURES.items()}
-        for command, (options, _) in COMMANDS.items():
-            titles[command] = options.__doc__.splitlines()[0].removesuffix(".")
-        for listed, title in titles.items():
-            print(f"  {listed:20} {title}")
+        about = {x: str(one.parser().description) for x, one in COMMANDS.items()}
+        for listed, title in ({x: y.title for x, y in FIGURES.items()} | about).items():
+            print(f"  {listed:20} {title.removesuffix('.')}")
     elif name in FIGURES:
-        _train(name, command_line.parse(Options, rest, f"experiments {name}"))
+        _train(name, _parser(name).parse_args(rest))
     elif name in COMMANDS:
-        options, function = COMMANDS[name]
-        return function(command_line.parse(options, rest, f"experiments {name}")) or 0
+        COMMANDS[name].run(COMMANDS[name].parser().parse_args(rest))
     else:
         raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
     return 0

@@ -35,16 +35,18 @@ from jax.sharding import PartitionSpec as P
 import gasil_envs
 from experiments import measured, peers
 from experiments.comparisons import interval
+from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
-from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, metrics_files
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.cli.parsing import input_checked
+from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
 
 VARIANTS = {
-    "mjx": {"solver": "mjx"},
+    "mjx": {"physics": "mjx"},
     "ours": {},
     "mujoco": {"physics": "mujoco"},
     "ours-euler": {"integrator": "euler"},
@@ -55,34 +57,29 @@ _NUM_STEPS, _BASELINE_STEPS = 20, 3 * 2048
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Measure the speed and fidelity of physics and training.
-
-    Attributes:
-      tables: tables to print: physics, training, scaling, peers.
-      envs: names of the tasks; the table peers has its own.
-      variants: ways of building a task; default all in the physics table, and ours and
-        mujoco in the training table.
-      num_envs: numbers of environments in the physics table.
-      repeats: number of times that each row is timed.
-      devices: number of CPU devices; default one per core.
-      seeds: number of seeds to train; in the scaling table on each device.
-      training_envs: number of environments per seed; default the paper preset's.
-      iterations: training iterations in a repeat; in the table peers, of each training.
-      page: write the tables into docs/performance.md too, below the same command.
-    """
-
-    tables: tuple[str, ...] = ("physics", "training")
-    envs: tuple[str, ...] = ("walker2d",)
-    variants: tuple[str, ...] = ()
-    num_envs: tuple[int, ...] = (64,)
-    repeats: int = 5
-    devices: int | None = None
-    seeds: int = 10
-    training_envs: int | None = None
-    iterations: int = 2
-    page: bool = False
+def parser() -> Parser:
+    """Return the reader of the command's options."""
+    about = "Measure the speed and fidelity of physics and training."
+    parser, whole = Parser("benchmark", about), at_least(1)
+    add = parser.add_argument
+    for name, choices, default, words in (
+        ("tables", TABLES, ["physics", "training"], "tables to print"),
+        ("envs", TASKS, ["walker2d"], "tasks; the table peers has its own"),
+        ("variants", VARIANTS, [], "ways of building a task, instead of the table's"),
+    ):
+        add(f"--{name}", nargs="+", choices=choices, default=default, help=words)
+    words = "numbers of environments in the physics table"
+    add("--num-envs", type=whole, nargs="+", default=[64], help=words)
+    for name, number, words in (
+        ("repeats", 5, "times that each row is timed"),
+        ("devices", None, "CPU devices, instead of one per core"),
+        ("seeds", 10, "seeds to train; in the scaling table on each device"),
+        ("training-envs", None, "environments per seed, instead of the preset's"),
+        ("iterations", 2, "iterations in a repeat; of each training in table peers"),
+    ):
+        add(f"--{name}", type=whole, default=number, help=words)
+    parser.add_page()
+    return parser
 
 
 @dataclasses.dataclass
@@ -97,7 +94,6 @@ class Row:
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
       returns: what trained policies return, (seeds,); None if it is not measured.
-      states: of physics, the environments after some steps, from which it is timed.
       speed: steps per second, the median of the repeats, once it is measured.
     """
 
@@ -108,13 +104,12 @@ class Row:
     compile_seconds: float = 0.0
     error: float | None = None
     returns: np.ndarray | None = None
-    states: Any = None
     speed: float = 0.0
 
 
-def start_jax(num_devices: int, solver: str = "small") -> None:
+def start_jax(num_devices: int, physics: str = "mujoco") -> None:
     """Choose CPU devices and precision as commands do; call it before JAX starts."""
-    prepare(Settings(physics="mujoco", solver=solver), num_devices)
+    prepare(Settings(physics=physics), num_devices)
     jax.config.update("jax_num_cpu_devices", num_devices)
     jax.config.update("jax_default_matmul_precision", "highest")
 
@@ -133,10 +128,8 @@ def random_step(env: Any, states: Any, key: jax.Array) -> Any:
 
 
 def _random_steps(env: Any, states: Any, key: jax.Array) -> Any:
-    def step(states: Any, key: Any) -> Any:
-        return (random_step(env, states, key), None)
-
-    return jax.lax.scan(step, states, jax.random.split(key, _NUM_STEPS))[0]
+    keys = jax.random.split(key, _NUM_STEPS)
+    return jax.lax.scan(lambda x, k: (random_step(env, x, k), None), states, keys)[0]
 
 
 def _keys(number: int, count: int) -> jax.Array:
@@ -156,7 +149,7 @@ def _serve(pipe: Any, flags: str, num_devices: int, build: Callable[[], Row]) ->
     start_jax(num_devices, "mjx")
     row = build()
     # A compiled program cannot be sent.
-    pipe.send(dataclasses.replace(row, run=float, states=None))
+    pipe.send(dataclasses.replace(row, run=float))
     with contextlib.suppress(EOFError):
         while pipe.recv():
             pipe.send(row.run())
@@ -182,32 +175,36 @@ def _row(variant: str, build: Callable[[], Row]) -> Row:
     return dataclasses.replace(pipe.recv(), run=run)
 
 
+def _rollout_row(
+    env: str, name: str, num_envs: int, rollout: Any, *, states: Any, keys: int
+) -> Row:
+    """Return a row of a compiled rollout, (states, keys) -> states."""
+    began = time.perf_counter()
+    advance = rollout.lower(states, _keys(0, keys)).compile()
+    # Timed after some steps, when most bodies lie on the ground, as they do later. Warp
+    # compiles its kernels at the first call.
+    states = jax.block_until_ready(advance(states, _keys(0, keys)))
+    seconds, again = time.perf_counter() - began, _keys(1, keys)
+    steps = num_envs * _NUM_STEPS
+    run = functools.partial(speed_of, lambda: advance(states, again), steps)
+    return Row(env, name, num_envs, run, seconds)
+
+
 def physics_row(env_name: str, variant: str, num_envs: int) -> Row:
     """Random actions in environments that are spread over the devices."""
     env = make(env_name, variant)
     count = max(n for n in range(1, len(jax.devices()) + 1) if num_envs % n == 0)
-    mesh, spec = Mesh(np.array(jax.devices()[:count]), ("envs",)), P("envs")
-
-    def shard(function: Any) -> Any:
-        return jax.jit(
-            jax.shard_map(
-                function, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False
-            )
-        )
-
-    states = shard(jax.vmap(env.reset))(_keys(0, num_envs))
-    rollout = shard(lambda x: (_random_steps(env, x[0], x[1][0]), x[1]))
-    began = time.perf_counter()
-    advance = rollout.lower((states, _keys(0, count))).compile()
-    compile_seconds = time.perf_counter() - began
-    # Timed after some steps, when most bodies lie on the ground, as they do later.
-    states, _ = jax.block_until_ready(advance((states, _keys(0, count))))
-
-    def rollouts() -> Any:
-        return advance((states, _keys(1, count)))
-
-    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
-    return Row(env_name, variant, num_envs, run, compile_seconds, states=states)
+    mesh = Mesh(np.array(jax.devices()[:count]), ("envs",))
+    shard = functools.partial(
+        jax.shard_map,
+        mesh=mesh,
+        in_specs=P("envs"),
+        out_specs=P("envs"),
+        check_vma=False,
+    )
+    states = jax.jit(shard(jax.vmap(env.reset)))(_keys(0, num_envs))
+    rollout = jax.jit(shard(lambda states, keys: _random_steps(env, states, keys[0])))
+    return _rollout_row(env_name, variant, num_envs, rollout, states=states, keys=count)
 
 
 def warp_row(env_name: str, num_envs: int) -> Row:
@@ -234,17 +231,9 @@ def warp_row(env_name: str, num_envs: int) -> Row:
 
     rollout = jax.jit(lambda data, keys: jax.lax.scan(random_step, data, keys)[0])
     states = jax.vmap(start)(_keys(0, num_envs))
-    began = time.perf_counter()
-    advance = rollout.lower(states, _keys(0, _NUM_STEPS)).compile()
-    states = jax.block_until_ready(advance(states, _keys(0, _NUM_STEPS)))
-    # Warp compiles its kernels at the first call.
-    compile_seconds = time.perf_counter() - began
-
-    def rollouts() -> Any:
-        return advance(states, _keys(1, _NUM_STEPS))
-
-    run = functools.partial(speed_of, rollouts, num_envs * _NUM_STEPS)
-    return Row(env_name, "warp", num_envs, run, compile_seconds)
+    return _rollout_row(
+        env_name, "warp", num_envs, rollout, states=states, keys=_NUM_STEPS
+    )
 
 
 def one_step_error(env_name: str, variant: str) -> float:
@@ -279,22 +268,23 @@ def physics_table(env_name: str, options: Options) -> Iterator[list[Row]]:
         yield rows
 
 
+def _algorithm(env_name: str, options: Options) -> Algorithm:
+    algorithm = presets.preset(env_name, "ppo+gasil", "paper")
+    num_envs = options.training_envs or algorithm.config.num_envs
+    # As many iterations in a call as the command line does at most.
+    total_steps = 50 * options.iterations * algorithm.config.batch_steps
+    return algorithm.replace(num_envs=num_envs, total_steps=total_steps)
+
+
 def training_row(
     env_name: str, variant: str, options: Options, *, devices: int, seeds: int
 ) -> Row:
     """PPO+GASIL with the paper's preset."""
     env = gasil_envs.make(env_name, **VARIANTS[variant])
-    algorithm = presets.preset(env_name, "ppo+gasil", "paper")
-    num_envs = options.training_envs or algorithm.config.num_envs
-    batch_steps = algorithm.config.batch_steps
-    # As many iterations in a call as the command line does at most.
-    algorithm = algorithm.replace(
-        num_envs=num_envs, total_steps=50 * options.iterations * batch_steps
-    )
-    with command_line.input_checked():
-        batch = make_members(
-            env, algorithm, range(seeds), devices=jax.devices()[:devices]
-        )
+    algorithm, used = _algorithm(env_name, options), jax.devices()[:devices]
+    num_envs, batch_steps = algorithm.config.num_envs, algorithm.config.batch_steps
+    with input_checked():
+        batch = make_members(env, algorithm, range(seeds), devices=used)
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began
@@ -337,13 +327,9 @@ def _train_baseline(
 def baseline_row(
     env_name: str, runs: int, num_envs: int, *, spread: bool = False
 ) -> Row:
-    """Stable-Baselines3's PPO.
+    """Stable-Baselines3's PPO: `runs` at once, each of `num_envs` environments.
 
-    Args:
-      env_name: name of the task.
-      runs: number of runs that train at once.
-      num_envs: number of environments of a run.
-      spread: whether each environment has its own process; otherwise a run is one.
+    If they are spread, each environment has its own process; otherwise a run is one.
     """
     task = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
     context = multiprocessing.get_context("spawn")
@@ -381,9 +367,8 @@ def baseline_row(
 
 def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     """Training beside physics alone and Stable-Baselines3."""
-    config = presets.preset(env_name, "ppo+gasil", "paper").config
-    num_envs = options.seeds * (options.training_envs or config.num_envs)
-    rows, devices = [], len(jax.devices())
+    num_envs = options.seeds * _algorithm(env_name, options).config.num_envs
+    rows, sizes = [], {"devices": len(jax.devices()), "seeds": options.seeds}
     if importlib.util.find_spec("stable_baselines3"):
         for runs in sorted({1, available_cores()}):
             rows += [baseline_row(env_name, runs, n) for n in (1, 8)]
@@ -392,15 +377,8 @@ def training_table(env_name: str, options: Options) -> Iterator[list[Row]]:
         physics = functools.partial(physics_row, env_name, variant, num_envs)
         row = _row(variant, physics)
         rows.append(dataclasses.replace(row, name=f"physics alone, {variant}"))
-        training = functools.partial(
-            training_row,
-            env_name,
-            variant,
-            options,
-            devices=devices,
-            seeds=options.seeds,
-        )
-        rows.append(_row(variant, training))
+        train = functools.partial(training_row, env_name, variant, options, **sizes)
+        rows.append(_row(variant, train))
     yield rows
 
 
@@ -480,23 +458,12 @@ TABLES = {
 
 def run(options: Options) -> None:
     """Print the tables."""
-    for name, allowed in (("tables", TABLES), ("envs", TASKS), ("variants", VARIANTS)):
-        if others := set(getattr(options, name)) - set(allowed):
-            raise InputError(
-                f"{name} has {min(others)!r}: allowed {', '.join(allowed)}"
-            )
-    if (fewest := min(options.num_envs, default=0)) < 1:
-        raise InputError(f"num_envs is {fewest}: it must be 1 or more")
-    command_line.check_minimum(
-        options, repeats=1, seeds=1, iterations=1, devices=1, training_envs=1
-    )
     if "peers" in options.tables:
         peers.check()
-    if options.page:
-        measured.find("benchmark", options)
+    page = measured.find(parser(), options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
-    versions = metrics_files.versions()
+    versions = driver.versions()
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     every: list[Row] = []
     for table in options.tables:
@@ -507,5 +474,5 @@ def run(options: Options) -> None:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)
                 every += rows
-    if options.page:
-        measured.write("benchmark", options, *for_page(every))
+    if page:
+        measured.write(page, *for_page(every))

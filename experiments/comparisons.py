@@ -29,53 +29,43 @@ Scores = Mapping[tuple[str, str], np.ndarray]
 
 
 class Effect(NamedTuple):
-    """A difference before its p-value is corrected.
-
-    Attributes:
-      middle: the difference.
-      p: its p-value.
-      drawn: bootstrap samples of it, (draws,).
-    """
+    """A difference, its p-value before correction, and bootstrap samples, (draws,)."""
 
     middle: float
     p: float
     drawn: np.ndarray
 
 
+def verdict(middle: float, p: float) -> str:
+    """Return whether a difference with a corrected p-value is better or worse."""
+    if not p <= LEVEL:
+        return "not clear"
+    return "better" if middle > 0 else "worse"
+
+
 @dataclasses.dataclass(frozen=True)
-class Difference:
-    """A difference of two curves.
+class Comparison:
+    """A difference of curves with its interval, which is its text: f"{comparison:.2f}".
 
     Attributes:
       middle: the difference.
       p: its p-value, corrected by Holm's method.
-    """
-
-    middle: float
-    p: float
-
-    @property
-    def verdict(self) -> str:
-        """Better, worse or not clear."""
-        if not self.p <= LEVEL:
-            return "not clear"
-        return "better" if self.middle > 0 else "worse"
-
-
-@dataclasses.dataclass(frozen=True)
-class Comparison(Difference):
-    """A difference with its interval, which is its text: f"{comparison:.2f}".
-
-    Attributes:
       low: the low end of its 95% interval.
       high: the high end.
       visible: the smallest true difference that would be found with a probability of
         80%, at the level of the family's smallest p-value.
     """
 
+    middle: float
+    p: float
     low: float
     high: float
     visible: float
+
+    @property
+    def verdict(self) -> str:
+        """Better, worse or not clear."""
+        return verdict(self.middle, self.p)
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
@@ -87,13 +77,13 @@ class Comparison(Difference):
         return f"not clear (visible from {number(self.visible, spec)} on)"
 
 
-def judged(effects: Mapping[Any, Effect]) -> dict[Any, Comparison]:
-    """Return the comparisons of a family of tests."""
-    p_values = corrected({key: effect.p for key, effect in effects.items()})
+def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Comparison]:
+    """Return the comparisons of a family of tests, of which some may be dropped."""
+    p_values = corrected({key: effect.p for key, effect in effects.items()}, dropped)
     compared = {}
     for key, (middle, _, drawn) in effects.items():
         low, high = map(float, np.percentile(drawn, [2.5, 97.5]))
-        visible = visible_effect(drawn, len(effects))
+        visible = visible_effect(drawn, len(effects) + dropped)
         compared[key] = Comparison(middle, p_values[key], low, high, visible)
     return compared
 
@@ -132,7 +122,9 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     return float((1 + as_far.sum()) / (1 + _DRAWS))
 
 
-def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Comparison]:
+def compare(
+    scores: Scores, family: Comparisons, dropped: int = 0
+) -> dict[tuple[str, ...], Comparison]:
     """Return the comparisons of a family whose curves all have scores.
 
     The p-value is the percentile bootstrap's: twice the share of draws on the other
@@ -157,7 +149,7 @@ def compare(scores: Scores, family: Comparisons) -> dict[tuple[str, ...], Compar
         if enough and len(sides) == 2:
             p_value = max(p_value, permutation_p(*sides))
         effects[key] = Effect(middle, p_value, drawn)
-    return judged(effects)
+    return judged(effects, dropped)
 
 
 def bootstrap_p(drawn: np.ndarray) -> float:
@@ -169,38 +161,33 @@ def bootstrap_p(drawn: np.ndarray) -> float:
 def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
     """Return the smallest true effect that would be found with a probability of 80%.
 
-    Args:
-      drawn: bootstrap samples of the effect, (draws,).
-      comparisons: n, the number of comparisons in the family. The level of the test is
-        `LEVEL` / n, as in Holm's method for the smallest p-value.
+    The level of the test is `LEVEL` / `comparisons`, as for Holm's smallest p-value.
     """
     quantile = statistics.NormalDist().inv_cdf
     errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
     return errors * float(np.std(drawn))
 
 
-def corrected(p_values: Mapping[Any, float]) -> dict[Any, float]:
-    """Return the p-values of a family, corrected by Holm's method."""
+def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
+    """Return the p-values of a family, corrected by Holm's method.
+
+    Those that are dropped, because their runs are, count as if they were the largest.
+    """
     higher, least = {}, 0.0
     for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
-        least = max(least, min(1.0, p_values[key] * (len(p_values) - i)))
+        least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
         higher[key] = least
     return {key: higher[key] for key in p_values}
 
 
+def more(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    """Return 1 where one is more than the other, and one half where they are equal."""
+    return np.add(one > other, one >= other, dtype=np.int8) / 2
+
+
 def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the share of pairs of seeds in which ours is more; equal ones count half.
-
-    Args:
-      ours: our seeds, (..., seeds).
-      others: the other seeds, (..., other seeds).
-
-    Returns:
-      The shares, (...).
-    """
-    one, two = ours[..., :, None], others[..., None, :]
-    points = np.add(one > two, one >= two, dtype=np.int8)
-    return points.mean(axis=(-1, -2)) / 2
+    """Return the share of pairs of seeds in which ours is more, from (..., seeds)."""
+    return more(ours[..., :, None], others[..., None, :]).mean(axis=(-1, -2))
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:
@@ -254,12 +241,9 @@ def interval(scores: np.ndarray) -> str:
 def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
     """Return the interquartile mean over the seeds of all tasks, as text.
 
-    Every task has the same weight. The 95% interval is the percentile bootstrap's over
-    seeds, drawn within each task.
-
-    Args:
-      name: seeds the random numbers of the bootstrap.
-      scores: the scores of each task, (seeds,), in one unit.
+    Every task has the same weight; its scores are (seeds,), in one unit. The 95%
+    interval is the percentile bootstrap's over seeds, drawn within each task; `name`
+    seeds its random numbers.
     """
     most = math.lcm(*map(len, scores))
     rng = generator(name)

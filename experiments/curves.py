@@ -6,13 +6,13 @@ import types
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from experiments.agents import AGENTS
 from experiments.search import DELAY, PAPERS, Point, Search
 from experiments.store import Store
 from gasil_jax import presets
-from gasil_jax.agents import AGENTS
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.
 Terms = tuple[tuple[float, str, str], ...]
@@ -84,7 +84,10 @@ class Curve:
             algorithm = self.search.algorithm({})
         elif isinstance(self.base, str):
             algorithm = presets.preset(
-                self.env, self.agent, self.base, reward_delay=self.reward_delay
+                self.env,
+                AGENTS[self.agent],
+                self.base,
+                reward_delay=self.reward_delay,
             )
         algorithm = algorithm.replace(**{"total_steps": self.total_steps, **point})
         settings = Settings(reward_delay=self.reward_delay, **self.settings)
@@ -112,6 +115,8 @@ class Figure:
         field's value are points of one line.
       early: number of first environment steps whose mean return is compared too, as the
         curve "NAME early".
+      dropped_pairs: number of pairs of curves that were compared in every panel and are
+        not in the figure any more; verdicts are still corrected for them.
       solved_from: (task) -> the return of a success. If it is given, what counts is the
         share of seeds that solve the task (see `shares`), not their returns.
     """
@@ -124,6 +129,7 @@ class Figure:
     searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
     over: tuple[str, str] | None = None
     early: int | None = None
+    dropped_pairs: int = 0
     solved_from: Callable[[str], float] | None = None
 
     def curves(self) -> list[tuple[str, str, Curve]]:
@@ -185,13 +191,7 @@ class Figure:
         return list(families.values())
 
     def requested(self, searched: Store) -> list[Run]:
-        """Return all runs of the figure whose settings are decided, panel by panel.
-
-        Runs that depend on the result of an incomplete search are left out.
-
-        Args:
-          searched: the store of the searches' runs.
-        """
+        """Return all runs of the figure whose settings are decided, panel by panel."""
         runs: list[Run] = []
         for curves in self.panels.values():
             own = [x.search for x in curves.values() if x.search]

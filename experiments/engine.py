@@ -9,16 +9,14 @@ import dataclasses
 import functools
 import json
 import math
-import multiprocessing.connection
+import multiprocessing
 import os
 import pathlib
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from multiprocessing import resource_tracker
-from multiprocessing.context import SpawnProcess
+from multiprocessing import connection
 from typing import Any
 
 import jax
@@ -26,11 +24,12 @@ import numpy as np
 
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Store
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host import interruption, metrics_files, run_folder, run_options
-from gasil_jax.sweeps import assembly, programs
-from gasil_jax.sweeps.programs import Program
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host import driver, folders, interruption, json_files, programs, training
+from gasil_jax.host.programs import Program
+from gasil_jax.host.runs import Run
+from gasil_jax.host.sweep import Recording, Sweep
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -52,28 +51,34 @@ class Setup:
 
     Attributes:
       runs: scratch folder of the training in progress.
-      resume: continue interrupted training in the scratch folder, which is otherwise
-        refused. Runs that the results hold are never trained again, with or without it.
-      physics: physics engine of locomotion: mjx or mujoco.
-      devices: number of CPU devices to shard members over; default one per core. All
-        visible GPUs are used in any case.
-      evaluate_episodes: episodes of each of the ten evaluations during training; 0
-        for no evaluations. Runs of a search are not evaluated.
-      processes: number of programs that are trained at once, each by a process of its
-        own on one core. Where each run has few environments this is the fastest way.
-        With 1 the program's runs are sharded over `devices`.
+      resume: whether interrupted training in it is continued; otherwise it is refused.
+      physics: physics engine of locomotion, jax, mjx or mujoco.
+      devices: number of CPU devices to shard members over; default one per core.
+      evaluate_episodes: episodes of each evaluation during training; 0 for none. Runs
+        of a search are not evaluated.
+      processes: number of programs that are trained at once, each by a process on one
+        core, which is fastest where each run has few environments. With 1 the program's
+        runs are sharded over `devices`.
       members: largest number of runs in a program; default no limit.
       commit: commit of the code, to be recorded if there is no repository.
     """
 
     runs: pathlib.Path = pathlib.Path("runs", "experiments")
     resume: bool = False
-    physics: str = "mjx"
+    physics: str = "jax"
     devices: int | None = None
     evaluate_episodes: int = 10
     processes: int = 1
     members: int | None = None
     commit: str | None = None
+
+    @property
+    def scratch(self) -> pathlib.Path:
+        """The folder of the programs in training.
+
+        Physics and evaluations are not in a run's key, but its tables depend on them.
+        """
+        return self.runs / f"{self.physics}-{self.evaluate_episodes}"
 
 
 @functools.cache
@@ -111,31 +116,23 @@ def title(program: Program) -> str:
     return ", ".join(words)
 
 
-def _scratch(setup: Setup) -> pathlib.Path:
-    """Return the folder of the programs in training.
-
-    Physics and evaluations are not in a run's key, but checkpoints and tables depend on
-    them.
-    """
-    return setup.runs / f"{setup.physics}-{setup.evaluate_episodes}"
+def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
+    """Return the runs of one of `count` shards, whichever other runs are missing."""
+    return [x for x in runs if int(x.key, 16) % count == number - 1]
 
 
 def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     """Return the programs to train: those that have begun, then the most important.
 
     The first of the missing runs is the most important one.
-
-    Raises:
-      InputError: if a program.json in the scratch folder is damaged.
     """
-    rank, scratch = {run: rank for rank, run in enumerate(missing)}, _scratch(setup)
+    rank = {run: rank for rank, run in enumerate(missing)}
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
-    begun, others = programs.unfinished(ordered, programs.read(scratch))
-    # Runs of a search are not evaluated.
+    begun, others = programs.unfinished(ordered, programs.read(setup.scratch, ordered))
     groups = programs.group(others, setup.members, lambda x: x.seed in FINALIST_SEEDS)
     new = [
-        x.below(scratch, {"member": range(len(x.runs)), "seed": x.seeds})
+        x.below(setup.scratch, {"member": range(len(x.runs)), "seed": x.seeds})
         for x in groups
     ]
     for each in (begun, new):
@@ -143,23 +140,8 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     return [*begun, *new]
 
 
-def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
-    """Return the runs of one of `count` shards, the same on each machine.
-
-    A run's shard depends on its key alone, not on which other runs are missing.
-    """
-    return [x for x in runs if int(x.key, 16) % count == number - 1]
-
-
-def train(
-    stored: Program, setup: Setup, on_restored: Callable[[], None] = lambda: None
-) -> dict[Run, Record]:
+def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     """Train a program, or continue its training, and return its runs' records.
-
-    Args:
-      stored: the program.
-      setup: how it is trained.
-      on_restored: called once a signal is answered by saving.
 
     Raises:
       InputError: if it does not fit into memory or on the disk, or if another process
@@ -170,22 +152,27 @@ def train(
     of_search = run.seed in FINALIST_SEEDS
     episodes = None if of_search else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
-    options = run_options.Options(
-        env=run.env,
-        out=stored.path,
+    recording = Recording(
         keep_checkpoints=1,
         evaluate_every=episodes and math.ceil(total_steps / EVALUATIONS),
-        evaluate_episodes=episodes,
-        devices=setup.devices,
-        settings=dataclasses.replace(run.settings, physics=setup.physics),
-        **run_options.algorithm_options(run.algorithm),
+        evaluate_episodes=episodes or Recording.evaluate_episodes,
     )
-    env = assembly.prepare(options, [stored])
+    settings = dataclasses.replace(run.settings, physics=setup.physics)
+    sweep = Sweep(
+        run.env, run.algorithm, (run.seed,), settings=settings, recording=recording
+    )
+    with input_checked():
+        env = training.prepare(sweep, [stored], stored.path, num_devices=setup.devices)
     _add_session(stored, setup)
-    with interruption.noted(_HOW_TO_CONTINUE):
-        assembly.train(
-            options, env, [stored], title=title(stored), on_restored=on_restored
+    with (
+        interruption.noted(_HOW_TO_CONTINUE),
+        interruption.Interruption() as received,
+    ):
+        (outcome,) = training.train_programs(
+            env, [stored], recording, title=title(stored), interruption=received
         )
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
     return records(stored)
 
 
@@ -195,24 +182,29 @@ def records(stored: Program) -> dict[Run, Record]:
     return {run: record(*own, provenance) for run, own in every}
 
 
+def _sessions(stored: Program) -> list[dict[str, Any]]:
+    path = stored.path / _SESSIONS
+    return json.loads(path.read_text())["sessions"] if path.exists() else []
+
+
 def _add_session(stored: Program, setup: Setup) -> None:
     """Add to a program's provenance.json how it is trained in this process."""
-    path = run_folder.create(stored.path) / _SESSIONS
     devices = jax.devices()[: len(stored.runs)]
     now = {
+        # Stored runs from before 2026-11-29 say "mjx" where this says "jax".
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
-        "versions": metrics_files.versions(),
+        "versions": driver.versions(),
         **source(setup.commit),
     }
-    sessions = json.loads(path.read_text())["sessions"] if path.exists() else []
-    if now not in sessions:
-        metrics_files.write_json(path, {"sessions": [*sessions, now]})
+    if now not in (sessions := _sessions(stored)):
+        path = folders.create(stored.path) / _SESSIONS
+        json_files.write(path, {"sessions": [*sessions, now]})
 
 
 def _provenance(stored: Program) -> dict[str, Any]:
     """Return how a program was trained, over all sessions of interrupted training."""
-    sessions = json.loads((stored.path / _SESSIONS).read_text())["sessions"]
+    sessions = _sessions(stored)
     joined = dict(sessions[-1])
     for name in ("device", "commit"):
         different = dict.fromkeys(x[name] for x in sessions if x[name])
@@ -227,10 +219,9 @@ def record(
     evaluations: Mapping[str, np.ndarray],
     provenance: Mapping[str, Any],
 ) -> Record:
-    """Return a run's record.
+    """Return a run's record from the columns of its tables, (rows,) each.
 
-    The metrics and the evaluations are columns of its tables, (rows,) each; there may
-    be no evaluations.
+    There may be no evaluations.
     """
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
@@ -253,14 +244,9 @@ def record(
 
 
 def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Program]:
-    """Return the programs that train the missing runs; store those that are trained.
-
-    Raises:
-      InputError: if the scratch folder holds training of these runs and `Setup.resume`
-        is not set.
-    """
+    """Return the programs that train the missing runs; store those that are trained."""
     asked = set(missing)
-    begun = programs.read(_scratch(setup))
+    begun = programs.read(setup.scratch, missing)
     used = [x for x in begun if not asked.isdisjoint(x.runs)]
     if used and not setup.resume:
         raise InputError(
@@ -270,7 +256,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
         )
     for each in used:
         # It was stopped before its runs were stored.
-        if each.training:
+        if each.is_finished:
             store.add(records(each))
     return unfinished(missing, setup)
 
@@ -291,45 +277,25 @@ def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
 
 def _train_on_core(core: int, stored: Program, setup: Setup, folder: Any) -> None:
     """Train a program on one core; what this process prints goes to a log file."""
-    has_begun = threading.Event()
-
-    def end_or_ignore(number: int, frame: Any) -> None:
-        # Training has answered a first signal, and must save before it ends. A cluster
-        # sends one to all processes, and the parent sends another.
-        if not has_begun.is_set():
-            sys.exit(128 + number)
-
-    signal.signal(signal.SIGTERM, end_or_ignore)
+    # Training answers the first signal by saving. A cluster, a terminal and the parent
+    # may each send one.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
     os.sched_setaffinity(0, {core})
     with open(f"{stored.path}.log", "a") as log:
         for stream in (sys.stdout, sys.stderr):
             os.dup2(log.fileno(), stream.fileno())
-        Store(folder).add(train(stored, setup, has_begun.set))
+        Store(folder).add(train(stored, setup))
 
 
-def _start(core: int, stored: Program, setup: Setup, folder: Any) -> SpawnProcess:
-    """Start a process that trains a program.
-
-    Ctrl-C, which goes to all processes of a terminal, does not reach it: a process that
-    still imports would print where it was.
-    """
-    arguments = (core, stored, setup, folder)
-    process = SpawnProcess(target=_train_on_core, args=arguments)
-    # Else the first process starts it, and that unblocks the signal.
-    resource_tracker.ensure_running()
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    process.start()
-    signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    return process
-
-
-def _end(processes: Collection[SpawnProcess]) -> None:
+def _end(processes: Collection[Any]) -> None:
     """End processes, and wait until they have saved; a second Ctrl-C kills them."""
+    print(_ENDING, file=sys.stderr, flush=True)
     try:
-        for process in processes:
-            process.terminate()
-        for process in processes:
-            process.join()
+        while alive := [x for x in processes if x.is_alive()]:
+            for process in alive:
+                process.terminate()
+            alive[0].join(_SECONDS_BETWEEN_POLLS)
     finally:
         for process in processes:
             process.kill()
@@ -340,12 +306,8 @@ def train_in_processes(
 ) -> None:
     """Train runs in `setup.processes` processes of one core each; see `train_missing`.
 
-    Args:
-      missing: returns the runs that are not stored, the most important first. It is
-        called again after each program, because the result of a search decides which
-        runs are needed.
-      store: the store that the runs are added to.
-      setup: how they are trained.
+    The runs that are not stored, the most important first, are asked for again after
+    each program, because the result of a search decides which are needed.
 
     Raises:
       InputError: if there are more processes than cores, as `train_missing`, or if the
@@ -358,29 +320,28 @@ def train_in_processes(
             f"processes is {setup.processes}: it must be at most the number of cores, "
             f"{len(cores)}"
         )
-    _scratch(setup).mkdir(parents=True, exist_ok=True)
+    setup.scratch.mkdir(parents=True, exist_ok=True)
     free, failed = cores[: setup.processes], list[Program]()
-    running: dict[Any, tuple[SpawnProcess, Program, int]] = {}
+    running: dict[Any, tuple[Any, Program, int]] = {}
+    start = multiprocessing.get_context("spawn").Process
     with (
         interruption.noted(_HOW_TO_CONTINUE),
         interruption.Interruption() as received,
-        received.answering(_ENDING),
     ):
         while True:
             begun = [*failed, *(stored for _, stored, _ in running.values())]
             begun_here = {run for each in begun for run in each.runs}
             waiting = [run for run in missing() if run not in begun_here]
             for stored in _requested(waiting, store, setup)[: len(free)]:
-                core = free.pop()
-                process = _start(core, stored, setup, store.folder)
-                running[process.sentinel] = process, stored, core
-            if not running and received.signal is None:
+                arguments = (free.pop(), stored, setup, store.folder)
+                process = start(target=_train_on_core, args=arguments)
+                process.start()
+                running[process.sentinel] = process, stored, arguments[0]
+            if not running:
                 break
             ended: list[Any] = []
             while not ended and received.signal is None:
-                ended = multiprocessing.connection.wait(
-                    list(running), _SECONDS_BETWEEN_POLLS
-                )
+                ended = connection.wait(list(running), _SECONDS_BETWEEN_POLLS)
             if received.signal is not None:
                 _end([process for process, _, _ in running.values()])
                 raise interruption.Interrupted(received.signal)

@@ -93,13 +93,13 @@ def _ends(panels: Panels) -> Comparisons:
     }
 
 
+_humanoid = functools.partial(grid, ("humanoid",), total_steps=3_000_000)
+_walker2d = functools.partial(grid, ("walker2d",), base=Search)
 _EFFECTS = joined(
-    grid(
-        ("walker2d",),
+    _walker2d(
         [Arm(f"{value}", "ppo+gasil", {name: value}) for value in values],
         (delay,),
         panel=name_of(name, delay),
-        base=Search,
     )
     for delay in (1, DELAY)
     for name, values in _VALUES.items()
@@ -128,7 +128,10 @@ _LOGIT, _CENTERED = (
     Arm(f"ppo+gasil ({form})", "ppo+gasil", {"bonus": form})
     for form in ("logit", "centered")
 )
+_FORMS = (_LOGIT, _CENTERED, "ppo+gasil", "ppo+bonus", "ppo")
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
+_BEST_MEAN_RANK = Arm("ppo (decomposed, best mean rank)", "ppo")
+_BEST_DECOMPOSED = functools.partial(SingleSetting, decompose_rewards=True)
 
 
 def _by_root(size: int) -> Point:
@@ -146,11 +149,6 @@ _NEVER_TRAINED = {"decomposition_updates": 1, "decomposition_learning_rate": 1e-
 _CONTROLS = [
     _SCALED,
     Arm("ppo (equal shares, scaled)", "ppo", _NEVER_TRAINED),
-    Arm(
-        "ppo (decomposed without next observation, scaled)",
-        "ppo",
-        {"decomposition_inputs": "pair"},
-    ),
 ]
 _SEES_PHASE = Arm("ppo (sees the phase, scaled)", "ppo", {"decompose_rewards": False})
 #: The paper's agents without cloning.
@@ -173,6 +171,14 @@ _BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
 }
 
 
+def _by_dimension(env: str) -> list[Arm]:
+    size = presets.ACTION_SIZES[env]
+    return [_SCALED, *(Arm(x, "ppo", of(size)) for x, of in _BY_DIMENSION.items())]
+
+
+_on_new_seeds = functools.partial(grid, TASKS, delays=(DELAY,), seeds=20, first_seed=20)
+
+
 def _like_scaled(env: str, arms: Iterable[Arm]) -> list[Arm]:
     """Return arms of agents without rows in `scaled`, with its settings for PPO."""
     scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
@@ -182,7 +188,7 @@ def _like_scaled(env: str, arms: Iterable[Arm]) -> list[Arm]:
     ]
 
 
-def _decomposition_panels(env: str, delay: int) -> Panels:
+def _controls(env: str, delay: int) -> Panels:
     """Return decomposition and its controls on a task, all with the preset `scaled`."""
     one = functools.partial(
         grid, (env,), delays=(delay,), panel="{env} delayed {delay}", seeds=20
@@ -210,6 +216,7 @@ _LONG_HISTORY = Arm(
 )
 #: Delays in steps; 1000 is a whole episode of these tasks.
 _DELAYS = (1, 5, DELAY, 100, 1000)
+_over_delays = functools.partial(grid, panel="{env}", curve="{arm}-{delay}")
 _NOT_CLIPPED = [
     Arm(f"{agent} (rewards not clipped)", agent, {"reward_clip": 1e9}) for agent in PAIR
 ]
@@ -251,11 +258,7 @@ def _delayed(arms: Sequence[Arm | str], base: Any) -> Panels:
 
 
 def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
-    """Return all agents on tasks, each with what its search on the task chose.
-
-    Args:
-      cells: tasks, each with its delay; default all.
-    """
+    """Return all agents on tasks, each with what its search on the task chose."""
     return joined(
         grid(
             (env,),
@@ -269,6 +272,9 @@ def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
     )
 
 
+#: The searches whose values are PPO's, and those of decomposed rewards.
+_PPOS = functools.partial(Search, chooser="ppo")
+_DECOMPOSED = functools.partial(Search, decompose_rewards=True)
 _WITH_PPOS, _WITH_GASILS = "{} (PPO's values)", "{} (PPO+GASIL's values)"
 #: The paper's agents with the values that PPO's search chose, and PPO with PPO+GASIL's.
 _EQUAL = joined(
@@ -276,10 +282,7 @@ _EQUAL = joined(
     for delay in (1, DELAY)
     for arms, base in (
         (PAIR, Search),
-        (
-            [Arm(_WITH_PPOS.format(x), x) for x in PAPERS[1:]],
-            functools.partial(Search, chooser="ppo"),
-        ),
+        ([Arm(_WITH_PPOS.format(x), x) for x in PAPERS[1:]], _PPOS),
         (
             [Arm(_WITH_GASILS.format("ppo"), "ppo")],
             functools.partial(Search, chooser="ppo+gasil"),
@@ -353,11 +356,10 @@ def _changes() -> Comparisons:
     """Compare each arm of the causes with that from which it differs in one thing."""
     paper, centred, both = "gasil, as the paper", "gasil, centered", "novelty, cloning"
     pairs = [(paper, "ppo"), ("gasil, logit", paper), (centred, paper)]
-    pairs += [("gasil, absorbing", paper)]
     pairs += [(x.name, centred) for x in _CAUSES if x.name.startswith(f"{centred},")]
     pairs += [("cloning", centred), ("cloning", "ppo"), ("novel ties", "cloning")]
     pairs += [(x.name, "cloning") for x in _CAUSES if x.name.startswith("cloning,")]
-    pairs += [("novelty", "ppo"), (both, "novelty"), (f"{both}, oldest of ties", both)]
+    pairs += [("novelty", "ppo"), (both, "novelty")]
     return differences(_CAUSE_TASKS, pairs)
 
 
@@ -388,12 +390,9 @@ _CLONING_NOVELTY = Arm("ppo+bc+novelty (PPO+NOVELTY's values)", "ppo+bc+novelty"
 def _sparse_panels(
     tasks: Sequence[str], shared: Sequence[str], total_steps: int
 ) -> list[Panels]:
-    """Return all agents on tasks, also with the values that others' searches chose.
+    """Return all agents on tasks, also with values that others' searches chose.
 
-    Args:
-      tasks: the tasks.
-      shared: those on which agents have PPO's values too.
-      total_steps: environment steps of each run.
+    On the `shared` tasks agents have PPO's values too.
     """
     with_ppos, with_noveltys = (
         functools.partial(SparseSearch, chooser=x) for x in ("ppo", "ppo+novelty")
@@ -410,36 +409,19 @@ def _sparse_panels(
 
 #: The sparse tasks of the ablation.
 _CAUSE_TASKS = [SPARSE[i] for i in (0, 2, 6)]
-#: What may differ in how a buffer is filled, by name.
-_BUFFERS: Mapping[str, Point] = {
-    "better episodes": {"admission": "better"},
-    "newest of ties": {"ties": "newest"},
-    "10,000 steps": {"buffer_steps": 10_000},
-}
+_LARGE = {"buffer_steps": 10_000}
 _CAUSES = [
     Arm("ppo", "ppo"),
     Arm("gasil, as the paper", "ppo+gasil", _GASIL),
     Arm("gasil, logit", "ppo+gasil", {**_GASIL, "bonus": "logit"}),
-    Arm("gasil, absorbing", "ppo+gasil", {**_GASIL, "bonus": "absorbing"}),
     Arm("gasil, centered", "ppo+gasil", _CENTRED),
-    *(
-        Arm(f"gasil, centered, {name}", "ppo+gasil", {**_CENTRED, **changes})
-        for name, changes in _BUFFERS.items()
-    ),
+    Arm("gasil, centered, 10,000 steps", "ppo+gasil", {**_CENTRED, **_LARGE}),
     Arm("cloning", "ppo+bc", _CLONED),
-    *(
-        Arm(f"cloning, {name}", "ppo+bc", {**_CLONED, **changes})
-        for name, changes in _BUFFERS.items()
-    ),
+    Arm("cloning, 10,000 steps", "ppo+bc", {**_CLONED, **_LARGE}),
     Arm("cloning, one episode", "ppo+bc", {**_CLONED, "buffer_episodes": 1}),
     Arm("cloning, by the gap", "ppo+bc-adaptive", _CLONED),
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
-    Arm(
-        "novelty, cloning, oldest of ties",
-        "ppo+bc+novelty",
-        {**_CLONED, "novelty_ties": "arrival"},
-    ),
     Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
 ]
 _SEAS = ("sparse:deep_sea_10", "sparse:deep_sea_20")
@@ -511,12 +493,7 @@ FIGURES: Mapping[str, Figure] = {
     "delayed_rewards": Figure(
         "Delayed rewards: PPO on decomposed rewards beside all others",
         "",
-        joined(
-            [
-                _matrix(cell for cell in CELLS if cell[1] > 1),
-                _delayed([_SCALED], "scaled"),
-            ]
-        ),
+        joined([_matrix(x for x in CELLS if x[1] > 1), _delayed([_SCALED], "scaled")]),
         favourite="ppo (decomposed)",
     ),
     "single_setting": Figure(
@@ -526,12 +503,7 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _delayed([_SCALED], "scaled"),
                 grid(TASKS, [_NOT_DECOMPOSED], (DELAY,), base="scaled"),
-                grid(
-                    TASKS,
-                    [Arm("ppo (decomposed, best mean rank)", "ppo")],
-                    (DELAY,),
-                    base=functools.partial(SingleSetting, decompose_rewards=True),
-                ),
+                grid(TASKS, [_BEST_MEAN_RANK], (DELAY,), base=_BEST_DECOMPOSED),
                 grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,), base=None),
                 _delayed(PAPERS, Search),
             ]
@@ -541,26 +513,19 @@ FIGURES: Mapping[str, Figure] = {
     "decomposition_controls": Figure(
         "Delayed rewards: what learning which steps earned a reward is worth",
         "",
-        joined(
-            _decomposition_panels(env, delay)
-            for env in TASKS[:4]
-            for delay in (DELAY, 1000)
-        ),
+        joined(_controls(x, delay) for x in TASKS[:4] for delay in (DELAY, 1000)),
         favourite=_SCALED.name,
+        dropped_pairs=1,  # Decomposition without the next observation.
     ),
     "scaled_test": Figure(
         "Delayed rewards: the preset scaled on new seeds and on new tasks",
         "",
         joined(
             [
-                *(
-                    grid(TASKS, arms, (DELAY,), base=base, seeds=20, first_seed=20)
-                    for arms, base in (([_SCALED], "scaled"), (_RIVALS, Search))
-                ),
-                *(
-                    grid(NEW_TASKS, arms, (DELAY, 100), base=base)
-                    for arms, base in (([_SCALED], "scaled"), (_RIVALS, _best_rank))
-                ),
+                _on_new_seeds([_SCALED], base="scaled"),
+                _on_new_seeds(_RIVALS, base=Search),
+                grid(NEW_TASKS, [_SCALED], (DELAY, 100), base="scaled"),
+                grid(NEW_TASKS, _RIVALS, (DELAY, 100), base=_best_rank),
             ]
         ),
         favourite=_SCALED.name,
@@ -576,19 +541,7 @@ FIGURES: Mapping[str, Figure] = {
         "",
         joined(
             [
-                grid(TASKS, [_SCALED], (DELAY,), base="scaled"),
-                *(
-                    grid(
-                        (env,),
-                        [
-                            Arm(x, "ppo", of(presets.ACTION_SIZES[env]))
-                            for x, of in _BY_DIMENSION.items()
-                        ],
-                        (DELAY,),
-                        base="scaled",
-                    )
-                    for env in TASKS
-                ),
+                *(grid((x,), _by_dimension(x), (DELAY,), base="scaled") for x in TASKS),
                 grid(TASKS, ["ppo"], (DELAY,), base=Search),
             ]
         ),
@@ -597,12 +550,7 @@ FIGURES: Mapping[str, Figure] = {
     "bonus_forms": Figure(
         "Delayed rewards: PPO+GASIL without a survival bonus",
         "",
-        grid(
-            TASKS[:4],
-            [_LOGIT, _CENTERED, "ppo+gasil", "ppo+bonus", "ppo"],
-            (DELAY,),
-            base=Search,
-        ),
+        grid(TASKS[:4], _FORMS, (DELAY,), base=Search),
         favourite=_LOGIT.name,
     ),
     "ppo_values": Figure(
@@ -616,13 +564,7 @@ FIGURES: Mapping[str, Figure] = {
         "The gap between PPO and PPO+GASIL is larger when Gaussian noise, of standard "
         "deviation 0.05, 0.1 and 0.5, is added to the observations.",
         joined(
-            grid(
-                ("walker2d",),
-                PAIR,
-                panel=f"noise {x:g}",
-                settings={"obs_noise": x},
-                base=Search,
-            )
+            _walker2d(PAIR, panel=f"noise {x:g}", settings={"obs_noise": x})
             for x in _NOISES
         ),
         comparisons=_noise_comparisons(),
@@ -640,30 +582,14 @@ FIGURES: Mapping[str, Figure] = {
         "PPO+GASIL improves PPO and outperforms PPO+BC and PPO+SIL, by a large margin "
         "where the reward is delayed.",
         joined(
-            grid(
-                ("humanoid",),
-                arms,
-                (delay,),
-                panel=panel,
-                base=base,
-                total_steps=3_000_000,
-            )
-            for panel, arms, delay, base in (
-                ("{task}", [*(Arm(x, x) for x in PAIR), _SCHEDULED], 1, Search),
-                (
-                    _WITH_PPOS.format("{task}"),
-                    [*(Arm(x, x) for x in PAPERS), _SCHEDULED],
-                    1,
-                    functools.partial(Search, chooser="ppo"),
+            [
+                _humanoid([*PAIR, _SCHEDULED], base=Search),
+                _humanoid(
+                    [*PAPERS, _SCHEDULED], base=_PPOS, panel=_WITH_PPOS.format("{task}")
                 ),
-                (
-                    "{task}",
-                    [Arm("ppo (decomposed)", "ppo")],
-                    DELAY,
-                    functools.partial(Search, decompose_rewards=True),
-                ),
-                ("{task}", [_BY_ROOT], DELAY, "scaled"),
-            )
+                _humanoid([Arm("ppo (decomposed)", "ppo")], (DELAY,), base=_DECOMPOSED),
+                _humanoid([_BY_ROOT], (DELAY,), base="scaled"),
+            ]
         ),
         comparisons={
             **differences(
@@ -683,15 +609,7 @@ FIGURES: Mapping[str, Figure] = {
         "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
         "",
         joined(
-            grid(
-                tasks,
-                arms,
-                delays,
-                panel="{env}",
-                curve="{arm}-{delay}",
-                base=base,
-                seeds=seeds,
-            )
+            _over_delays(tasks, arms, delays, base=base, seeds=seeds)
             for tasks, arms, delays, base, seeds in (
                 (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
                 (TASKS[:3], _NOT_CLIPPED, _DELAYS[-1:], _usual_delay, 10),
@@ -757,6 +675,8 @@ FIGURES: Mapping[str, Figure] = {
             total_steps=SPARSE_STEPS,
         ),
         comparisons=_changes(),
+        # Absorbing ends, newer ties and admission, of cloning too, and the oldest ties.
+        dropped_pairs=6,
         solved_from=solved_from,
     ),
     "deep_sea": Figure(

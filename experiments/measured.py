@@ -7,15 +7,16 @@ page, between ``<!-- begin -->`` and ``<!-- end -->``.
 import pathlib
 import re
 import shlex
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 
 from experiments import engine
-from experiments.report import markdown_table
+from experiments.options import Options, Parser
+from experiments.tables import markdown_table
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line, environments, output_file
+from gasil_jax.host import environments, output_file
 
 PAGE = pathlib.Path(__file__).parent.parent / "docs/performance.md"
 _TABLE = re.compile(
@@ -31,27 +32,23 @@ def machine() -> str:
     return f"{len(devices)} x {devices[0].device_kind}, cores: {cores}"
 
 
-def find(name: str, options: Any) -> re.Match[str]:
+def find(parser: Parser, options: Options) -> re.Match[str]:
     """Return the part of the page that a command with these options writes.
 
     Raises:
       InputError: if the page does not have the command.
     """
     for part in _TABLE.finditer(PAGE.read_text()):
-        if part[1] == name:
-            arguments = [*shlex.split(part[2]), "--page"]
-            if command_line.parse(type(options), arguments, name) == options:
+        if parser.prog.endswith(f" {part[1]}"):
+            if parser.parse_args([*shlex.split(part[2]), "--page"]) == options:
                 return part
     raise InputError(f"page is set, but {PAGE} has no command with these options")
 
 
-def write(
-    name: str, options: Any, head: Sequence[str], rows: Iterable[Sequence[str]]
-) -> None:
-    """Write a table, and what it was measured with, below its command in the page."""
-    part, commit = find(name, options), engine.source(None)["commit"]
+def write(part: re.Match[str], head: Sequence[str], rows: Any) -> None:
+    """Write a table, and what it was measured with, into a part of the page."""
     (begin, end), page = part.span(3), part.string
-    table = f"{markdown_table(head, rows)}\n\n"
-    table += f"{machine()}, jax {jax.__version__}, commit {commit}.\n\n"
+    table = f"{markdown_table(head, rows)}\n\n{machine()}, jax {jax.__version__}, "
+    table += f"commit {engine.source(None)['commit']}.\n\n"
     with output_file.atomic(PAGE) as partial:
         partial.write_text(page[:begin] + table + page[end:])

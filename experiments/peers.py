@@ -211,15 +211,9 @@ def check() -> None:
 def programs(
     name: str, seeds: int, iterations: int
 ) -> Iterator[tuple[str, Callable[[], Any], float, int, np.ndarray]]:
-    """Yield what is measured of each package.
+    """Yield each package's name, training, seconds of compiling, steps and returns.
 
-    That is its name, its training, seconds of compiling, its steps, and what the
-    trained policies return, (seeds,).
-
-    Args:
-      name: one of `ENVS`.
-      seeds: number of seeds, which are trained at once.
-      iterations: number of iterations of a training.
+    The returns are those of the trained policies, (seeds,).
     """
     total_steps = iterations * _NUM_ENVS * _NUM_STEPS
     for package, make in _PACKAGES.items():

@@ -7,7 +7,6 @@ import pathlib
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-import jax
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Picture
@@ -17,9 +16,7 @@ from experiments.comparisons import Scores
 from experiments.curves import Figure
 from experiments.search import AGENTS
 from experiments.store import Record
-from gasil_jax.figures import plotting
-from gasil_jax.host import output_file
-from gasil_jax.host.environments import make_env
+from gasil_jax.host import output_file, plotting
 from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: The color of each agent, the same in all figures.
@@ -223,43 +220,6 @@ def _draw_over(figure: Figure, panel: str, scores: Scores, *, axes: Any) -> None
     axes.set(xlabel=label, xscale="log", xlim=limits)
     axes.set_xticks(values, list(map(str, values)))
     axes.minorticks_off()
-
-
-def draw_starts(names: Sequence[str]) -> Picture:
-    """Return pictures of how episodes start in tasks that can draw themselves."""
-    columns = min(5, len(names))
-    rows = math.ceil(len(names) / columns)
-    picture = Picture(figsize=(1.9 * columns, 2.1 * rows), layout="constrained")
-    grid = picture.subplots(rows, columns, squeeze=False)
-    for axes in grid.flat:
-        axes.set_axis_off()
-    for axes, name in zip(grid.flat, names, strict=False):
-        env = make_env(name)
-        state = jax.tree.map(np.asarray, env.reset(jax.random.key(0)).pipeline_state)
-        axes.imshow(env.unwrapped.draw(state, (180, 180)))
-        axes.set_title(name.partition(":")[2], fontsize=9)
-    return picture
-
-
-#: What the best of k points returns, for k from 1 on, by panel and agent.
-Budgets = dict[tuple[str, str], np.ndarray]
-
-
-def draw_search_budget(budgets: Budgets) -> Picture:
-    """Return a plot of what the best of k points of a search returns."""
-    panels = list(dict.fromkeys(panel for panel, _ in budgets))
-    picture = Picture(figsize=(7.2, 3.0), layout="constrained")
-    grid = picture.subplots(1, max(1, len(panels)), squeeze=False, sharey=True)[0]
-    for axes, panel in zip(grid, panels, strict=False):
-        for (of, agent), returns in budgets.items():
-            if of == panel:
-                count = np.arange(1, len(returns) + 1)
-                color = _COLOR_OF[agent]
-                axes.plot(count, returns, ".-", color=color, label=agent)
-        axes.set(title=f"{panel} rewards", xlabel="points that the search may try")
-        axes.legend(frameon=False, fontsize=7)
-    grid[0].set_ylabel("return of the best, in units\nof dense PPO's best")
-    return picture
 
 
 def save_png(picture: Picture, path: pathlib.Path, dpi: int = 80) -> None:

@@ -10,23 +10,23 @@ All seeds are on one device. To measure one CPU core, start it with ``taskset -c
 """
 
 import collections
-import dataclasses
 import pathlib
 import re
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any
+from typing import Any
 
 import jax
 import numpy as np
-import tyro
 
 import gasil_envs
 from experiments import measured
+from experiments.options import Options, Parser, at_least
 from gasil_envs.registry import Settings
 from gasil_jax import presets
-from gasil_jax.host import command_line, devices, metrics_files
+from gasil_jax.cli.parsing import input_checked
+from gasil_jax.host import devices, tables
 from gasil_jax.host.members import make_members
 
 #: Named scopes by part. An operation belongs to the first part whose scope it is in.
@@ -54,31 +54,21 @@ _CONTROL = ("while", "call", "conditional")
 _KERNEL = "xla_cpu_small_call"
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Measure the time of each part of a training iteration.
-
-    Attributes:
-      env: name of the environment.
-      agent: name of the agent.
-      preset: name of the preset.
-      seeds: number of seeds.
-      iterations: number of iterations before the one that is traced.
-      repeats: number of times that a whole iteration is timed.
-      page: write the table into docs/performance.md too, below the same command.
-      settings: settings of the environment.
-    """
-
-    env: str = "walker2d"
-    agent: str = "ppo+gasil"
-    preset: str = "tuned"
-    seeds: int = 5
-    iterations: int = 10
-    repeats: int = 5
-    page: bool = False
-    settings: Annotated[Settings, tyro.conf.arg(name="")] = dataclasses.field(
-        default_factory=Settings
-    )
+def parser() -> Parser:
+    """Return the reader of the command's options."""
+    about = "Measure the time of each part of a training iteration."
+    parser, whole = Parser("profile", about), at_least(1)
+    add = parser.add_argument
+    for name, default in (("env", "walker2d"), ("agent", "ppo+gasil")):
+        add(f"--{name}", default=default, help=f"name of the {name}")
+    add("--preset", default="tuned", help="name of the preset")
+    add("--seeds", type=whole, default=5, help="number of seeds")
+    words = "iterations before the one that is traced"
+    add("--iterations", type=whole, default=10, help=words)
+    words = "times that a whole iteration is timed"
+    add("--repeats", type=whole, default=5, help=words)
+    parser.add_page()
+    return parser
 
 
 def operations(program: str) -> dict[str, str]:
@@ -150,18 +140,13 @@ def trace(call: Any, program: str) -> dict[str, float]:
 
 def run(options: Options) -> None:
     """Print the table."""
-    command_line.check_minimum(options, seeds=1, iterations=1, repeats=1)
-    if options.page:
-        measured.find("profile", options)
-    devices.use_devices(options.settings, 1, options.seeds)
+    page = measured.find(parser(), options) if options.page else None
+    devices.use_devices(Settings(), 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
-    with command_line.input_checked():
-        delay = options.settings.reward_delay
-        algorithm = presets.preset(
-            options.env, options.agent, options.preset, reward_delay=delay
-        )
-        env = gasil_envs.make(options.env, **dataclasses.asdict(options.settings))
+    with input_checked():
+        algorithm = presets.preset(options.env, options.agent, options.preset)
+        env = gasil_envs.make(options.env)
         members = make_members(
             env, algorithm, range(options.seeds), devices=jax.devices()[:1]
         )
@@ -184,7 +169,7 @@ def run(options: Options) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "metrics.csv"
         labels = {"seed": range(options.seeds)}
-        writer = metrics_files.MetricsWriter(path, labels, None)
+        writer = tables.TableWriter(path, labels)
         began = time.perf_counter()
         writer.write({name: np.asarray(x)[:, :1] for name, x in metrics.items()})
         totals["host: metrics.csv"] = time.perf_counter() - began
@@ -199,6 +184,6 @@ def run(options: Options) -> None:
     ]
     for part, time_of_step, share in shown:
         print(f"{part:30} {time_of_step:>9} {share:>9}")
-    if options.page:
+    if page:
         head = [f"{options.env}, {options.agent}", "us a step", "share"]
-        measured.write("profile", options, head, shown)
+        measured.write(page, head, shown)

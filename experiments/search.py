@@ -13,19 +13,18 @@ than the searches.
 import dataclasses
 import functools
 import itertools
-import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
 
+from experiments.agents import algorithm
 from experiments.store import Store
-from gasil_jax import statistics
-from gasil_jax.algorithms import Algorithm, algorithm
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings, make_env
-from gasil_jax.sweeps.points import PAPER_RANGES
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.points import PAPER_RANGES
+from gasil_jax.host.runs import Run
 
 Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]
@@ -44,15 +43,6 @@ STEPS, _STEPS_OF = 1_000_000, {"point_mass": 500_000}
 _POINTS, SEEDS = 12, range(1000, 1002)
 #: Number of best points that are trained with more seeds, and all their seeds.
 _FINALISTS, FINALIST_SEEDS = 3, range(1000, 1006)
-#: How a search chooses its point, for the pages.
-PROTOCOL = (
-    f"For every agent {_POINTS} points (values of its hyperparameters) are drawn, the "
-    f"same on all tasks, and each is trained on each task with {len(SEEDS)} seeds. "
-    "Where the best of them has a value at an end of its grid, the next value beyond "
-    f"is tried too. The best {_FINALISTS} of all points are then trained with "
-    f"{len(FINALIST_SEEDS)} seeds in all, and the best of these is chosen, each time "
-    "by the mean return over the last fifth of training."
-)
 #: The values for every agent, and those for some.
 _SHARED: Space = {
     "learning_rate": (1e-4, 3e-4, 6e-4),
@@ -364,19 +354,6 @@ SPARSE_STEPS = 500_000
 SPARSE_BASE: Point = {"num_envs": 16, "normalize_rewards": True}
 
 
-#: How the searches of the sparse tasks choose, for the page.
-SPARSE_PROTOCOL = (
-    f"{SPARSE_BASE['num_envs']} environments, {SPARSE_STEPS:,} steps ({STEPS:,} for "
-    "robots and navix), rewards normalized. For every agent six points were tried, "
-    f"each with {len(SEEDS)} seeds on {len(SPARSE_SEARCHED)} tasks, "
-    f"{', '.join(x.partition(':')[2] for x in SPARSE_SEARCHED)}: three weights of the "
-    "entropy, and two learning rates for PPO or two weights of imitation or of novelty "
-    "for the others. The point with the highest return over the last fifth of "
-    "training, as a share of a success's, is used on all tasks. The other tasks, and "
-    "all with noise, had no part in the choice."
-)
-
-
 @dataclasses.dataclass(frozen=True)
 class SparseSearch(SingleStage):
     """The search of an agent for one setting for all sparse tasks.
@@ -455,26 +432,6 @@ class SingleSetting(Search):
         return drawn[int(np.mean(ranks, axis=0).argmax())]
 
 
-def importance(agent: str, store: Store) -> dict[str, float]:
-    """Return the share of the scores' variance that each hyperparameter explains alone.
-
-    It is the mean of `statistics.importance` over tasks, dense and delayed, or 0 if
-    that is negative. Only tasks count whose drawn points are all stored and all ended
-    an episode; without such a task the result is empty.
-    """
-    points, shares = draw(agent), []
-    for env, delay in CELLS:
-        scores = Search(env, agent, delay).scores(points, store)
-        if scores is not None and np.isfinite(scores).all():
-            means = scores.mean(axis=1)
-            values = {name: [point[name] for point in points] for name in points[0]}
-            explained = {n: statistics.importance(x, means) for n, x in values.items()}
-            shares.append({name: share or 0.0 for name, share in explained.items()})
-    if not shares:
-        return {}
-    return {n: max(0.0, float(np.mean([x[n] for x in shares]))) for n in points[0]}
-
-
 def mean_ranks(
     name: str, env: str, reward_delay: int, *, store: Store
 ) -> dict[Any, float]:
@@ -493,29 +450,3 @@ def mean_ranks(
             for point, rank in zip(points, shares, strict=True):
                 ranks.setdefault(point[name], []).append(float(rank))
     return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}
-
-
-def best_of(search: Search, store: Store) -> np.ndarray | None:
-    """Return what the best of k random points returns, for k from 1 on: (points,).
-
-    It is the expected return of the point that is chosen by one seed, measured with the
-    other one, so that a lucky choice gains nothing; the mean of both ways round. None
-    if runs of drawn points are missing.
-    """
-    scores = search.scores(draw(search.agent), store)
-    if scores is None:
-        return None
-    count = len(scores)
-    returns = []
-    for choosing, other in (scores.T, scores.T[::-1]):
-        # In order of the choosing seed, the best of k is the point of rank i if the
-        # other k - 1 are among the i points below it.
-        measured = other[np.argsort(choosing, kind="stable")]
-        returns.append(
-            [
-                sum(math.comb(i, k - 1) * x for i, x in enumerate(measured))
-                / math.comb(count, k)
-                for k in range(1, count + 1)
-            ]
-        )
-    return np.mean(returns, axis=0)

@@ -11,11 +11,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from experiments.comparisons import (
-    Difference,
     Effect,
     bootstrap_p,
     corrected,
-    share_of_more,
+    more,
+    verdict,
 )
 from experiments.search import generator
 from experiments.store import Record
@@ -44,11 +44,7 @@ def steps_until_solved(record: Record, success: float) -> float:
 def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
     """Return the p-value of Fisher's exact test, two-sided.
 
-    Args:
-      ours: number of our seeds that solve the task.
-      our_seeds: number of our seeds.
-      other: number of the other curve's seeds that solve it.
-      other_seeds: number of its seeds.
+    `ours` of our seeds and `other` of the other curve's solve the task.
     """
     solved, seeds = ours + other, our_seeds + other_seeds
 
@@ -60,18 +56,17 @@ def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
     return sum(as_rare) / math.comb(seeds, solved)
 
 
-def compare(
-    solved: Solved, pairs: Sequence[tuple[str, str, str]]
-) -> dict[tuple[str, str, str], Difference]:
-    """Return the differences of a family of (panel, ours, other)."""
+def verdicts(
+    solved: Solved, pairs: Sequence[tuple[str, str, str]], dropped: int = 0
+) -> dict[tuple[str, str, str], str]:
+    """Return the verdicts of a family of (panel, ours, other)."""
     middle, p_values = {}, {}
-    for panel, ours, other in pairs:
-        first, second = solved[panel, ours], solved[panel, other]
-        key = panel, ours, other
+    for key in pairs:
+        first, second = (solved[key[0], curve] for curve in key[1:])
         middle[key] = float(first.mean() - second.mean())
         counts = (int(first.sum()), len(first), int(second.sum()), len(second))
         p_values[key] = fisher_p(*counts)
-    return {k: Difference(middle[k], p) for k, p in corrected(p_values).items()}
+    return {k: verdict(middle[k], p) for k, p in corrected(p_values, dropped).items()}
 
 
 def _mean_lead(
@@ -130,13 +125,24 @@ def sooner(steps: Steps, panels: Sequence[str], pair: Pair) -> Effect:
     dealt, drawn = np.zeros(_DRAWS), np.zeros(_DRAWS)
     for panel in panels:
         both = [steps[panel, curve] for curve in pair]
-        # Ours is sooner where the other's steps are more.
-        middle += float(share_of_more(*both[::-1])) - 0.5
-        all_seeds = np.tile(np.concatenate(both), (_DRAWS, 1))
-        parts = np.split(rng.permuted(all_seeds, axis=1), [len(both[0])], axis=1)
-        dealt += share_of_more(*parts[::-1]) - 0.5
-        resampled = [rng.choice(x, (_DRAWS, len(x))) for x in both]
-        drawn += share_of_more(*resampled[::-1]) - 0.5
+        ours, other = map(len, both)
+        # Ours is sooner where the other's steps are more: (our seeds, other seeds).
+        wins = more(both[1][None, :], both[0][:, None]) - 0.5
+        middle += float(wins.mean())
+        # The sum of the other's ranks says how often its steps are more.
+        pooled = np.concatenate(both)
+        ranks = np.tile(more(pooled[:, None], pooled).sum(axis=1), (_DRAWS, 1))
+        sums = rng.permuted(ranks, axis=1)[:, ours:].sum(axis=1)
+        dealt += (sums - other**2 / 2) / (ours * other) - 0.5
+        first, second = (_resampled(size, rng) for size in (ours, other))
+        drawn += np.sum(first @ wins * second, axis=1)
     as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
     p_value = (1 + as_far) / (1 + _DRAWS)
     return Effect(middle / len(panels), p_value, drawn / len(panels))
+
+
+def _resampled(size: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the share of each seed in bootstrap samples, (draws, seeds)."""
+    drawn = rng.integers(size, size=(_DRAWS, size)) + size * np.arange(_DRAWS)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=_DRAWS * size)
+    return counts.reshape(_DRAWS, size) / size

@@ -9,23 +9,21 @@ import dataclasses
 import json
 import pathlib
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
+from experiments.agents import OWN
 from gasil_jax import npz
 from gasil_jax.errors import InputError
-from gasil_jax.host import output_file, run_folder
-from gasil_jax.sweeps.runs import Run, read_run
+from gasil_jax.host import folders, output_file
+from gasil_jax.host.runs import Run, read_run
 
 _NONE = np.empty(0)
+#: The names of agents in files, and those of their classes, where they differ.
+_STORED = {agent.name: name for name, agent in OWN.items()}
+_CURRENT = {name: agent for agent, name in _STORED.items()}
 RESULTS = pathlib.Path(__file__).parent / "results"
-#: The type of an option with this default, which the help need not say in full.
-ResultsFolder = Annotated[
-    pathlib.Path,
-    tyro.conf.arg(help_behavior_hint="(default: experiments/results of the checkout)"),
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -95,6 +93,22 @@ def _rounded(name: str, values: np.ndarray) -> np.ndarray:
     return np.array([float(f"{value:.6g}") for value in values], np.float32)
 
 
+def to_stored(experiment: str) -> dict[str, Any]:
+    """Return a `Run.experiment` as it stands in a file."""
+    return _renamed(json.loads(experiment), _STORED)
+
+
+def from_stored(fields: Mapping[str, Any], seed: int = 0) -> Run:
+    """Return the run of an experiment in a file."""
+    return read_run(_renamed(fields, _CURRENT), seed)
+
+
+def _renamed(fields: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
+    settings = fields["algorithm"]
+    agent = names.get(settings["agent"], settings["agent"])
+    return {**fields, "algorithm": {**settings, "agent": agent}}
+
+
 def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     """Write a file of runs; its bytes do not depend on the order of the runs."""
     ordered = sorted(records, key=lambda run: (run.experiment, run.seed))
@@ -102,7 +116,7 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     experiments = sorted({run.experiment for run in ordered})
     provenances = sorted(set(provenance.values()))
     index = {
-        "experiments": list(map(json.loads, experiments)),
+        "experiments": list(map(to_stored, experiments)),
         "provenances": list(map(json.loads, provenances)),
     }
     arrays = {
@@ -131,7 +145,7 @@ def read(path: pathlib.Path) -> dict[Run, Record]:
         arrays = npz.read(path)
         index = json.loads(str(arrays["index"]))
         # A file has thousands of runs of some hundred experiments.
-        experiments = [read_run(fields, 0) for fields in index["experiments"]]
+        experiments = list(map(from_stored, index["experiments"]))
         columns = {
             name: np.split(arrays[name].astype(float), np.cumsum(arrays[lengths])[:-1])
             for lengths, names in _TABLES.items()
@@ -192,7 +206,7 @@ class Store:
         self.answers.clear()
         self.folder.mkdir(parents=True, exist_ok=True)
         for env in sorted({run.env for run in records}):
-            with run_folder.wait_for_lock(self.folder):
+            with folders.lock(self.folder, seconds=60.0):
                 self._records.pop(env, None)
                 stored = self._of(env)
                 new = {run for run in records if run.env == env} - set(stored)
@@ -201,20 +215,3 @@ class Store:
                     write(self._path(env), stored)
             added += len(new)
         return added
-
-
-def merge(source: pathlib.Path, target: Store) -> tuple[int, int]:
-    """Add the runs of another store; return how many are new, and how many it has.
-
-    The source is the folder of that store, or of the results that contain it. A run
-    that the target has is not changed.
-
-    Raises:
-      InputError: if there are no runs in the folder.
-    """
-    folder = source / "runs" if (source / "runs").is_dir() else source
-    paths = sorted(folder.glob("[!.]*.npz"))
-    if not paths:
-        raise InputError(f"folder is {source}: it must have TASK.npz files of runs")
-    records = {run: record for path in paths for run, record in read(path).items()}
-    return target.add(records), len(records)

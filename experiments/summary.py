@@ -4,6 +4,7 @@ A claim's verdict is computed from the comparisons on its figure's page.
 """
 
 import dataclasses
+import functools
 import itertools
 import json
 import pathlib
@@ -13,10 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import plots, report
+from experiments import report
+from experiments.agents import OWN
 from experiments.curves import name_of
+from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.report import Page
+from experiments.options import Options, Parser
 from experiments.search import (
     ADAPTIVE,
     DELAY,
@@ -24,11 +27,10 @@ from experiments.search import (
     PAPERS,
     TASKS,
     PaperSearch,
-    Search,
     SparseSearch,
-    best_of,
 )
 from experiments.store import RESULTS, Store
+from experiments.tables import changed, markdown_table
 from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
@@ -85,13 +87,7 @@ def _ahead(
 
 
 def _on_tasks(words: str, delay: int, share: float) -> Claim:
-    """Return the claim that PPO+GASIL is ahead of the paper's other agents on tasks.
-
-    Args:
-      words: the claim as text.
-      delay: the tasks' reward delay.
-      share: the share of the tasks on which it must be ahead, for the claim to hold.
-    """
+    """Return the claim to be ahead of the paper's other agents on a share of tasks."""
     equal = tuple(x if x == "ppo" else f"{x} (PPO's values)" for x in _OTHERS)
     of = {
         "paper_protocol": _ahead(delay, _OTHERS),
@@ -103,12 +99,7 @@ def _on_tasks(words: str, delay: int, share: float) -> Claim:
 
 
 def _comparisons(name: str, prefix: str = "") -> dict[str, list[_Expected]]:
-    """Expect the first of two curves to be better, in each comparison of a figure.
-
-    Args:
-      name: name of the figure.
-      prefix: only panels whose names begin with it count.
-    """
+    """Expect the first curve to be better, on panels that begin with a prefix."""
     keys = [key for key in FIGURES[name].compared() if key[0].startswith(prefix)]
     return {f"{key[0]}, {key[1]} against {key[2]}": [(key, "better")] for key in keys}
 
@@ -164,166 +155,158 @@ CLAIMS = (
 )
 
 
-class Summary:
-    """The page of all claims and the README's blocks, from one store."""
+#: The results of all figures, by name.
+Pages = Mapping[str, Results]
 
-    #: The methods that slots may name. Other slots are a figure's name and its slot.
-    SLOTS = ("claims", "effects", "figures", "front")
 
-    def __init__(self, store: Store):
-        self.pages = {name: Page(name, store) for name in FIGURES}
+def all_results(store: Store) -> Pages:
+    """Return the results of all figures."""
+    return {name: Results(figure, store) for name, figure in FIGURES.items()}
 
-    def verdict(self, test: Test | None) -> str:
-        """Return as text whether a claim holds, judged by the complete curves."""
-        if test is None:
-            return ""
-        compared = self.pages[test.figure].comparisons
-        measured = {
-            case: all(compared[key].verdict == verdict for key, verdict in expected)
-            for case, expected in test.cases.items()
-            if all(key in compared for key, _ in expected)
-        }
-        if not measured:
-            return "not measured yet"
-        agree = [case for case, agrees in measured.items() if agrees]
-        judged = [x for case in measured for x in test.cases[case]]
-        opposite = sum(compared[key].verdict == _OPPOSITE[x] for key, x in judged)
-        lacking = len(test.cases) - len(measured)
-        if len(agree) >= test.needed:
-            word = "holds"
-        elif len(agree) + lacking >= test.needed:
-            word = "open so far"
-        else:
-            word = "holds in part" if agree else "does not hold"
-        words = f"{word}: in {len(agree)} of {len(measured)} cases"
-        words += f" ({'; '.join(agree)})" if agree else ""
-        if opposite:
-            words += f"; the opposite in {opposite} of {len(judged)} comparisons"
-        return words + (f"; {lacking} not measured yet" if lacking else "")
 
-    def claims(self) -> str:
-        """Return a table with each claim and what was measured by each protocol."""
-        rows = [
-            (claim.words, *(self.verdict(claim.tests.get(x)) for x in PROTOCOLS))
-            for claim in CLAIMS
-        ]
-        return report.markdown_table(["The paper's claim", *PROTOCOLS], rows)
+def verdict(pages: Pages, test: Test | None) -> str:
+    """Return as text whether a claim holds, judged by the complete curves."""
+    if test is None:
+        return ""
+    compared = pages[test.figure].comparisons
+    measured = {
+        case: all(compared[key].verdict == verdict for key, verdict in expected)
+        for case, expected in test.cases.items()
+        if all(key in compared for key, _ in expected)
+    }
+    if not measured:
+        return "not measured yet"
+    agree = [case for case, agrees in measured.items() if agrees]
+    judged = [x for case in measured for x in test.cases[case]]
+    opposite = sum(compared[key].verdict == _OPPOSITE[x] for key, x in judged)
+    lacking = len(test.cases) - len(measured)
+    if len(agree) >= test.needed:
+        word = "holds"
+    elif len(agree) + lacking >= test.needed:
+        word = "open so far"
+    else:
+        word = "holds in part" if agree else "does not hold"
+    words = f"{word}: in {len(agree)} of {len(measured)} cases"
+    words += f" ({'; '.join(agree)})" if agree else ""
+    if opposite:
+        words += f"; the opposite in {opposite} of {len(judged)} comparisons"
+    return words + (f"; {lacking} not measured yet" if lacking else "")
 
-    def effects(self, rewards: str) -> str:
-        """Return a table of how far PPO+GASIL is ahead of others on each task.
 
-        Args:
-          rewards: "dense" or "delayed".
-        """
-        claim = next((x for x in CLAIMS if x.words.lower().startswith(rewards)), None)
-        if claim is None:
-            raise InputError(f"rewards is {rewards}: it must be dense or delayed")
-        rows: dict[tuple[str, str], dict[str, str]] = {}
-        for protocol, test in claim.tests.items():
-            compared = self.pages[test.figure].comparisons
-            for key, _ in itertools.chain(*test.cases.values()):
-                words = "not measured yet"
-                if key in compared:
-                    one = compared[key]
-                    words = f"{one}, {one.verdict_in_words()}"
-                other = key[2].partition(" (")[0]
-                rows.setdefault((key[0], other), {})[protocol] = words
-        return report.markdown_table(
-            ["task", "ahead of", *PROTOCOLS],
-            [[*names, *(x.get(y, "") for y in PROTOCOLS)] for names, x in rows.items()],
-        )
+def claims(pages: Pages) -> str:
+    """Return a table with each claim and what was measured by each protocol."""
+    rows = [
+        (claim.words, *(verdict(pages, claim.tests.get(x)) for x in PROTOCOLS))
+        for claim in CLAIMS
+    ]
+    return markdown_table(["The paper's claim", *PROTOCOLS], rows)
 
-    def budgets(self) -> plots.Budgets:
-        """Return what the best of k points returns, by rewards and agent of the paper.
 
-        The unit of a task is what the best of all of PPO's points returns with dense
-        rewards. The values are means over the tasks whose searches are all stored.
-        """
-        store = self.pages["matrix"].searched
-        budgets: plots.Budgets = {}
-        for delay, rewards in ((DELAY, "delayed"), (1, "dense")):
-            for agent in PAPERS:
-                curves = []
-                for env in TASKS:
-                    unit = best_of(Search(env, "ppo"), store)
-                    curve = best_of(Search(env, agent, delay), store)
-                    if unit is not None and curve is not None:
-                        curves.append(curve / unit[-1])
-                if curves:
-                    budgets[rewards, agent] = np.mean(curves, axis=0)
-        return budgets
+def effects(pages: Pages, rewards: str) -> str:
+    """Return how far PPO+GASIL is ahead on each "dense" or "delayed" task."""
+    claim = next(x for x in CLAIMS if x.words.lower().startswith(rewards))
+    rows: dict[tuple[str, str], dict[str, str]] = {}
+    for protocol, test in claim.tests.items():
+        compared = pages[test.figure].comparisons
+        for key, _ in itertools.chain(*test.cases.values()):
+            words = "not measured yet"
+            if key in compared:
+                words = f"{compared[key]}, {compared[key].verdict_in_words()}"
+            other = key[2].partition(" (")[0]
+            rows.setdefault((key[0], other), {})[protocol] = words
+    return markdown_table(
+        ["task", "ahead of", *PROTOCOLS],
+        [[*names, *(x.get(y, "") for y in PROTOCOLS)] for names, x in rows.items()],
+    )
 
-    def front(self) -> str:
-        """Return the README's text on the results."""
-        return self.text("front").rstrip()
 
-    def figures(self) -> str:
-        """Return links to the pages of all figures."""
-        pages = self.pages.items()
-        return "\n".join(f"- [{page.figure.title}]({name}.md)" for name, page in pages)
+def figures(pages: Pages) -> str:
+    """Return links to the pages of all figures."""
+    return "\n".join(f"- [{FIGURES[name].title}]({name}.md)" for name in pages)
 
-    def value(self, name: str, *arguments: str) -> str:
-        """Return the text of a slot: a method in `SLOTS`, or a figure's name and slot.
 
-        Raises:
-          InputError: if there is no such slot.
-        """
-        if name in self.SLOTS and len(arguments) == (name == "effects"):
-            return getattr(self, name)(*arguments)
-        if name in self.pages and arguments:
-            return self.pages[name].value(*arguments)
-        raise InputError(
-            f"slot is {shlex.join([name, *arguments])}: it must be one of "
-            f"{', '.join(self.SLOTS)}, or a figure and its slot"
-        )
+def front(pages: Pages) -> str:
+    """Return the README's text on the results."""
+    return text(pages, "front").rstrip()
 
-    def text(self, note: str) -> str:
-        """Return a note, such as a page of `SUMMARIES`, with its slots filled in."""
-        return report.fill((report.NOTES / f"{note}.md").read_text(), self.value)
 
-    def tuned(self) -> str:
-        """Return the tuned presets as JSON, updated by what complete searches chose."""
-        rows = json.loads(presets.TUNED.read_text())
-        final = {
-            results.curve.search: float(interquartile_mean(results.final))
-            for name in ("matrix", "ppo_values")
-            for results in self.pages[name].results.values()
-            if results.complete
-        }
-        for page in self.pages.values():
-            for search in page.figure.searches.values():
-                # The preset "paper" has normalized rewards, "scaled" decomposed ones.
-                other = search.decompose_rewards or not getattr(
-                    search, "normalize_rewards", True
-                )
-                # On the sparse tasks each agent has one setting for all, and so has
-                # adaptive imitation where that returns about as much as its searches.
-                kind = "delayed" if search.reward_delay > 1 else "dense"
-                is_own = kind == "delayed" and search.env in ("ant", "humanoid")
-                single = search.agent == ADAPTIVE and not is_own
-                single |= isinstance(search, SparseSearch)
-                # The best of its own values and of those that PPO's and PPO+GASIL's
-                # searches chose, by the final returns on the pages.
-                others = [dataclasses.replace(search, chooser=x) for x in PAIR]
-                best = max([search, *others], key=lambda x: final.get(x, -np.inf))
-                point = best.chosen(page.searched)
-                if point is None or single or other:
-                    continue
-                settings = report.changed(search.algorithm(point))
-                kind = f"paper {kind}" if isinstance(search, PaperSearch) else kind
-                of_task = rows.setdefault(kind, {}).setdefault(search.env, {})
-                of_task[search.agent] = dict(sorted(settings.items()))
-        return json.dumps(rows, indent=1, sort_keys=True) + "\n"
+_SLOTS = {x.__name__: x for x in (claims, effects, figures, front)}
 
-    def write(self) -> None:
-        """Write the pages of all claims, the README's blocks and the presets."""
-        text = report.fill_blocks(README.read_text(), self.value)
-        picture = plots.draw_search_budget(self.budgets())
-        plots.save_png(picture, RESULTS / "search_budget.png")
-        for path, content in (
-            *((RESULTS / f"{page}.md", self.text(page)) for page in SUMMARIES),
-            (README, text),
-            (presets.TUNED, self.tuned()),
-        ):
-            with output_file.atomic(path) as partial:
-                partial.write_text(content)
+
+def value(pages: Pages, name: str, *arguments: str) -> str:
+    """Return the text of a slot: one of the above, or a figure's name and its slot.
+
+    Raises:
+      InputError: if there is no such slot.
+    """
+    if name in _SLOTS:
+        return _SLOTS[name](pages, *arguments)
+    if name in pages and arguments:
+        return report.value(pages[name], *arguments)
+    raise InputError(
+        f"slot is {shlex.join([name, *arguments])}: it must be one of "
+        f"{', '.join(_SLOTS)}, or a figure and its slot"
+    )
+
+
+def text(pages: Pages, note: str) -> str:
+    """Return a note, such as a page of `SUMMARIES`, with its slots filled in."""
+    return report.fill(report.note(note), functools.partial(value, pages))
+
+
+def tuned(pages: Pages) -> str:
+    """Return the tuned presets as JSON, updated by what complete searches chose."""
+    rows = json.loads(presets.TUNED.read_text())
+    final = {
+        one.curve.search: float(interquartile_mean(one.final))
+        for name in ("matrix", "ppo_values")
+        for one in pages[name].curves.values()
+        if one.complete
+    }
+    for results in pages.values():
+        for search in results.figure.searches.values():
+            # The preset "paper" has normalized rewards, "scaled" decomposed ones.
+            other = search.decompose_rewards or not getattr(
+                search, "normalize_rewards", True
+            )
+            # On the sparse tasks each agent has one setting for all, and so has
+            # adaptive imitation where that returns about as much as its searches. The
+            # experiments' own agents have no presets.
+            kind = "delayed" if search.reward_delay > 1 else "dense"
+            is_own = kind == "delayed" and search.env in ("ant", "humanoid")
+            single = search.agent == ADAPTIVE and not is_own
+            single |= isinstance(search, SparseSearch) or search.agent in OWN
+            # The best of its own values and of those that PPO's and PPO+GASIL's
+            # searches chose, by the final returns on the pages.
+            others = [dataclasses.replace(search, chooser=x) for x in PAIR]
+            best = max([search, *others], key=lambda x: final.get(x, -np.inf))
+            point = best.chosen(results.searched)
+            if point is None or single or other:
+                continue
+            kind = f"paper {kind}" if isinstance(search, PaperSearch) else kind
+            of_task = rows.setdefault(kind, {}).setdefault(search.env, {})
+            settings = changed(search.algorithm(point))
+            of_task[search.agent] = dict(sorted(settings.items()))
+    return json.dumps(rows, indent=1, sort_keys=True) + "\n"
+
+
+def parser() -> Parser:
+    """Return the reader of the command's options, of which there are none."""
+    about = "Write all pages, plots and presets, and the README's text on results."
+    return Parser("report", about)
+
+
+def run(options: Options) -> None:
+    """Write all that is made from stored runs."""
+    pages = all_results(Store(RESULTS / "runs"))
+    for name, results in pages.items():
+        report.write(name, results, RESULTS)
+    blocks = report.fill_blocks(README.read_text(), functools.partial(value, pages))
+    for path, content in (
+        *((RESULTS / f"{page}.md", text(pages, page)) for page in SUMMARIES),
+        (README, blocks),
+        (presets.TUNED, tuned(pages)),
+    ):
+        with output_file.atomic(path) as partial:
+            partial.write_text(content)
+    print(f"in {RESULTS}")

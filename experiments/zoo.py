@@ -5,35 +5,32 @@ Gymnasium. It replaces the package's policy for the task if its score is higher.
 table in docs/zoo.md is written from the policies.
 """
 
-import dataclasses
 import json
 import pathlib
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
-import tyro
 
-from experiments import report
+from experiments import report, tables
 from experiments.curves import name_of
+from experiments.options import Options, Parser, at_least
 from gasil_jax import npz, numpy_policy
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.evaluate import evaluate_in_gymnasium
-from gasil_jax.host import command_line, environments, output_file, run_folder
+from gasil_jax.evaluation import evaluate_in_gymnasium
+from gasil_jax.host import environments, output_file, sweep
 
 TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
 
 
-@dataclasses.dataclass(frozen=True)
-class Options:
-    """Score runs' best policies and add them to the package's.
-
-    Attributes:
-      runs: folders of finished runs on locomotion tasks.
-      episodes: number of episodes of each score.
-    """
-
-    runs: Annotated[tuple[pathlib.Path, ...], tyro.conf.Positional] = ()
-    episodes: int = 100
+def parser() -> Parser:
+    """Return the reader of the command's options."""
+    parser = Parser("zoo", "Score runs' best policies and add them to the package's.")
+    words = "folders of finished runs on locomotion tasks"
+    parser.add_argument("runs", nargs="+", type=pathlib.Path, help=words)
+    words = "episodes of each score"
+    parser.add_argument("--episodes", type=at_least(1), default=100, help=words)
+    return parser
 
 
 def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
@@ -51,10 +48,10 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
       InputError: if it is not the folder of a finished run on a locomotion task, or
         none of its seeds has a return.
     """
-    description = run_folder.read(folder)
-    algorithm, delay = description["algorithm"], description["settings"].reward_delay
-    with command_line.input_checked():
-        env = environments.make_env(description["env"])
+    trained = sweep.read(folder)
+    algorithm, delay = trained.algorithm, trained.settings.reward_delay
+    with input_checked():
+        env = environments.make_env(trained.env)
         saved = npz.read(folder / "policy.npz")
     if not environments.is_locomotion(env):
         raise InputError(f"run is {folder}: it must be of a locomotion task")
@@ -70,7 +67,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         num_episodes=episodes,
     )["episode_return"]
     about = {
-        "env": description["env"],
+        "env": trained.env,
         "reward_delay": delay,
         "agent": algorithm.agent.name,
         "decompose_rewards": algorithm.settings["decompose_rewards"],
@@ -80,7 +77,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         "deviation": round(float(returns.std()), 1),
         "episodes": episodes,
     }
-    path = zoo / f"{name_of(description['env'], delay)}.npz"
+    path = zoo / f"{name_of(trained.env, delay)}.npz"
     words = f"{path.stem}: {about['mean']} in Gymnasium"
     if path.exists():
         before = json.loads(str(npz.read(path)["about"]))["mean"]
@@ -109,14 +106,11 @@ def table() -> str:
         agent = about["agent"] + " (decomposed)" * about["decompose_rewards"]
         rows.append([f"`zoo:{name}`", agent, steps, score])
     head = ["policy", "trained with", "steps", "return in Gymnasium"]
-    return report.markdown_table(head, rows)
+    return tables.markdown_table(head, rows)
 
 
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
-    command_line.check_minimum(options, episodes=1)
-    if not options.runs:
-        raise InputError("runs is empty: name one folder or more")
     for folder in options.runs:
         print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
     text = report.fill_blocks(TABLE.read_text(), lambda _: table())

@@ -49,8 +49,6 @@ NOT_RUN = {
     "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
     "python -m experiments profile": "it measures for minutes",
-    "python -m experiments roofline": "it measures for minutes",
-    "python -m experiments two_doors": "test_two_doors.py trains a small one",
     "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
     "test_shards.py and tests/sweeps/test_ray.py train shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",

@@ -4,8 +4,8 @@ The action is the agent's velocity. Objects are collected once: blue +5, green +
 orange distractors -5. An actuation cost proportional to the L2 norm of the action
 discourages speed. The paper gives no coordinates. `Layout`'s defaults were found by a
 search for a layout in which the paper's findings appear
-(experiments/point_mass_layouts.py): a blue object on each side of the start, three
-green ones further up, and two distractors on each side of those.
+(experiments/point_mass_layouts.py of commit 5c9b6ad): a blue object on each side of the
+start, three green ones further up, and two distractors on each side of those.
 """
 
 import dataclasses

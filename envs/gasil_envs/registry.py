@@ -19,7 +19,6 @@ from gasil_envs import (
 from gasil_envs.base import Env
 from gasil_envs.errors import InputError, nearest, refusal, unknown
 from gasil_envs.physics import batching, native
-from gasil_envs.physics.mjx import SOLVERS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,10 +33,8 @@ class Settings:
       action_noise: standard deviation of Gaussian noise on the actions, in units of
         half their range; for discrete actions, the probability that an action is
         replaced by a random one. 0 means no noise.
-      physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
-        host's cores.
-      solver: implementation of the JAX physics: small, our own dynamics and solver, or
-        mjx, MJX's own step, which is slower.
+      physics: physics engine of locomotion: jax, our own in pure JAX; mjx, MuJoCo's
+        MJX as shipped, which is slower; or mujoco, in C on the host's cores.
       integrator: integrator of locomotion: model, the same as Gymnasium's, or euler,
         which is faster but changes the task.
       terminal_limits: whether an episode that reaches the step limit counts as
@@ -52,8 +49,7 @@ class Settings:
     reward_delay: int = 1
     obs_noise: float = 0.0
     action_noise: float = 0.0
-    physics: str = "mjx"
-    solver: str = "small"
+    physics: str = "jax"
     integrator: str = "model"
     terminal_limits: bool = False
     max_episode_steps: int | None = None
@@ -124,10 +120,7 @@ def _build_ours(name: str, settings: Settings) -> Env:
     if name == "point_mass":
         return point_mass.PointMass()
     return locomotion.Locomotion(
-        name,
-        physics=settings.physics,
-        solver=settings.solver,
-        integrator=settings.integrator,
+        name, physics=settings.physics, integrator=settings.integrator
     )
 
 
@@ -152,20 +145,14 @@ def check(name: str, settings: Settings) -> None:
         )
     _constructor(name)
     if ":" in name:
-        for field in ("physics", "solver", "integrator"):
+        for field in ("physics", "integrator"):
             value = getattr(settings, field)
             if value != getattr(Settings, field):
                 raise ValueError(
                     f"{field} is {value!r}: leave it out, {name} has its own physics"
                 )
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
-    _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
-    if settings.physics != "mjx" and settings.solver != Settings.solver:
-        raise ValueError(
-            f"solver is {settings.solver!r}: it needs physics 'mjx', and physics is "
-            f"{settings.physics!r}"
-        )
     for field in ("terminal_limits", "observe_phase"):
         if not isinstance(value := getattr(settings, field), bool):
             raise refusal(field, value, "True or False")
@@ -195,13 +182,13 @@ def without_effect(name: str, settings: Settings) -> list[str]:
     """
     if ":" in name or name in locomotion.TASKS:
         return []
-    of_physics = ("physics", "solver", "integrator")
+    of_physics = ("physics", "integrator")
     return [x for x in of_physics if getattr(settings, x) != getattr(Settings, x)]
 
 
 def prepare(settings: Settings, num_devices: int) -> None:
     """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
-    batching.keep_loops(settings.solver)
+    batching.keep_loops(settings.physics)
     if settings.physics == "mujoco":
         native.reserve_threads(num_devices)
 
@@ -214,7 +201,7 @@ def make(name: str, **settings: Any) -> Env:
         MODULE:NAME of your own class or function that builds an environment with Brax's
         interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, action_noise, physics,
-        solver, integrator, terminal_limits, max_episode_steps, observe_phase.
+        integrator, terminal_limits, max_episode_steps, observe_phase.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
@@ -224,7 +211,7 @@ def make(name: str, **settings: Any) -> Env:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
     check(name, chosen)
-    batching.keep_loops(chosen.solver)
+    batching.keep_loops(chosen.physics)
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.max_episode_steps is not None:

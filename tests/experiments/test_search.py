@@ -1,13 +1,13 @@
 """The plan of all agents and tasks: alike for every agent, and its holes are told."""
 
 import collections
-import itertools
 
 import numpy as np
 import pytest
 
-from experiments import __main__, search
-from experiments.report import Page
+from experiments import search, tables
+from experiments.figure_results import Results
+from experiments.figures import FIGURES
 from experiments.search import (
     AGENTS,
     CELLS,
@@ -127,48 +127,9 @@ def test_which_values_suit_a_task_is_told(tmp_path):
     low, high = search.mean_ranks("gamma", "ant", 20, store=store).values()
     assert low == pytest.approx(high) == pytest.approx(0.5)
     assert search.mean_ranks("alpha", "ant", 20, store=store) == {}
-    row = next(
-        x for x in Page("matrix", store).ranks("gamma").splitlines() if "| ant" in x
-    )
+    printed = tables.ranks(Results(FIGURES["matrix"], store), "gamma")
+    row = next(x for x in printed.splitlines() if "| ant" in x)
     assert row == "| ant-delayed | 0.50 | 0.50 |"
-
-
-def test_what_matters_is_told(tmp_path):
-    store, points = Store(tmp_path), search.draw("ppo")
-    assert search.importance("ppo", store) == {}
-    for env, delay in CELLS:
-        one = Search(env, "ppo", delay)
-        fill(store, one, points, [1e4 * x["gamma"] for x in points])
-    shares = search.importance("ppo", store)
-    assert shares["gamma"] == pytest.approx(1.0)
-    assert max(shares["gae_lambda"], shares["initial_std"]) < 0.3
-    row = next(
-        x for x in Page("matrix", store).importance().splitlines() if "| ppo |" in x
-    )
-    assert "| 100% |" in row
-
-
-def test_holes_of_the_plan_are_told(tmp_path, capsys):
-    store, one = Store(tmp_path / "runs"), Search("hopper", "ppo", 20)
-    drawn = one.points(store)
-    fill(store, one, drawn, range(len(drawn)))
-    assert __main__.main(["coverage", "--results", str(tmp_path)]) == 1
-    printed = capsys.readouterr().out
-    of_matrix, _ = printed.split("paper_protocol")
-    _, *lines = of_matrix.splitlines()
-    # Where rewards are delayed, there is PPO with decomposed rewards too.
-    assert len(lines) == len(CELLS) * len(AGENTS) + len(TASKS)
-    planned = len(one.requested(store))
-    assert planned > 2 * len(drawn)
-    line = next(x for x in lines if x.startswith("hopper-delayed"))
-    assert line.split() == (
-        f"hopper-delayed ppo {2 * len(drawn)} of {planned} 0 of 20".split()
-    )
-    words = " ".join(printed.split())
-    assert f"hopper ppo 0 of {2 * len(drawn)} 0 of 10" in words
-    # With its schedule of alpha two of the 32 points are as others.
-    assert "humanoid (raw) ppo+gasil 0 of 60 0 of 10" in words
-    assert "humanoid-delayed (raw) ppo+gasil 0 of 64 0 of 10" in words
 
 
 def test_the_papers_protocol_has_the_appendix_s_values():
@@ -201,25 +162,3 @@ def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
     fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
     assert one.chosen(store) == {"learning_rate": 5e-5}
     assert not store.missing(one.requested(store)) and raw.chosen(store) is None
-
-
-def test_the_best_of_k_points_is_chosen_by_one_seed_and_measured_with_the_other(
-    tmp_path,
-):
-    """Against all subsets of points."""
-    store, one = Store(tmp_path), Search("hopper", "ppo", 20)
-    assert search.best_of(one, store) is None
-    points, rng = search.draw("ppo"), np.random.default_rng(0)
-    scores = rng.permuted(np.tile(np.arange(12.0), (2, 1)), axis=1)
-    for seed, of_seed in zip((1000, 1001), scores, strict=True):
-        fill(store, one, points, of_seed, [seed])
-    expected = []
-    for k in range(1, 13):
-        subsets = list(itertools.combinations(range(12), k))
-        both = [
-            other[max(subset, key=chosen.__getitem__)]
-            for subset in subsets
-            for chosen, other in (scores, scores[::-1])
-        ]
-        expected.append(np.mean(both))
-    np.testing.assert_allclose(search.best_of(one, store), expected)

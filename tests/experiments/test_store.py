@@ -11,13 +11,21 @@ import pytest
 from altered_archives import altered
 
 import gasil_jax
-from experiments.store import RESULTS, Record, Store, merge, read, write
+from experiments.store import (
+    RESULTS,
+    Record,
+    Store,
+    from_stored,
+    read,
+    to_stored,
+    write,
+)
 from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize, npz
 from gasil_jax.errors import InputError
 from gasil_jax.host.descriptions import find_agent
 from gasil_jax.host.environments import Settings
 from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.runs import NEWER, Run, read_run
+from gasil_jax.sweeps.runs import NEWER, STORED_NAMES, Run
 
 
 def run(seed=0, env="hopper", **changes):
@@ -39,7 +47,6 @@ def test_what_decides_numbers_decides_the_key_and_nothing_else_does():
         run(stagger_episodes=False),
         run(total_steps=5),
         run(decompose_rewards=True),
-        run(decompose_rewards=True, decomposition_inputs="pair"),
         run(alpha_schedule=((1e3, 0.0), (2e3, 1.0))),
         *(
             dataclasses.replace(one, **change)
@@ -65,7 +72,7 @@ def test_every_setting_is_in_the_experiment():
     text = run(decompose_rewards=True, normalize_rewards=True).experiment
     for part in (Config, PPOGASIL, Decompose, Normalize):
         for name in {field.name for field in dataclasses.fields(part)} - set(NEWER):
-            assert f'"{name}"' in text
+            assert f'"{STORED_NAMES.get(name, name)}"' in text
     for model in (Decompose, Normalize):
         assert f'"{model.switch}": true' in text
         assert f'"{model.switch}": false' in run().experiment
@@ -79,7 +86,7 @@ _ADDED_TO_THE_KEY = {"activation", "layer_norm", "admission", "ties"}
 @pytest.mark.parametrize("path", sorted((RESULTS / "runs").glob("*.npz")), ids=str)
 def test_stored_runs_keep_their_keys(path):
     for stored in json.loads(str(npz.read(path)["index"]))["experiments"]:
-        now = json.loads(read_run(stored, 0).experiment)
+        now = to_stored(from_stored(stored).experiment)
         for name in now["algorithm"].keys() - stored["algorithm"].keys():
             assert path.stem == "point_mass" and name in _ADDED_TO_THE_KEY
             del now["algorithm"][name]
@@ -205,17 +212,6 @@ def test_a_run_that_is_there_stays(tmp_path):
     for fresh in (store, Store(tmp_path)):
         assert fresh[run()].episode_return.tolist() == [1.0] * 3
         assert fresh.missing([run(), run(2), run(1), run(2)]) == [run(2)]
-
-
-def test_the_runs_of_another_machine_are_added(tmp_path):
-    here, there = Store(tmp_path / "here"), Store(tmp_path / "results" / "runs")
-    here.add({run(): record(1.0)})
-    there.add({run(): record(2.0), run(1): record(2.0), run(env="ant"): record(2.0)})
-    assert merge(tmp_path / "results", here) == (2, 3)
-    assert merge(tmp_path / "results" / "runs", here) == (0, 3)
-    assert here[run()].episode_return[0] == 1.0 and here[run(1)].episode_return[0] == 2
-    with pytest.raises(InputError, match=r"must have TASK\.npz"):
-        merge(tmp_path, here)
 
 
 def test_runs_are_added_side_by_side(tmp_path):

@@ -1,0 +1,110 @@
+"""Evaluate the policies of all members at regular intervals during training.
+
+The scores go to evaluations.csv, beside metrics.csv: a row for each member and
+evaluation, with the mean, lowest and highest return of its episodes and their mean
+length. Evaluations do not change training, not by a single bit.
+"""
+
+import math
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from gasil_jax.evaluation import evaluate
+from gasil_jax.host.members import Members
+from gasil_jax.host.tables import TableWriter
+from gasil_jax.host.trackers import Tracker
+from gasil_jax.train import TrainState
+
+# Far from the usual seed numbers, because training takes its keys from those.
+_ROOT = 2**32 - 1
+
+
+def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Array:
+    """Return the key of a seed's evaluation after `iteration` iterations.
+
+    It depends on these two numbers alone, not on the keys of training or on the other
+    members.
+    """
+    return jax.random.fold_in(
+        jax.random.fold_in(jax.random.key(_ROOT), seed), iteration
+    )
+
+
+class Evaluation:
+    """Evaluates all members with one compiled program, sharded as training is.
+
+    Args:
+      members: the members that are trained.
+      every: environment steps per seed between two evaluations, rounded up to whole
+        iterations; the untrained and the final policy are always evaluated.
+      num_episodes: number of episodes of each policy, in fresh environments.
+      table: writes evaluations.csv.
+      trackers: trackers that also get the scores.
+
+    Attributes:
+      table: as given.
+      seconds: time of all evaluations in this process, including compilation.
+    """
+
+    #: Columns of evaluations.csv after those that identify the members.
+    COLUMNS = ("env_steps", "mean", "min", "max", "length")
+
+    def __init__(
+        self,
+        members: Members,
+        *,
+        every: int,
+        num_episodes: int,
+        table: TableWriter,
+        trackers: Sequence[Tracker] = (),
+    ):
+        def score(state: TrainState, seed: jax.Array) -> dict[str, jax.Array]:
+            return evaluate(
+                members.env,
+                members.algorithm,
+                state,
+                key=evaluation_key(seed, state.iteration),
+                num_episodes=num_episodes,
+            )
+
+        self.table, self.seconds = table, 0.0
+        self._interval = math.ceil(every / members.config.batch_steps)
+        self._members, self._trackers = members, trackers
+        self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
+        self._score = members.vmap(score)
+
+    def iterations_left(self, done: int) -> int:
+        """Return the iterations from `done` to the next evaluation, at least one."""
+        return self._interval - done % self._interval
+
+    def is_due(self, done: int) -> bool:
+        """Return whether to evaluate after `done` iterations."""
+        last = self._members.config.num_iterations
+        return done % self._interval == 0 or done == last
+
+    def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
+        """Evaluate the policies, write the scores and log them to the trackers.
+
+        Returns:
+          The columns of evaluations.csv, (members,) each.
+        """
+        started = time.monotonic()
+        episodes = jax.tree.map(np.asarray, self._score(states, self._seeds))
+        episodes = self._members.trim(episodes)
+        returns, length = episodes["episode_return"], episodes["episode_length"]
+        scores = {
+            "env_steps": np.full(len(returns), done * self._members.config.batch_steps),
+            "mean": returns.mean(axis=1),
+            "min": returns.min(axis=1),
+            "max": returns.max(axis=1),
+            "length": length.mean(axis=1),
+        }
+        self.table.write({name: x[:, None] for name, x in scores.items()})
+        for tracker in self._trackers:
+            tracker.log(int(scores["env_steps"][0]), {"evaluation": scores["mean"]})
+        self.seconds += time.monotonic() - started
+        return scores

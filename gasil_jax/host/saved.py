@@ -1,0 +1,335 @@
+"""Load the training states and policies that a folder holds."""
+
+import contextlib
+import functools
+import math
+import operator
+import pathlib
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from gasil_envs import wrappers
+from gasil_envs.precision import full_precision
+from gasil_jax import numpy_policy, policy, train
+from gasil_jax.agents.adversarial import AdversarialAgent
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import Range
+from gasil_jax.errors import InputError, refusal
+from gasil_jax.host import (
+    checkpoint,
+    environments,
+    programs,
+    results,
+    sweep,
+    tables,
+    training,
+)
+from gasil_jax.host.driver import Outcome
+from gasil_jax.host.members import member
+from gasil_jax.host.output_file import note
+from gasil_jax.host.programs import Program
+from gasil_jax.host.sweep import Sweep
+
+
+def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
+    """Return the environment's and the agent's name, and the programs of a point.
+
+    The programs have the runs of that point alone. Only their tables can be read if
+    Python alone can make what was trained.
+
+    Args:
+      folder: folder of the run or sweep, which need not be finished.
+      point: number of the point; default the best by mean.
+
+    Raises:
+      InputError: if it is no such folder, or has no such point.
+    """
+    described = sweep.described(folder)
+    agent = str(described["algorithm"].get("agent"))
+    chosen = _choose_point(folder, described["points"], point)
+    if described["only_python"] is None:
+        return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
+    return described["env"], agent, programs.labelled(folder / "programs", chosen)
+
+
+def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
+    """Return the seed with the highest final return of a point; None if unknown.
+
+    A policy of the zoo has one seed, which needs no name.
+    """
+    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
+        return None
+    scores = {}
+    for each in find(folder, point)[2]:
+        table = each.table("metrics.csv", ("episode_return",))
+        for i, columns in zip(each.indices, table, strict=True):
+            if columns:
+                final = tables.final_returns(columns["episode_return"])
+                scores[each.labels["seed"][i]] = float(
+                    np.nan_to_num(final, nan=-np.inf)
+                )
+    return max(scores, key=scores.__getitem__) if scores else None
+
+
+def _choose_point(
+    folder: pathlib.Path, points: Sequence[Mapping[str, Any]], point: int | None
+) -> int:
+    """Return the number of the requested point; by default the best by mean."""
+    last = len(points) - 1
+    if point is None and last > 0:
+        if (point := results.best_point(folder)) is None:
+            raise InputError(
+                f"run is {folder}, a sweep without a best point: name one, --point 0 "
+                f"to {last}"
+            )
+        values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
+        note(f"{folder}: point {point}, the best by mean ({values})")
+    point = point or 0
+    if not 0 <= point <= last:
+        raise InputError(f"point is {point}: {folder} has points 0 to {last}")
+    return point
+
+
+def _programs(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
+    """Return the programs that hold a point's runs, with no other runs."""
+    left = {stored.runs[point, seed] for seed in stored.seeds}
+    of_point = []
+    # Two may hold the same run, if one was copied from another folder.
+    for each in sorted(stored.stored(folder), key=lambda x: not x.is_finished):
+        if kept := [i for i, run in enumerate(each.runs) if run in left]:
+            left -= {each.runs[i] for i in kept}
+            of_point.append(each.only(kept))
+    if not of_point:
+        raise InputError(f"run is {folder}: none of its seeds has begun")
+    return of_point
+
+
+def load(
+    folder: pathlib.Path,
+    which: str = "last",
+    point: int | None = None,
+    *,
+    seed: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
+) -> tuple[Any, Algorithm, list[int], Any]:
+    """Return environment, algorithm, seed numbers and states (seed, ...) of a point.
+
+    Args:
+      folder: folder of the run or sweep, which need not be finished.
+      which: the checkpoint to load: "last", or "best", which has the best evaluation
+        or, without evaluations, the highest returns in training.
+      point: number of the point; default the best by mean.
+      seed: number of the seed; default all seeds.
+      env: the environment; default that which config.json describes.
+      algorithm: the algorithm; default that which config.json describes.
+
+    Raises:
+      InputError: if it is not the folder of a run, if it has no such checkpoint or
+        seed, if the checkpoint is damaged, or if "best" is requested of a point that
+        shares its checkpoints with other points.
+    """
+    for name, number in (("point", point), ("seed", seed)):
+        if number is not None and number not in Range(-math.inf, whole=True):
+            raise refusal(name, number, "a whole number")
+    if not isinstance(which, str) or which not in ("last", "best"):
+        raise refusal("which", which, "'last' or 'best'")
+    stored = sweep.read(folder, algorithm)
+    point = _choose_point(folder, stored.points, point)
+    if env is None:
+        with _named(folder):
+            env = training.make_env(stored)
+    return env, *restore(folder, stored, env, point=point, which=which, seed=seed)
+
+
+@contextlib.contextmanager
+def _named(folder: pathlib.Path) -> Any:
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"run is {folder}: {error}") from None
+
+
+def restore(
+    folder: pathlib.Path,
+    stored: Sweep,
+    env: Any,
+    *,
+    point: int,
+    which: str = "last",
+    seed: int | None = None,
+) -> tuple[Algorithm, list[int], Any]:
+    """Return algorithm, seed numbers and states (seed, ...) of a point; see `load`."""
+    states: dict[int, train.TrainState] = {}
+    every = _programs(folder, stored, point)
+    for each in every:
+        if which == "best" and len(each.runs) < each.num_members:
+            raise InputError(
+                "checkpoint is 'best': this point was trained with others, and "
+                "checkpoints are scored over all of them: it must be 'last'"
+            )
+        root = each.path / "checkpoints"
+        if which == "best":
+            with _named(folder):
+                chosen = checkpoint.best(root)
+        else:
+            chosen, errors = checkpoint.latest(root)
+            for error in errors:
+                print(f"warning: {error}", file=sys.stderr)
+        if chosen is None:
+            scored = " with a score" if which == "best" else ""
+            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
+        init = functools.partial(train.first_state, env, each.algorithm)
+        keys = jax.random.split(jax.random.key(0), each.num_members)
+        with _named(folder):
+            # The leaves of all members have the same shapes.
+            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
+        own = zip(each.seeds, each.indices, strict=True)
+        states |= {number: member(restored, i) for number, i in own}
+    seeds = [x for x in stored.seeds if x in states]
+    if seed is not None:
+        if seed not in seeds:
+            listed = ", ".join(map(str, seeds))
+            raise InputError(f"seed is {seed}: the run has {listed}")
+        seeds = [seed]
+
+    # JAX would compile a program for each shape, but only it can stack random keys.
+    def stack(*leaves: Any) -> jax.Array:
+        library = jnp if isinstance(leaves[0], jax.Array) else np
+        return jax.device_put(library.stack(leaves))
+
+    stacked = jax.tree.map(stack, *(states[x] for x in seeds))
+    return every[0].algorithm, seeds, stacked
+
+
+def states_of(
+    folder: pathlib.Path,
+    stored: Sweep,
+    env: Any,
+    point: int,
+    trained: Sequence[tuple[Program, Outcome]],
+) -> train.TrainState:
+    """Return the states of a point, (seeds, ...), as just trained or from its folder.
+
+    Raises:
+      InputError: as `load` does.
+    """
+    runs = [stored.runs[point, seed] for seed in stored.seeds]
+    for program, outcome in trained:
+        if set(runs) <= set(program.runs):
+            places = np.array([program.runs.index(run) for run in runs])
+            if np.array_equal(places, range(len(program.runs))):
+                return outcome.states
+            return jax.tree.map(operator.itemgetter(places), outcome.states)
+    return restore(folder, stored, env, point=point)[2]
+
+
+class Policies(NamedTuple):
+    """Saved policies.
+
+    Attributes:
+      env: the environment that they were trained in.
+      num_steps: steps after which an episode is truncated, at the latest.
+      seeds: numbers of their seeds.
+      weights: the arrays of each, which `numpy_policy` describes.
+    """
+
+    env: Any
+    num_steps: int
+    seeds: Sequence[int]
+    weights: Sequence[Mapping[str, np.ndarray]]
+
+
+def load_policies(
+    folder: str | pathlib.Path,
+    which: str = "last",
+    point: int | None = None,
+    *,
+    seed: int | None = None,
+) -> Policies:
+    """Return the policies of a run, or one that comes with the package.
+
+    Args:
+      folder: folder of the run or sweep, or zoo:NAME, which has no points and no
+        checkpoints.
+      which: see `load`.
+      point: see `load`.
+      seed: see `load`.
+
+    Raises:
+      InputError: as `load` does, or if the zoo has no such policy.
+    """
+    if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
+        env, _, seeds, states = load(pathlib.Path(folder), which, point, seed=seed)
+        every = jax.device_get(policy.weights(states, env))
+        names = [name for name in numpy_policy.SHARED if name in every]
+        shared = {name: every.pop(name) for name in names}
+        weights = [member(every, i) | shared for i in range(len(seeds))]
+        return Policies(env, train.max_episode_steps(env), seeds, weights)
+    if point is not None or which != "last":
+        raise InputError(f"run is {folder}: it has no points and no checkpoints")
+    arrays = numpy_policy.read(folder, seed)
+    about = numpy_policy.about(str(folder))
+    env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
+    return Policies(env, int(env.episode_length), [about["seed"]], [arrays])
+
+
+def load_reward(
+    folder: str | pathlib.Path,
+    seed: int | None = None,
+    *,
+    which: str = "last",
+    point: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
+) -> Callable[[Any, Any], jax.Array]:
+    """Return the reward that a run's discriminator has learned, as a pure function.
+
+    The function is ``reward(observation, action)``, (..., obs), (..., action) -> (...),
+    in float32: the bonus without alpha. Discrete actions are int, (...).
+
+    Args:
+      folder: folder of the run or sweep.
+      seed: number of the seed; default the run's first.
+      which: see `load`.
+      point: see `load`.
+      env: see `load`; needed if the environment was made in Python.
+      algorithm: see `load`; needed if it was made in Python.
+
+    Raises:
+      ValueError: as `load` does, or if the run's agent has no discriminator, or a bonus
+        that depends on the batch that a step is in.
+    """
+    if not isinstance(folder, str | pathlib.PurePath):
+        raise refusal("folder", folder, "a string or a pathlib.Path")
+    env, algorithm, _, states = load(
+        pathlib.Path(folder), which, point, seed=seed, env=env, algorithm=algorithm
+    )
+    agent, state = algorithm.agent, member(states, 0)
+    if not isinstance(agent, AdversarialAgent):
+        raise InputError(
+            f"run is {folder}, of agent {agent.name!r}: it has no discriminator"
+        )
+    learned = agent.reward(state.agent, state.normalizer)
+    discrete, size = wrappers.is_discrete(env), wrappers.action_size(env)
+
+    @full_precision
+    def reward(observation: Any, action: Any) -> jax.Array:
+        action = jnp.asarray(action)
+        if discrete:
+            action = jax.nn.one_hot(action, size)
+        sizes = {"observation": env.observation_size, "action": size}
+        given = {"observation": jnp.asarray(observation), "action": action}
+        for name, array in given.items():
+            if array.shape[-1:] != (sizes[name],):
+                raise ValueError(
+                    f"{name} has shape {array.shape}: it must be (..., {sizes[name]})"
+                )
+        return learned(*(array.astype(jnp.float32) for array in given.values()))
+
+    return reward
