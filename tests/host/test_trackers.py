@@ -10,8 +10,8 @@ import pytest
 from small_training import FLAGS
 
 from gasil_jax import run, sweep
-from gasil_jax.errors import InputError
 from gasil_jax.cli import train
+from gasil_jax.errors import InputError
 from gasil_jax.host import progress, trackers, training
 
 SMALL = (
