@@ -14,18 +14,18 @@ import time
 
 import numpy as np
 import pytest
-from small_training import SMALL
+from small_training import FLAGS
 
 from gasil_jax import sweep
 from gasil_jax.cli import options
 
 ray = pytest.importorskip("ray")
 
-STEPS = str(300 * 256)
-LONG = (*SMALL, "--total-steps", STEPS, "--seeds", "2", "--devices", "1")
-LONG += ("--checkpoint-every", str(20 * 256))
+STEPS = 100 * 128
+LONG = (*FLAGS, "--agent", "ppo", "--total-steps", str(STEPS), "--seeds", "2")
+LONG += ("--devices", "1", "--checkpoint-every", str(10 * 128))
 # Two programs: a shard has one of them, as the whole sweep has.
-GRID = ("--grid", "alpha=0.1,1", "discriminator_updates=1,3")
+GRID = ("--grid", "gamma=0.9,0.99", "num_epochs=1,2")
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
     killed, programs = [], []
 
     def kill():
-        begun = "programs/*/checkpoints/[0-9]*/manifest.json"
+        begun = "programs/*/checkpoints/*[0-9]/manifest.json"
         while not (checkpoints := list(out.glob(begun))):
             time.sleep(0.01)
         programs.append(checkpoints[0].parents[2])
@@ -74,7 +74,7 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
         np.testing.assert_array_equal(curves[0][name], curves[1][name])
     # What it had done before it was killed was not done again.
     trained = json.loads((program / "training.json").read_text())
-    assert trained["env_steps"] < int(STEPS) * 2 * 2
+    assert trained["env_steps"] < 4 * STEPS
     before = {p: p.stat().st_mtime_ns for p in (out / "programs").rglob("*")}
     assert sweep.main([*arguments, "--out", str(out)]) == 2
     assert sweep.main([*arguments, "--resume", "--out", str(out)]) == 0
@@ -84,7 +84,7 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
 def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
     """A file stands where the folder of the programs must be made."""
     out = tmp_path / "out"
-    arguments = [*SMALL, "--grid", "alpha=1", "--out", str(out)]
+    arguments = [*FLAGS, "--grid", "alpha=1", "--out", str(out)]
     _, requested = options.read(options.SweepOptions, arguments, "x")
     out.mkdir()
     requested.write(out)
