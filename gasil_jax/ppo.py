@@ -268,14 +268,7 @@ def descend_one(network: Learner, gradient: Any, config: Config) -> Learner:
 
 @jax.named_scope("ppo")
 def update(
-    actor_critic: ActorCritic,
-    batch: Batch,
-    key: jax.Array,
-    *,
-    policy: Callable[[Any, jax.Array], Any],
-    distribution: Distribution,
-    value: Callable[[Any, jax.Array], jax.Array],
-    config: Config,
+    actor_critic: ActorCritic, batch: Batch, key: jax.Array, context: Context
 ) -> tuple[ActorCritic, Metrics]:
     """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
@@ -283,23 +276,20 @@ def update(
       actor_critic: the networks before the update.
       batch: the batch, (steps, ...), whose advantages are standardized and mixed.
       key: random key; consumed.
-      policy: (params, observation) -> the parameters of the actions' distribution.
-      distribution: the distribution of actions.
-      value: (params, observation) -> value.
-      config: number of epochs, number and size of minibatches, and this iteration's
-        numbers.
+      context: the iteration's data, with the networks and the config.
 
     Returns:
       The networks after the update, and the mean of each metric over all minibatches.
     """
+    config = context.config
 
     def minibatch_step(actor_critic: ActorCritic, rows: jax.Array) -> Any:
         gradient, metrics = jax.grad(loss, has_aux=True)(
             actor_critic.params,
             jax.tree.map(lambda x: x[rows], batch),
-            policy=policy,
-            distribution=distribution,
-            value=value,
+            policy=context.policy,
+            distribution=context.distribution,
+            value=context.value,
             config=config,
         )
         return descend(actor_critic, gradient, config), metrics

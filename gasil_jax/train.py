@@ -263,10 +263,7 @@ def learn(
             state.actor_critic,
             ppo.batch_of(context, advantage, returns),
             keys.ppo,
-            policy=context.policy,
-            distribution=context.distribution,
-            value=context.value,
-            config=config,
+            context,
         )
         agent_state, actor_critic, policy_metrics = call(
             agent,
