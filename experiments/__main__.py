@@ -18,9 +18,9 @@ from experiments.figures import FIGURES
 from experiments.options import Options, Parser, at_least, shard
 from experiments.search import PaperSearch
 from experiments.store import RESULTS, Store
+from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import command_line
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
 
 #: Commands other than figures: each module has a `parser` and a `run`.
 COMMANDS: Mapping[str, ModuleType] = {
@@ -58,7 +58,11 @@ def _parser(name: str) -> Parser:
     parser.add_results("folder of the pages and, below runs/, of the stored runs")
     add("--runs", type=pathlib.Path, help="scratch folder of the training in progress")
     add("--resume", action="store_true", help="continue interrupted training")
-    add("--physics", choices=("mjx", "mujoco"), help="physics engine of locomotion")
+    add(
+        "--physics",
+        choices=("jax", "mjx", "mujoco"),
+        help="physics engine of locomotion",
+    )
     add("--devices", type=at_least(1), help="CPU devices, instead of one per core")
     add(
         "--evaluate-episodes",
@@ -173,7 +177,7 @@ def _train(name: str, options: Options) -> None:
     print(f"in {results / name}.md")
 
 
-@command_line.reports_errors
+@reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]

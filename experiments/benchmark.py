@@ -37,12 +37,13 @@ from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.host import command_line, metrics_files
+from gasil_jax.cli.parsing import input_checked
+from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
 
 VARIANTS = {
-    "mjx": {"solver": "mjx"},
+    "mjx": {"physics": "mjx"},
     "ours": {},
     "mujoco": {"physics": "mujoco"},
     "ours-euler": {"integrator": "euler"},
@@ -101,9 +102,9 @@ class Row:
     speed: float = 0.0
 
 
-def start_jax(num_devices: int, solver: str = "small") -> None:
+def start_jax(num_devices: int, physics: str = "mujoco") -> None:
     """Choose CPU devices and precision as commands do; call it before JAX starts."""
-    prepare(Settings(physics="mujoco", solver=solver), num_devices)
+    prepare(Settings(physics=physics), num_devices)
     jax.config.update("jax_num_cpu_devices", num_devices)
     jax.config.update("jax_default_matmul_precision", "highest")
 
@@ -277,7 +278,7 @@ def training_row(
     env = gasil_envs.make(env_name, **VARIANTS[variant])
     algorithm, used = _algorithm(env_name, options), jax.devices()[:devices]
     num_envs, batch_steps = algorithm.config.num_envs, algorithm.config.batch_steps
-    with command_line.input_checked():
+    with input_checked():
         batch = make_members(env, algorithm, range(seeds), devices=used)
     began = time.perf_counter()
     states, advance = batch.compile()
@@ -440,7 +441,7 @@ def run(options: Options) -> None:
     page = measured.find(parser(), options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
-    versions = metrics_files.versions()
+    versions = driver.versions()
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     every: list[Row] = []
     for table in options.tables:

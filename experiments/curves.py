@@ -12,7 +12,7 @@ from experiments.store import Store
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
 
 #: A weighted sum of the interquartile means of curves, by panel and curve.
 Terms = tuple[tuple[float, str, str], ...]

@@ -24,11 +24,12 @@ import numpy as np
 
 from experiments.search import FINALIST_SEEDS
 from experiments.store import Record, Store
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host import interruption, metrics_files, run_folder, run_options
-from gasil_jax.sweeps import assembly, programs
-from gasil_jax.sweeps.programs import Program
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host import driver, folders, interruption, json_files, programs, training
+from gasil_jax.host.programs import Program
+from gasil_jax.host.runs import Run
+from gasil_jax.host.sweep import Recording, Sweep
 
 #: Equal parts of training in a record, and evaluations during training.
 ROWS, EVALUATIONS = 50, 10
@@ -51,7 +52,7 @@ class Setup:
     Attributes:
       runs: scratch folder of the training in progress.
       resume: whether interrupted training in it is continued; otherwise it is refused.
-      physics: physics engine of locomotion, mjx or mujoco.
+      physics: physics engine of locomotion, jax, mjx or mujoco.
       devices: number of CPU devices to shard members over; default one per core.
       evaluate_episodes: episodes of each evaluation during training; 0 for none. Runs
         of a search are not evaluated.
@@ -64,7 +65,7 @@ class Setup:
 
     runs: pathlib.Path = pathlib.Path("runs", "experiments")
     resume: bool = False
-    physics: str = "mjx"
+    physics: str = "jax"
     devices: int | None = None
     evaluate_episodes: int = 10
     processes: int = 1
@@ -128,7 +129,7 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
     rank = {run: rank for rank, run in enumerate(missing)}
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
-    begun, others = programs.unfinished(ordered, programs.read(setup.scratch))
+    begun, others = programs.unfinished(ordered, programs.read(setup.scratch, ordered))
     groups = programs.group(others, setup.members, lambda x: x.seed in FINALIST_SEEDS)
     new = [
         x.below(setup.scratch, {"member": range(len(x.runs)), "seed": x.seeds})
@@ -151,20 +152,27 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
     of_search = run.seed in FINALIST_SEEDS
     episodes = None if of_search else setup.evaluate_episodes or None
     total_steps = run.algorithm.config.total_steps
-    options = run_options.Options(
-        env=run.env,
-        out=stored.path,
+    recording = Recording(
         keep_checkpoints=1,
         evaluate_every=episodes and math.ceil(total_steps / EVALUATIONS),
-        evaluate_episodes=episodes,
-        devices=setup.devices,
-        settings=dataclasses.replace(run.settings, physics=setup.physics),
-        **run_options.algorithm_options(run.algorithm),
+        evaluate_episodes=episodes or Recording.evaluate_episodes,
     )
-    env = assembly.prepare(options, [stored])
+    settings = dataclasses.replace(run.settings, physics=setup.physics)
+    sweep = Sweep(
+        run.env, run.algorithm, (run.seed,), settings=settings, recording=recording
+    )
+    with input_checked():
+        env = training.prepare(sweep, [stored], stored.path, num_devices=setup.devices)
     _add_session(stored, setup)
-    with interruption.noted(_HOW_TO_CONTINUE):
-        assembly.train(options, env, [stored], title=title(stored))
+    with (
+        interruption.noted(_HOW_TO_CONTINUE),
+        interruption.Interruption() as received,
+    ):
+        (outcome,) = training.train_programs(
+            env, [stored], recording, title=title(stored), interruption=received
+        )
+    if outcome.unsaved is not None:
+        raise outcome.unsaved
     return records(stored)
 
 
@@ -183,14 +191,15 @@ def _add_session(stored: Program, setup: Setup) -> None:
     """Add to a program's provenance.json how it is trained in this process."""
     devices = jax.devices()[: len(stored.runs)]
     now = {
+        # Stored runs from before 2026-11-29 say "mjx" where this says "jax".
         "physics": setup.physics,
         "device": f"{len(devices)} x {devices[0].device_kind}",
-        "versions": metrics_files.versions(),
+        "versions": driver.versions(),
         **source(setup.commit),
     }
     if now not in (sessions := _sessions(stored)):
-        path = run_folder.create(stored.path) / _SESSIONS
-        metrics_files.write_json(path, {"sessions": [*sessions, now]})
+        path = folders.create(stored.path) / _SESSIONS
+        json_files.write(path, {"sessions": [*sessions, now]})
 
 
 def _provenance(stored: Program) -> dict[str, Any]:
@@ -237,7 +246,7 @@ def record(
 def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Program]:
     """Return the programs that train the missing runs; store those that are trained."""
     asked = set(missing)
-    begun = programs.read(setup.scratch)
+    begun = programs.read(setup.scratch, missing)
     used = [x for x in begun if not asked.isdisjoint(x.runs)]
     if used and not setup.resume:
         raise InputError(
@@ -247,7 +256,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
         )
     for each in used:
         # It was stopped before its runs were stored.
-        if each.training:
+        if each.is_finished:
             store.add(records(each))
     return unfinished(missing, setup)
 

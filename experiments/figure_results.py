@@ -11,7 +11,7 @@ from experiments import shares
 from experiments.comparisons import Comparison, Scores, compare
 from experiments.curves import Curve, Figure
 from experiments.store import Record, Store
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
 
 
 @dataclasses.dataclass(frozen=True)

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from typing import Any, NoReturn
 
 from experiments.store import RESULTS
+from gasil_jax.cli.reporting import HelpShown
 from gasil_jax.errors import InputError
-from gasil_jax.host.command_line import HelpShown
 
 
 class Parser(argparse.ArgumentParser):

@@ -16,8 +16,7 @@ from experiments.comparisons import Scores
 from experiments.curves import Figure
 from experiments.search import AGENTS
 from experiments.store import Record
-from gasil_jax.figures import plotting
-from gasil_jax.host import output_file
+from gasil_jax.host import output_file, plotting
 from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 #: The color of each agent, the same in all figures.

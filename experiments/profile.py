@@ -25,7 +25,8 @@ from experiments import measured
 from experiments.options import Options, Parser, at_least
 from gasil_envs.registry import Settings
 from gasil_jax import presets
-from gasil_jax.host import command_line, devices, metrics_files
+from gasil_jax.cli.parsing import input_checked
+from gasil_jax.host import devices, tables
 from gasil_jax.host.members import make_members
 
 #: Named scopes by part. An operation belongs to the first part whose scope it is in.
@@ -143,7 +144,7 @@ def run(options: Options) -> None:
     devices.use_devices(Settings(), 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)
-    with command_line.input_checked():
+    with input_checked():
         algorithm = presets.preset(options.env, options.agent, options.preset)
         env = gasil_envs.make(options.env)
         members = make_members(
@@ -168,7 +169,7 @@ def run(options: Options) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = pathlib.Path(folder) / "metrics.csv"
         labels = {"seed": range(options.seeds)}
-        writer = metrics_files.MetricsWriter(path, labels, None)
+        writer = tables.TableWriter(path, labels)
         began = time.perf_counter()
         writer.write({name: np.asarray(x)[:, :1] for name, x in metrics.items()})
         totals["host: metrics.csv"] = time.perf_counter() - began

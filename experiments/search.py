@@ -23,8 +23,8 @@ from experiments.agents import algorithm
 from experiments.store import Store
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.host.environments import Settings, make_env
-from gasil_jax.sweeps.points import PAPER_RANGES
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.points import PAPER_RANGES
+from gasil_jax.host.runs import Run
 
 Point = Mapping[str, Any]
 Space = Mapping[str, tuple[Any, ...]]

@@ -16,8 +16,8 @@ import numpy as np
 from experiments.agents import OWN
 from gasil_jax import npz
 from gasil_jax.errors import InputError
-from gasil_jax.host import output_file, run_folder
-from gasil_jax.sweeps.runs import Run, read_run
+from gasil_jax.host import folders, output_file
+from gasil_jax.host.runs import Run, read_run
 
 _NONE = np.empty(0)
 #: The names of agents in files, and those of their classes, where they differ.
@@ -206,7 +206,7 @@ class Store:
         self.answers.clear()
         self.folder.mkdir(parents=True, exist_ok=True)
         for env in sorted({run.env for run in records}):
-            with run_folder.wait_for_lock(self.folder):
+            with folders.lock(self.folder, seconds=60.0):
                 self._records.pop(env, None)
                 stored = self._of(env)
                 new = {run for run in records if run.env == env} - set(stored)

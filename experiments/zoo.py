@@ -15,9 +15,10 @@ from experiments import report, tables
 from experiments.curves import name_of
 from experiments.options import Options, Parser, at_least
 from gasil_jax import npz, numpy_policy
+from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.evaluate import evaluate_in_gymnasium
-from gasil_jax.host import command_line, environments, output_file, run_folder
+from gasil_jax.evaluation import evaluate_in_gymnasium
+from gasil_jax.host import environments, output_file, sweep
 
 TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
 
@@ -47,10 +48,10 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
       InputError: if it is not the folder of a finished run on a locomotion task, or
         none of its seeds has a return.
     """
-    description = run_folder.read(folder)
-    algorithm, delay = description["algorithm"], description["settings"].reward_delay
-    with command_line.input_checked():
-        env = environments.make_env(description["env"])
+    trained = sweep.read(folder)
+    algorithm, delay = trained.algorithm, trained.settings.reward_delay
+    with input_checked():
+        env = environments.make_env(trained.env)
         saved = npz.read(folder / "policy.npz")
     if not environments.is_locomotion(env):
         raise InputError(f"run is {folder}: it must be of a locomotion task")
@@ -66,7 +67,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         num_episodes=episodes,
     )["episode_return"]
     about = {
-        "env": description["env"],
+        "env": trained.env,
         "reward_delay": delay,
         "agent": algorithm.agent.name,
         "decompose_rewards": algorithm.settings["decompose_rewards"],
@@ -76,7 +77,7 @@ def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
         "deviation": round(float(returns.std()), 1),
         "episodes": episodes,
     }
-    path = zoo / f"{name_of(description['env'], delay)}.npz"
+    path = zoo / f"{name_of(trained.env, delay)}.npz"
     words = f"{path.stem}: {about['mean']} in Gymnasium"
     if path.exists():
         before = json.loads(str(npz.read(path)["about"]))["mean"]

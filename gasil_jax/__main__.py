@@ -9,7 +9,7 @@ import gasil_jax
 from gasil_jax.errors import nearest
 
 #: The modules that have a command line.
-COMMANDS = ("run", "sweep", "merge", "evaluate", "render", "plot", "export_minari")
+COMMANDS = ("run", "sweep", "evaluate", "render", "plot")
 
 
 def _first_line(documentation: str | None) -> str:
@@ -18,8 +18,8 @@ def _first_line(documentation: str | None) -> str:
 
 def _summary(command: str) -> str:
     """Return the first line of a command's module, without importing it."""
-    source = pathlib.Path(__file__).with_name(f"{command}.py").read_text()
-    documentation = ast.get_docstring(ast.parse(source))
+    path = pathlib.Path(__file__).with_name("cli") / f"{command}.py"
+    documentation = ast.get_docstring(ast.parse(path.read_text()))
     return _first_line(documentation).partition(":")[0].rstrip(".")
 
 

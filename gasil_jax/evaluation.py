@@ -5,6 +5,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
@@ -120,3 +121,45 @@ def run_episodes(
     keys = jax.random.split(act_key, num_steps)
     _, _, return_, length = jax.lax.scan(step, start, keys)[0]
     return {"episode_return": return_, "episode_length": length}
+
+
+def evaluate_in_gymnasium(
+    gymnasium_id: str,
+    act: Callable[[np.ndarray], np.ndarray],
+    *,
+    num_episodes: int,
+    seed: int = 0,
+    num_steps: int | None = None,
+) -> dict[str, np.ndarray]:
+    """Run complete episodes of a policy in Gymnasium, with C MuJoCo.
+
+    Args:
+      gymnasium_id: name of the task, such as "Walker2d-v5".
+      act: observation -> action, as from `numpy_policy.load`.
+      num_episodes: number of episodes, which run one after the other.
+      seed: seed of the first episode; each next episode has the next seed.
+      num_steps: steps after which an episode is truncated; default the task's own.
+
+    Returns:
+      "episode_return" and "episode_length", (num_episodes,) each.
+    """
+    import gymnasium
+
+    if not callable(act):
+        raise refusal("act", act, "a function of an observation")
+    env = gymnasium.make(gymnasium_id, max_episode_steps=num_steps)
+    returns, lengths = [], []
+    for episode in range(num_episodes):
+        observation, _ = env.reset(seed=seed + episode)
+        total, length, running = 0.0, 0, True
+        while running:
+            observation, reward, terminated, truncated, _ = env.step(act(observation))
+            total, length = total + float(reward), length + 1
+            running = not (terminated or truncated)
+        returns.append(total)
+        lengths.append(length)
+    env.close()
+    return {
+        "episode_return": np.array(returns),
+        "episode_length": np.array(lengths),
+    }

@@ -3,17 +3,9 @@
 ``make("walker2d", reward_delay=20)`` returns an environment whose ``reset`` and
 ``step`` are pure functions for ``jax.jit`` and ``jax.vmap``; ``names()`` lists all
 environments. ``Locomotion(Task(...))`` is a robot of your own. Nothing here imports
-``gasil_jax``.
+``gasil_jax``. A module is imported when a name of it is first used.
 """
 
-import contextlib
-import io
+import lazy_loader
 
-# MJX prints at its first import that its optional Warp backend is absent.
-with contextlib.redirect_stdout(io.StringIO()):
-    import mujoco.mjx  # noqa: F401
-
-from gasil_envs.locomotion import Locomotion, Task
-from gasil_envs.registry import make, names
-
-__all__ = ["Locomotion", "Task", "make", "names"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,11 +20,11 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import Env
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeLimit
 
 from gasil_envs import pictures, registry, wrappers
+from gasil_envs.base import Env
 
 _NAMESPACE = "gasil_envs"
 _NO_FORK = (

@@ -11,10 +11,10 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs import State
 from flax import struct
 
 from gasil_envs import registry, wrappers
+from gasil_envs.base import State
 
 Transition = tuple[jax.Array, State, jax.Array, jax.Array, jax.Array, dict[str, Any]]
 

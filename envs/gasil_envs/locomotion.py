@@ -16,14 +16,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from brax.envs import Env, State
 from flax import struct
 
+from gasil_envs.base import Env, State
 from gasil_envs.physics import batching
 from gasil_envs.physics.dynamics import FIELDS
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
-from gasil_envs.physics.mjx import SOLVERS, MjxPhysics
+from gasil_envs.physics.mjx import MjxPhysics
 from gasil_envs.physics.native import MujocoPhysics
+from gasil_envs.physics.ours import ours_or_mjx
 
 # MuJoCo would also write each of its warnings to MUJOCO_LOG.TXT in the user's folder.
 _log = mujoco.MjLogConfig.get()
@@ -69,7 +70,7 @@ class Task:
       reward: (state before, state after, fields, action) -> reward (), added to the
         others.
       healthy: (state, fields) -> bool (), whether an episode goes on.
-      solver_iterations: number of Newton iterations of physics "mjx". 4 are enough for
+      solver_iterations: number of Newton iterations in JAX. 4 are enough for
         most states of Gymnasium's tasks, 8 for all of robots with more contacts.
       start: random key -> qpos (nq,), qvel (nv,) of an episode's start; None for the
         model's own, with noise.
@@ -359,14 +360,15 @@ class LocomotionState(struct.PyTreeNode):
     position: jax.Array
 
 
-#: Physics engines by name: (model, fields, solver, iterations) -> `Physics`.
-PHYSICS: Mapping[
-    str, Callable[[mujoco.MjModel, tuple[str, ...], str, int], Physics]
-] = types.MappingProxyType(
-    {
-        "mjx": MjxPhysics,
-        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
-    }
+#: Physics engines by name: (model, fields, iterations) -> `Physics`.
+PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], int], Physics]] = (
+    types.MappingProxyType(
+        {
+            "jax": ours_or_mjx,
+            "mjx": MjxPhysics,
+            "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+        }
+    )
 )
 
 #: Integrators by name; "model" is the integrator that the model specifies.
@@ -439,9 +441,9 @@ class Locomotion(Env):
 
     Args:
       task: the task, or the name of one in `TASKS`.
-      physics: "mjx", in pure JAX, or "mujoco", in C on the host's cores.
-      solver: implementation of physics "mjx": "small", our own, or "mjx", MJX's own
-        step, which is slower; see `MjxPhysics`.
+      physics: "jax", our own in pure JAX, with "mjx" and a warning in its place for a
+        model that it lacks a part of; "mjx", MuJoCo's MJX as shipped, which is slower;
+        or "mujoco", in C on the host's cores.
       integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
 
@@ -454,30 +456,25 @@ class Locomotion(Env):
         self,
         task: str | Task,
         *,
-        physics: str = "mjx",
-        solver: str = "small",
+        physics: str = "jax",
         integrator: str = "model",
     ):
         for what, name, names in (
             ("task", task, TASKS),
             ("physics", physics, PHYSICS),
-            ("solver", solver, SOLVERS),
             ("integrator", integrator, INTEGRATORS),
         ):
             if name not in names and not isinstance(name, Task):
                 raise ValueError(
                     f"{what} is {name!r}: it must be one of {', '.join(names)}"
                 )
-        batching.keep_loops(solver)
+        batching.keep_loops(physics)
         self.task = task = task if isinstance(task, Task) else TASKS[task]
         self.model = _load(task.xml)
         _check(task, self.model)
         if INTEGRATORS[integrator] is not None:
             self.model.opt.integrator = INTEGRATORS[integrator]
-        self._physics_name = physics
-        self.physics = PHYSICS[physics](
-            self.model, task.fields, solver, task.solver_iterations
-        )
+        self.physics = PHYSICS[physics](self.model, task.fields, task.solver_iterations)
         self.dt = self.model.opt.timestep * task.frame_skip
         # A NumPy array becomes a constant of the traced functions.
         self._start = np.asarray(self.model.qpos0, np.float32)
@@ -512,8 +509,8 @@ class Locomotion(Env):
 
     @property
     def backend(self) -> str:
-        """The name of the physics engine."""
-        return self._physics_name
+        """The name of the physics engine that steps the model."""
+        return self.physics.name
 
     def reset(self, rng: jax.Array) -> State:
         """Start as the task says, or at rest with noise on positions and velocities."""

@@ -14,10 +14,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import State
 from flax import struct
 
 from gasil_envs import locomotion, wrappers
+from gasil_envs.base import State
 
 #: The reward of each object, which is collected once, and those that end an episode.
 REWARDS: Mapping[str, float] = {"G": 1.0, "K": 1.0, "A": 1.0, "T": 10.0}

@@ -3,7 +3,8 @@
 import brax.envs
 import jax
 import jax.numpy as jnp
-from brax.envs import Env, Wrapper
+
+from gasil_envs.base import Env, Wrapper
 
 
 class _OfBrax(Wrapper):

@@ -11,9 +11,9 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from brax.envs import Env
 
 from gasil_envs import user_code
+from gasil_envs.base import Env
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.point_mass import PointMass
 

@@ -13,8 +13,9 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import Env, State
 from flax import struct
+
+from gasil_envs.base import Env, State
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,7 +1,6 @@
 """Build environments by name; check names and settings."""
 
 import dataclasses
-import difflib
 import importlib.util
 import numbers
 from collections.abc import Callable, Iterable
@@ -9,18 +8,17 @@ from typing import Any
 
 import jax
 import numpy as np
-from brax.envs import Env
 
 from gasil_envs import (
     locomotion,
     point_mass,
-    user_code,
     user_environment,
     worlds,
     wrappers,
 )
+from gasil_envs.base import Env
+from gasil_envs.errors import InputError, nearest, refusal, unknown
 from gasil_envs.physics import batching, native
-from gasil_envs.physics.mjx import SOLVERS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,10 +33,8 @@ class Settings:
       action_noise: standard deviation of Gaussian noise on the actions, in units of
         half their range; for discrete actions, the probability that an action is
         replaced by a random one. 0 means no noise.
-      physics: physics engine of locomotion: mjx, in pure JAX, or mujoco, in C on the
-        host's cores.
-      solver: implementation of the JAX physics: small, our own dynamics and solver, or
-        mjx, MJX's own step, which is slower.
+      physics: physics engine of locomotion: jax, our own in pure JAX; mjx, MuJoCo's
+        MJX as shipped, which is slower; or mujoco, in C on the host's cores.
       integrator: integrator of locomotion: model, the same as Gymnasium's, or euler,
         which is faster but changes the task.
       terminal_limits: whether an episode that reaches the step limit counts as
@@ -53,8 +49,7 @@ class Settings:
     reward_delay: int = 1
     obs_noise: float = 0.0
     action_noise: float = 0.0
-    physics: str = "mjx"
-    solver: str = "small"
+    physics: str = "jax"
     integrator: str = "model"
     terminal_limits: bool = False
     max_episode_steps: int | None = None
@@ -64,40 +59,13 @@ class Settings:
 _EPISODE_LENGTH = 1000
 
 
-def _refusal(name: str, value: Any, allowed: str) -> ValueError:
-    """Return the error for a value that is not allowed, in one short line."""
-    return ValueError(f"{name} is {user_code.shown(value)}: it must be {allowed}")
-
-
 def _refuse_unknown(
     kind: str, name: Any, allowed: Iterable[str], *, forms: Iterable[str] = ()
 ) -> None:
-    """Raise `ValueError` for a name that is not among the allowed ones.
-
-    Args:
-      kind: the kind of thing that is named, such as "env".
-      name: the name.
-      allowed: the names that exist.
-      forms: the forms of other allowed names, such as MODULE:NAME, for the message.
-    """
+    """Raise `ValueError` for a name that is not among the allowed ones."""
     allowed = tuple(allowed)
-    listed = ", ".join((*allowed, *forms))
-    if not isinstance(name, str):
-        raise _refusal(kind, name, f"one of {listed}")
-    if name in allowed:
-        return
-    name = name[:300]
-    # The prefix, which all names have, must not make them similar.
-    bare = {x.rpartition(":")[2].lower(): x for x in allowed}
-    given = name.rpartition(":")[2].lower()  # Gymnasium writes "Hopper-v5".
-    near = difflib.get_close_matches(given, bare, n=1, cutoff=0.7)
-    if not near and len(given) > 2:
-        near = [x for x in bare if given in x]
-    if not near:
-        raise ValueError(f"{kind} {name!r} is unknown: it must be one of {listed}")
-    raise ValueError(
-        f"{kind} {name!r} is unknown: did you mean {bare[near[0]]!r}? (one of {listed})"
-    )
+    if not isinstance(name, str) or name not in allowed:
+        raise InputError(unknown(kind, name, allowed, forms=tuple(forms)))
 
 
 def names() -> tuple[str, ...]:
@@ -126,9 +94,9 @@ def _constructor(name: str) -> Callable[[Settings], Env]:
 
 def _refuse_unknown_family(name: str, family: str) -> None:
     """Raise `ValueError` if a family's name is misspelled and is no module."""
-    near = difflib.get_close_matches(family.lower(), worlds.FAMILIES, n=1, cutoff=0.7)
-    if near and not _is_module(family):
-        meant = f"{near[0]}:{name.partition(':')[2]}"
+    near = nearest(family, worlds.FAMILIES)
+    if near is not None and not _is_module(family):
+        meant = f"{near}:{name.partition(':')[2]}"
         listed = ", ".join((*worlds.forms(), "MODULE:NAME"))
         raise ValueError(
             f"env {name!r} is of an unknown family: did you mean {meant!r}? (one of "
@@ -152,10 +120,7 @@ def _build_ours(name: str, settings: Settings) -> Env:
     if name == "point_mass":
         return point_mass.PointMass()
     return locomotion.Locomotion(
-        name,
-        physics=settings.physics,
-        solver=settings.solver,
-        integrator=settings.integrator,
+        name, physics=settings.physics, integrator=settings.integrator
     )
 
 
@@ -180,38 +145,32 @@ def check(name: str, settings: Settings) -> None:
         )
     _constructor(name)
     if ":" in name:
-        for field in ("physics", "solver", "integrator"):
+        for field in ("physics", "integrator"):
             value = getattr(settings, field)
             if value != getattr(Settings, field):
                 raise ValueError(
                     f"{field} is {value!r}: leave it out, {name} has its own physics"
                 )
     _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
-    _refuse_unknown("solver", settings.solver, SOLVERS)
     _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
-    if settings.physics != "mjx" and settings.solver != Settings.solver:
-        raise ValueError(
-            f"solver is {settings.solver!r}: it needs physics 'mjx', and physics is "
-            f"{settings.physics!r}"
-        )
     for field in ("terminal_limits", "observe_phase"):
         if not isinstance(value := getattr(settings, field), bool):
-            raise _refusal(field, value, "True or False")
+            raise refusal(field, value, "True or False")
     if settings.observe_phase and settings.reward_delay == 1:
         raise ValueError("observe_phase is True: it needs a reward_delay above 1")
     delay = settings.reward_delay
     # Steps are counted in int32.
     if not _is_whole(delay, 1, 2**31 - 1):
-        raise _refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
+        raise refusal("reward_delay", delay, f"a whole number, from 1 to {2**31 - 1}")
     for field in ("obs_noise", "action_noise"):
         noise = getattr(settings, field)
         # NumPy would convert the limit to the number's own type, such as float16.
         noise = noise.item() if isinstance(noise, np.generic) else noise
         # Numbers are float32.
         if not (_is_number(noise, numbers.Real) and 0.0 <= noise <= 3.4e38):
-            raise _refusal(field, getattr(settings, field), "finite and 0 or more")
+            raise refusal(field, getattr(settings, field), "finite and 0 or more")
     if settings.action_noise and name.startswith("sparse:") and "_noisy" in name:
-        raise _refusal("action_noise", settings.action_noise, f"0: {name} has its own")
+        raise refusal("action_noise", settings.action_noise, f"0: {name} has its own")
 
 
 def without_effect(name: str, settings: Settings) -> list[str]:
@@ -223,13 +182,13 @@ def without_effect(name: str, settings: Settings) -> list[str]:
     """
     if ":" in name or name in locomotion.TASKS:
         return []
-    of_physics = ("physics", "solver", "integrator")
+    of_physics = ("physics", "integrator")
     return [x for x in of_physics if getattr(settings, x) != getattr(Settings, x)]
 
 
 def prepare(settings: Settings, num_devices: int) -> None:
     """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
-    batching.keep_loops(settings.solver)
+    batching.keep_loops(settings.physics)
     if settings.physics == "mujoco":
         native.reserve_threads(num_devices)
 
@@ -242,7 +201,7 @@ def make(name: str, **settings: Any) -> Env:
         MODULE:NAME of your own class or function that builds an environment with Brax's
         interface.
       **settings: fields of `Settings`: reward_delay, obs_noise, action_noise, physics,
-        solver, integrator, terminal_limits, max_episode_steps, observe_phase.
+        integrator, terminal_limits, max_episode_steps, observe_phase.
 
     Raises:
       ValueError: if a name is unknown or a value is out of range.
@@ -252,17 +211,17 @@ def make(name: str, **settings: Any) -> Env:
         _refuse_unknown("setting", setting, allowed)
     chosen = Settings(**settings)
     check(name, chosen)
-    batching.keep_loops(chosen.solver)
+    batching.keep_loops(chosen.physics)
     env = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.max_episode_steps is not None:
         if not _is_whole(chosen.max_episode_steps, 1, limit):
             own_limit = f"a whole number from 1 to {limit}, the environment's own limit"
-            raise _refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
+            raise refusal("max_episode_steps", chosen.max_episode_steps, own_limit)
         limit = int(chosen.max_episode_steps)
     if chosen.action_noise > 0:
         if wrappers.is_discrete(env) and chosen.action_noise > 1:
-            raise _refusal(
+            raise refusal(
                 "action_noise", chosen.action_noise, f"at most 1, a share, for {name}"
             )
         env = wrappers.ActionNoise(env, float(chosen.action_noise))

@@ -74,15 +74,6 @@ def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
     return message if plain else typed
 
 
-def shown(value: Any) -> str:
-    """Return a value in one line that is not long, whatever it is."""
-    try:
-        text = " ".join(repr(value).split())
-    except Exception:  # It may be an object of the user's, or a number of 5,000 digits.
-        return f"of type {type(value).__name__}"
-    return text if len(text) < 300 else f"{text[:300]}..."
-
-
 def first_change(before: Any, after: Any) -> tuple[str, str, str] | None:
     """Return the first leaf of two pytrees of arrays whose dtype or shape differs.
 

@@ -11,9 +11,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import Env
 
 from gasil_envs import user_code, wrappers
+from gasil_envs.base import Env
+from gasil_envs.errors import shown
 
 #: The attributes of Brax's interface that training uses.
 INTERFACE = ("reset", "step", "observation_size")
@@ -87,8 +88,7 @@ def check(name: str, env: Any, trained: Any) -> None:
     for function in ("reset", "step"):
         if not callable(given := getattr(env, function)):
             raise ValueError(
-                f"env {name!r} has {function} {user_code.shown(given)}: it must be a "
-                "function"
+                f"env {name!r} has {function} {shown(given)}: it must be a function"
             )
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
@@ -138,13 +138,12 @@ def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
                 jax.eval_shape(lambda value=value: value)
             except TypeError:
                 raise ValueError(
-                    f"the {field} of its {function} is {user_code.shown(value)}: it "
+                    f"the {field} of its {function} is {shown(value)}: it "
                     "must be an array"
                 ) from None
         if not isinstance(state.info, Mapping):
             raise ValueError(
-                f"the info of its {function} is {user_code.shown(state.info)}: it must "
-                "be a dict"
+                f"the info of its {function} is {shown(state.info)}: it must be a dict"
             )
         return state
 

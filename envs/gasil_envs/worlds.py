@@ -16,9 +16,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import Env, State
 
 from gasil_envs import user_environment
+from gasil_envs.base import Env, State
 
 #: The module of each family, and the package that it needs, by the prefix of names.
 FAMILIES: Mapping[str, tuple[str, str]] = {

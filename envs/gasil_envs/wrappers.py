@@ -10,7 +10,8 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from brax.envs import Env, PipelineEnv, State, Wrapper
+
+from gasil_envs.base import Env, PipelineEnv, State, Wrapper
 
 #: C MuJoCo's mjMAXVAL: a larger number means that the simulation has failed.
 _LARGEST = 1e10

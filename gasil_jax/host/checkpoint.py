@@ -22,7 +22,7 @@ import re
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from typing import Any, NamedTuple, TypedDict
 
 import jax
@@ -30,7 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from gasil_jax.host import json_reader, metrics_files, output_file
+from gasil_jax.host import json_files, output_file
 
 _STATE, _MANIFEST = "state", "manifest.json"
 #: The name of the only array of a state that has none.
@@ -61,9 +61,6 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     Orbax takes a path with brackets or stars for a pattern, so no character of the
     other path means anything. What fails in Orbax's threads is raised once, and not
     logged.
-
-    Raises:
-      OSError: if the operating system has refused something.
     """
     logger, before = logging.getLogger("absl"), sys.unraisablehook
     level = logger.level
@@ -116,9 +113,6 @@ def save(folder: pathlib.Path, state: Any) -> None:
     """Write `state`, a pytree of arrays, to a new folder, and read it again.
 
     Arrays of no size, which Orbax refuses, are left out; `restore` makes them anew.
-
-    Raises:
-      OSError: if it can't be written, or if other numbers are read than were written.
     """
     arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
     arrays = {name: x for name, x in arrays.items() if x.size}
@@ -147,14 +141,6 @@ def restore(folder: pathlib.Path, like: Any) -> Any:
     """Read a state that `save` wrote, as NumPy arrays and random keys.
 
     They are not put on a device, which may be too small for all members together.
-
-    Args:
-      folder: the folder that `save` wrote to.
-      like: a state of the same structure, shapes and dtypes; its leaves may be
-        `jax.ShapeDtypeStruct`.
-
-    Raises:
-      ValueError: if the saved state has another structure, shape or dtype.
     """
     expected = jax.eval_shape(_as_arrays, like)
     arrays = _read_arrays(folder)
@@ -187,6 +173,28 @@ def _key_impl(key: Any) -> Any:
     return implementations[0]
 
 
+class Record(TypedDict):
+    """Facts about a checkpoint that can be read without its state.
+
+    Attributes:
+      metrics_rows: number of rows of metrics.csv when it was written.
+      evaluations_rows: number of rows of evaluations.csv.
+      score: mean score of the policies or, without evaluations, mean of the returns
+        since the checkpoint before; None if neither is known.
+    """
+
+    metrics_rows: int
+    evaluations_rows: int
+    score: float | None
+
+
+class _Manifest(TypedDict):
+    """The content of manifest.json."""
+
+    files: dict[str, str]
+    record: Record
+
+
 class Checkpoint(NamedTuple):
     """A complete, undamaged checkpoint.
 
@@ -198,7 +206,7 @@ class Checkpoint(NamedTuple):
 
     folder: pathlib.Path
     iteration: int
-    record: Mapping[str, Any]
+    record: Record
 
     def restore(self, like: Any) -> Any:
         """Return the saved state; see the function `restore`."""
@@ -209,21 +217,8 @@ class WriteError(output_file.WriteError):
     """A checkpoint could not be written; older ones are unharmed."""
 
 
-def write(
-    root: pathlib.Path, iteration: int, state: Any, record: Mapping[str, Any]
-) -> None:
-    """Write a checkpoint into the folder `root`, unless an undamaged one is there.
-
-    Args:
-      root: folder of the checkpoints, created if it is missing.
-      iteration: number of iterations so far.
-      state: a pytree of arrays.
-      record: facts that can be read without the state; written as JSON.
-
-    Raises:
-      WriteError: if it can't be written, for example because the disk is full, or if
-        it can't be read after it was written.
-    """
+def write(root: pathlib.Path, iteration: int, state: Any, record: Record) -> None:
+    """Write a checkpoint into the folder `root`, unless an undamaged one is there."""
     folder = root / f"{iteration:08d}"
     partial = root / f"{iteration:08d}{_PARTIAL}"
     try:
@@ -236,7 +231,7 @@ def write(
         partial.mkdir()
         save(partial / _STATE, state)
         manifest = {"files": _hashes(partial), "record": record}
-        metrics_files.write_json(partial / _MANIFEST, manifest)
+        json_files.write(partial / _MANIFEST, manifest)
         for path in [*partial.rglob("*"), partial]:
             _flush(path)
         shutil.rmtree(folder, ignore_errors=True)  # A damaged checkpoint.
@@ -248,15 +243,12 @@ def write(
 
 
 def check_writable(root: pathlib.Path) -> None:
-    """Write a tiny checkpoint below the folder `root`, and delete it.
-
-    Raises:
-      WriteError: if it can't be written and read.
-    """
+    """Write a tiny checkpoint below the folder `root`, and delete it."""
     # `delete_partial` deletes it if the process is killed.
     tiny = root / f"check{_PARTIAL}"
     try:
-        write(tiny, 0, {"x": np.zeros(1, np.float32)}, {})
+        record = Record(metrics_rows=0, evaluations_rows=0, score=None)
+        write(tiny, 0, {"x": np.zeros(1, np.float32)}, record)
     finally:
         shutil.rmtree(tiny, ignore_errors=True)
 
@@ -290,37 +282,10 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
     )
 
 
-class Record(TypedDict, total=False):
-    """The record in manifest.json, as `driver` writes it.
-
-    Older versions recorded sizes and scores alone.
-    """
-
-    metrics_size: int
-    metrics_rows: int
-    metrics_sha256: str
-    evaluations_size: int
-    evaluations_rows: int
-    evaluations_sha256: str
-    score: float | None
-
-
-class _Manifest(TypedDict):
-    """The content of manifest.json."""
-
-    files: dict[str, str]
-    record: Record
-
-
 def read(folder: pathlib.Path) -> Checkpoint:
-    """Return the checkpoint in `folder` after checking its manifest and its hashes.
-
-    Raises:
-      ValueError: if it is damaged.
-      OSError: if it can't be read now.
-    """
+    """Return the checkpoint in `folder` after checking its manifest and its hashes."""
     try:
-        manifest = json_reader.read(folder / _MANIFEST, _Manifest)
+        manifest = json_files.read(folder / _MANIFEST, _Manifest)
         hashes = _hashes(folder)
     except _DAMAGE_ERRORS as error:
         raise ValueError(f"{folder} is damaged: {error}") from None
@@ -344,37 +309,26 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
     return None, errors
 
 
-def newest_record(root: pathlib.Path) -> Record:
-    """Return the record of the newest readable checkpoint; empty if there is none."""
-    records = map(_record, reversed(_folders(root)))
-    return next(filter(None, records), Record())
-
-
 def best(root: pathlib.Path) -> Checkpoint | None:
-    """Return the undamaged checkpoint with the highest recorded "score", or None."""
+    """Return the checkpoint with the highest score, None if none has one."""
     scores = _scores(_folders(root))
-    for folder in sorted(scores, key=scores.__getitem__, reverse=True):
-        with contextlib.suppress(ValueError):
-            return read(folder)
-    return None
+    return read(max(scores, key=scores.__getitem__)) if scores else None
 
 
 def best_score(root: pathlib.Path) -> float:
-    """Return the highest recorded "score", or minus infinity if there is none."""
+    """Return the highest recorded score, or minus infinity if there is none."""
     return max(_scores(_folders(root)).values(), default=-math.inf)
 
 
 def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
-    """Return the scores of the checkpoints that have one."""
-    scores = {folder: _record(folder).get("score") for folder in folders}
-    return {folder: score for folder, score in scores.items() if score is not None}
-
-
-def _record(folder: pathlib.Path) -> Record:
-    """Return the record of a checkpoint; nothing if it can't be read."""
-    with contextlib.suppress(*_DAMAGE_ERRORS):
-        return json_reader.read(folder / _MANIFEST, _Manifest)["record"]
-    return {}
+    """Return the scores of the checkpoints that have one and can be read."""
+    scores = {}
+    for folder in folders:
+        with contextlib.suppress(*_DAMAGE_ERRORS):
+            record = json_files.read(folder / _MANIFEST, _Manifest)["record"]
+            if record["score"] is not None:
+                scores[folder] = record["score"]
+    return scores
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:

@@ -11,19 +11,12 @@ from gasil_jax.agents import AGENTS, Agent
 from gasil_jax.algorithms import Algorithm, check
 from gasil_jax.config import names
 from gasil_jax.errors import InputError, NotImportable, refusal, unknown
-from gasil_jax.host import json_reader
+from gasil_jax.host import json_files
 from gasil_jax.rewards import REWARD_MODELS
 
 
 def find_agent(name: Any) -> type[Agent]:
-    """Return the class of an agent's name.
-
-    Args:
-      name: a key of `AGENTS`, or MODULE:CLASS of an agent of your own.
-
-    Raises:
-      ValueError: if the name is unknown, or if it names no agent.
-    """
+    """Return the class of an agent's name."""
     if not isinstance(name, str):
         raise refusal("agent", name, "a string")
     if ":" not in name:
@@ -61,9 +54,6 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     """Return the algorithm that `describe` describes, also after a way through JSON.
 
     Settings that are missing have their defaults.
-
-    Raises:
-      ValueError: if a name is unknown, or a value of another type.
     """
     if "agent" not in values:
         raise InputError("agent is missing")
@@ -71,7 +61,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     agent = find_agent(settings.pop("agent"))
     algorithm = Algorithm(agent())
     switches = {
-        model.switch: json_reader.as_type(
+        model.switch: json_files.as_type(
             bool, settings.pop(model.switch, False), model.switch
         )
         for model in REWARD_MODELS
@@ -86,7 +76,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
             raise InputError(algorithm.why_not(name))
     return algorithm.replace(
         **{
-            name: json_reader.as_type(kinds[name], value, name)
+            name: json_files.as_type(kinds[name], value, name)
             for name, value in settings.items()
         }
     )

@@ -11,18 +11,13 @@ from typing import Any
 import jax
 import jaxlib
 
-from gasil_jax.host import command_line, environments
+from gasil_jax.host import environments
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
 
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
-    """Make JAX use the host's cores as devices; call it before JAX starts.
-
-    Args:
-      settings: settings of the environment.
-      requested: number of devices; None for one per core.
-      num_members: number of members, which is the largest number of devices used.
-    """
+    """Make JAX use the host's cores as devices; call it before JAX starts."""
     count = min(requested or environments.available_cores(), num_members)
     environments.prepare(settings, count)
     try:
@@ -31,7 +26,7 @@ def use_devices(settings: Settings, requested: int | None, num_members: int) -> 
         # The program has used JAX before, so the devices stay as they are.
         running = len(jax.devices("cpu"))
         if requested is not None and running != count:
-            command_line.note(
+            note(
                 f"devices is {requested}, which has no effect: JAX is already running "
                 f"with {running} CPU device{'s' if running > 1 else ''}"
             )

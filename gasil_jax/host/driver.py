@@ -1,15 +1,16 @@
-"""Train members in chunks; log, save and evaluate them between chunks.
+"""Train the members of a program in chunks; log, save and evaluate them in between.
 
 `drive` writes metrics.csv, checkpoints/ and, if policies are evaluated during training,
-evaluations.csv. A checkpoint records the sizes of the two tables and their hashes.
-Training that continues from it cuts the tables to these sizes and writes the same rows
-again.
+evaluations.csv. A checkpoint records the number of rows of the two tables. Training
+that continues from it cuts the tables to these rows and writes the later ones again.
 """
 
 import dataclasses
 import functools
+import importlib.metadata
 import math
 import pathlib
+import platform
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -19,21 +20,39 @@ import jax
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, command_line, metrics_files, run_folder
+from gasil_jax.host import checkpoint
+from gasil_jax.host.evaluations import Evaluation
 from gasil_jax.host.interruption import Interrupted, Interruption
 from gasil_jax.host.members import Members
-from gasil_jax.host.periodic_checkpoints import CheckpointSchedule, PeriodicCheckpoints
-from gasil_jax.host.periodic_evaluation import EvaluationSchedule, PeriodicEvaluation
+from gasil_jax.host.output_file import note
+from gasil_jax.host.programs import Training
 from gasil_jax.host.progress import Progress
+from gasil_jax.host.sweep import Recording
+from gasil_jax.host.tables import TableWriter
 from gasil_jax.host.trackers import Tracker, log
 from gasil_jax.train import TrainState
 
 # Largest duration of a chunk. The progress display is updated, and Ctrl-C takes effect,
 # after each chunk.
 _SECONDS_PER_CHUNK = 5.0
+_SECONDS_BETWEEN_CHECKPOINTS = 600.0
 _AFTER_COMPILATION = "stopping after compilation; Ctrl-C again quits now"
 
 _Columns = Mapping[str, np.ndarray]
+
+
+def versions() -> dict[str, str | None]:
+    """Return the versions of Python and packages; None if one is not installed."""
+
+    def version(package: str) -> str | None:
+        try:
+            return importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            return None
+
+    packages = "gasil_jax jax jaxlib flax optax brax mujoco mujoco-mjx gymnasium numpy"
+    every = {name: version(name) for name in packages.split()}
+    return {"python": platform.python_version(), **every}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,15 +96,13 @@ class Outcome:
 
     Attributes:
       states: the members' states after the last iteration.
-      measured: how this process trained, for a JSON file: "env_steps" over all members,
-        the seconds of compiling, of training without evaluations and of evaluations
-        (None without any), devices and versions.
+      training: how this process trained.
       unsaved: why the last checkpoint could not be written, to raise once the results
         are written; None if it was.
     """
 
     states: Any
-    measured: Mapping[str, Any]
+    training: Training
     unsaved: checkpoint.WriteError | None
 
 
@@ -140,121 +157,59 @@ class _Training:
         return FitProgress(done, env_steps, metrics, evaluation, copy_states)
 
 
-class _Tables:
-    """Writes metrics to metrics.csv, scores to evaluations.csv, and both to trackers.
+class _Checkpoints:
+    """Writes the checkpoints of training, and decides when.
 
-    Its arguments are those of `drive`, and the record of the checkpoint that training
-    continues from, None without one.
-
-    Attributes:
-      evaluation: the periodic evaluation; None for none.
-      score: the mean score of the current policies; None if they are not evaluated.
+    Args:
+      members: the members in training.
+      root: the folder of the checkpoints.
+      recording: says when, and how many are kept.
     """
 
-    def __init__(
-        self,
-        members: Members,
-        folder: pathlib.Path,
-        labels: Mapping[str, Sequence[Any]],
-        *,
-        evaluation_schedule: EvaluationSchedule | None,
-        trackers: Sequence[Tracker],
-        record: Mapping[str, Any] | None,
-    ):
-        self._trackers = trackers
-        # The finite returns since the last record, after an empty array.
-        self._returns = [np.empty(0, np.float32)]
-        self.score: float | None = None
-        path = folder / "metrics.csv"
-        self._metrics = metrics_files.MetricsWriter(path, labels, record)
-        self.evaluation = None
-        if evaluation_schedule is not None:
-            self.evaluation = PeriodicEvaluation(
-                members,
-                evaluation_schedule,
-                folder / "evaluations.csv",
-                labels=labels,
-                checkpoint=record,
-                trackers=trackers,
-            )
-
-    def write(self, metrics: _Columns) -> None:
-        """Write and log the metrics of a chunk, (members, iterations) each."""
-        self._metrics.write(metrics)
-        log(self._trackers, metrics)
-        returns = metrics["episode_return"]
-        self._returns.append(returns[np.isfinite(returns)])
+    def __init__(self, members: Members, root: pathlib.Path, recording: Recording):
+        self._members, self._root = members, root
+        self._keep, self._interval = recording.keep_checkpoints, math.inf
+        if recording.checkpoint_every is not None:
+            steps = members.config.batch_steps
+            self._interval = math.ceil(recording.checkpoint_every / steps)
+        self._saved_at = time.monotonic()
+        self._best_score = checkpoint.best_score(root)
+        if self._keep:
+            checkpoint.check_writable(root)
 
     def iterations_left(self, done: int) -> float:
-        """Return the iterations to the next evaluation; infinity if there is none."""
-        evaluation = self.evaluation
-        return math.inf if evaluation is None else evaluation.iterations_left(done)
+        """Return the iterations to the next checkpoint; infinity if time decides."""
+        return self._interval - done % self._interval
 
-    def evaluate(self, training: _Training, progress: Progress) -> _Columns | None:
-        """Evaluate the policies if it is time; write, log and return their scores."""
-        self.score = None
-        if self.evaluation is None or not self.evaluation.is_due(training.done):
-            return None
-        with progress.aside("evaluating the policies"):
-            scores = self.evaluation.score(training.states, training.done)
-        self.score = float(scores["mean"].mean(dtype=np.float64))
-        return scores
+    def is_due(self, done: int, score: float | None) -> bool:
+        """Return whether it is time for a checkpoint or the score is the best yet."""
+        if score is not None and score > self._best_score:
+            return True
+        if math.isinf(self._interval):
+            return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
+        return done % self._interval == 0
 
-    def record(self) -> dict[str, Any]:
-        """Write everything to the disk; return a record of it for a checkpoint.
-
-        It has each file's size, rows and hash and, as "score", the mean score of the
-        current policies or, without evaluations, the mean of all returns since the last
-        record.
-        """
-        record = self._metrics.record()
-        returns = np.concatenate(self._returns)
-        del self._returns[1:]
-        if self.evaluation is None:
-            return record | {"score": float(returns.mean()) if returns.size else None}
-        return record | self.evaluation.writer.record() | {"score": self.score}
-
-    def close(self) -> None:
-        """Close the files and the trackers."""
-        self._metrics.close()
-        if self.evaluation is not None:
-            self.evaluation.writer.close()
-        for tracker in self._trackers:
-            tracker.close()
+    def save(self, done: int, states: Any, record: checkpoint.Record) -> None:
+        """Write a checkpoint, and delete older ones that need not be kept."""
+        if (score := record["score"]) is not None:
+            self._best_score = max(self._best_score, score)
+        if self._keep:
+            states = self._members.trim(states)
+            checkpoint.write(self._root, done, states, record)
+            checkpoint.prune(self._root, self._keep)
+            self._saved_at = time.monotonic()
 
 
 def _restored(
-    members: Members, root: pathlib.Path, progress: Progress, *, tables: Sequence[str]
-) -> tuple[_Training, Mapping[str, Any] | None]:
-    """Return the training after the newest undamaged checkpoint, and its record.
-
-    Without one, training is at its beginning and the record is None. Newer, damaged
-    checkpoints are renamed with a warning, and partial ones are deleted.
-
-    Args:
-      members: the members to train.
-      root: the folder of the checkpoints.
-      progress: the progress display.
-      tables: names of the tables whose sizes the checkpoint must have recorded.
-
-    Raises:
-      InputError: if the checkpoint has another state or no size of a table, or if there
-        is none although the folder holds the results of training that has ended.
-    """
-    folder = root.parent
+    members: Members, root: pathlib.Path, progress: Progress
+) -> tuple[_Training, checkpoint.Record | None]:
+    """Return the training after the newest undamaged checkpoint, and its record."""
     with progress.aside("reading the checkpoints"):
         newest, errors = checkpoint.latest(root)
-    for name in [f"{table}_size" for table in tables]:
-        if newest is not None and name not in newest.record:
-            raise InputError(
-                f"{newest.folder} has no {name}: it was written with other options, "
-                "for example without evaluate_every"
-            )
-    if newest is None and run_folder.has_results(folder):
-        why = f" ({errors[0]})" if errors else ""
+    if newest is None and (root.parent / "training.json").exists():
         raise InputError(
-            f"{folder} holds the results of training that has ended, and no undamaged "
-            f"checkpoint to continue from{why}: name another folder"
+            f"{root.parent} holds training that has ended, and no undamaged checkpoint "
+            "to continue from: name another folder"
         )
     for error in errors:
         start = "the beginning" if newest is None else newest.folder.name
@@ -262,32 +217,25 @@ def _restored(
     checkpoint.delete_partial(root)
     checkpoint.set_aside(root, newer_than=-1 if newest is None else newest.iteration)
     if newest is None:
-        if not errors and (folder / "metrics.csv").exists():
-            print(
-                f"warning: {folder} has no checkpoint: training starts from the "
-                "beginning, and the old tables are kept under other names",
-                file=sys.stderr,
-            )
+        if not errors and (root.parent / "metrics.csv").exists():
+            note(f"{root.parent} has no checkpoint: training starts from the beginning")
         return _Training(members), None
     with progress.aside(f"restoring {newest.folder.name}"):
-        with command_line.input_checked():
-            states = newest.restore(members.shapes())
+        states = newest.restore(members.shapes())
     return _Training(members, states, newest.iteration), newest.record
 
 
 def drive(
     members: Members,
     folder: pathlib.Path,
-    labels: Mapping[str, Sequence[Any]],
+    labels: Mapping[str, Sequence[int]],
     *,
-    schedule: CheckpointSchedule,
+    recording: Recording,
     progress: Progress,
     interruption: Interruption,
-    evaluation_schedule: EvaluationSchedule | None = None,
     steps_before: int = 0,
     trackers: Sequence[Tracker] = (),
     callback: Callback | None = None,
-    on_restored: Callable[[], None] = lambda: None,
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
@@ -295,48 +243,73 @@ def drive(
       members: the members to train.
       folder: the folder of metrics.csv, evaluations.csv and checkpoints/.
       labels: columns that identify the members in the tables, (members,) each.
-      schedule: the times of checkpoints and the number to keep.
+      recording: what is recorded, and when.
       progress: the progress display.
       interruption: checked after each chunk; if it has a signal, a checkpoint is
         written.
-      evaluation_schedule: the times of evaluations; None for none.
       steps_before: environment steps that `progress` has already counted.
       trackers: trackers that also get the metrics; they are closed at the end.
       callback: called after each chunk; if it returns true, training ends there.
-      on_restored: called once training can begin or continue without an error.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint has another state or no size of a table, if a table
-        is damaged, or if the folder holds results but no undamaged checkpoint.
+      InputError: if the checkpoint has another state, if a table lacks rows, or if the
+        folder holds results but no undamaged checkpoint.
       OSError: if the folder can't be written, or if the disk is full. If only the last
         checkpoint can't, the outcome has the error.
     """
     root = folder / "checkpoints"
-    names = ("metrics",) if evaluation_schedule is None else ("metrics", "evaluations")
-    training, record = _restored(members, root, progress, tables=names)
-    with command_line.input_checked():
-        tables = _Tables(
+    training, record = _restored(members, root, progress)
+    rows: Mapping[str, Any] = record or {}
+    table = TableWriter(folder / "metrics.csv", labels, rows.get("metrics_rows", 0))
+    evaluation = None
+    if recording.evaluate_every is not None:
+        evaluation = Evaluation(
             members,
-            folder,
-            labels,
-            evaluation_schedule=evaluation_schedule,
+            every=recording.evaluate_every,
+            num_episodes=recording.evaluate_episodes,
+            table=TableWriter(
+                folder / "evaluations.csv",
+                labels,
+                rows.get("evaluations_rows", 0),
+                columns=Evaluation.COLUMNS,
+            ),
             trackers=trackers,
-            record=record,
         )
-    on_restored()
-    checkpoints = PeriodicCheckpoints(members, root, schedule)
-    checkpoints.check()
-    first = training.done
+    checkpoints = _Checkpoints(members, root, recording)
+    first, score = training.done, None
+    # The finite returns since the last checkpoint, after an empty array.
+    returns = [np.empty(0, np.float32)]
 
     def steps_of(done: int) -> int:
         return steps_before + members.env_steps(done)
 
+    def evaluate() -> _Columns | None:
+        nonlocal score
+        score = None
+        if evaluation is None or not evaluation.is_due(training.done):
+            return None
+        with progress.aside("evaluating the policies"):
+            scores = evaluation.score(training.states, training.done)
+        score = float(scores["mean"].mean(dtype=np.float64))
+        return scores
+
     def save() -> None:
+        every = np.concatenate(returns)
+        del returns[1:]
+        own = score
+        if evaluation is None and every.size:
+            own = float(every.mean())
         with progress.aside("saving a checkpoint"):
-            done, states = training.done, training.states
-            record = tables.record()
-            checkpoints.save(done, states, record=record, score=tables.score)
+            table.flush()
+            if evaluation is not None:
+                evaluation.table.flush()
+            record = checkpoint.Record(
+                metrics_rows=table.rows,
+                evaluations_rows=0 if evaluation is None else evaluation.table.rows,
+                score=own,
+            )
+            checkpoints.save(training.done, training.states, record)
 
     started = time.monotonic()
     if training.left:
@@ -348,23 +321,27 @@ def drive(
     progress.phase("training", steps_of(first))
     started, stopped, warned = time.monotonic(), False, False
     # A checkpoint from before the first iteration may have a score already.
-    has_scores = record is not None and record.get("evaluations_size")
-    if first == 0 and interruption.signal is None and not has_scores:
-        tables.evaluate(training, progress)
+    if first == 0 and interruption.signal is None and not rows.get("evaluations_rows"):
+        evaluate()
     while training.left and not stopped and interruption.signal is None:
         done = training.done
-        most = min(checkpoints.iterations_left(done), tables.iterations_left(done))
+        most = checkpoints.iterations_left(done)
+        if evaluation is not None:
+            most = min(most, evaluation.iterations_left(done))
         metrics = training.train_chunk(most)
-        tables.write(metrics)
-        progress.update(steps_of(training.done), metrics["episode_return"])
+        table.write(metrics)
+        log(trackers, metrics)
+        ended = metrics["episode_return"]
+        returns.append(ended[np.isfinite(ended)])
+        progress.update(steps_of(training.done), ended)
         if not warned and np.any(metrics["skipped_updates"] > 0):
             warned = True
             progress.warn(
                 "an update was undone because a number in it was not finite: see "
                 "skipped_updates in metrics.csv"
             )
-        scores = tables.evaluate(training, progress)
-        if checkpoints.is_due(training.done, tables.score):
+        scores = evaluate()
+        if checkpoints.is_due(training.done, score):
             save()
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
@@ -375,21 +352,25 @@ def drive(
     except checkpoint.WriteError as error:
         unsaved = error
     with progress.aside("closing the trackers"):
-        tables.close()
+        table.close()
+        if evaluation is not None:
+            evaluation.table.close()
+        for tracker in trackers:
+            tracker.close()
     if interruption.signal is not None and training.left and not stopped:
         raise unsaved or Interrupted(interruption.signal)
-    evaluation = tables.evaluation
     evaluation_seconds = None if evaluation is None else evaluation.seconds
     return Outcome(
         states=members.trim(training.states),
-        measured={
-            "env_steps": members.env_steps(training.done - first),
-            "compile_seconds": compile_seconds,
-            "train_seconds": train_seconds - (evaluation_seconds or 0.0),
-            "evaluation_seconds": evaluation_seconds,
-            "device": members.device_kind,
-            "device_count": len(members.devices),
-            "versions": metrics_files.versions(),
-        },
+        training=Training(
+            iterations=training.done,
+            env_steps=members.env_steps(training.done - first),
+            compile_seconds=compile_seconds,
+            train_seconds=train_seconds - (evaluation_seconds or 0.0),
+            evaluation_seconds=evaluation_seconds,
+            device=members.device_kind,
+            device_count=len(members.devices),
+            versions=versions(),
+        ),
         unsaved=unsaved,
     )

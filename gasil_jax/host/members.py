@@ -18,8 +18,9 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding
 from jax.sharding import PartitionSpec as P
 
-from gasil_jax import checks, train
-from gasil_jax.algorithms import Algorithm, check_numbers
+from gasil_envs.precision import full_precision
+from gasil_jax import train
+from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, Range
 from gasil_jax.errors import refusal
 
@@ -169,9 +170,10 @@ class Members:
         A member's key comes from its seed alone.
         """
 
+        @full_precision
         def init_one(seed: Any, hyperparameters: Any) -> Any:
-            key = jax.random.key(seed)
-            return train.init(self.env, self.algorithm, key, hyperparameters)
+            algorithm = self.algorithm.replace(**hyperparameters)
+            return train.first_state(self.env, algorithm, jax.random.key(seed))
 
         return jax.jit(
             self._shard(jax.vmap(init_one), P("members")), in_shardings=self.sharding
@@ -317,14 +319,7 @@ def make_members(
         name; default none.
       devices: the devices to shard over, default all. At most one for each member is
         used.
-
-    Raises:
-      ValueError: if the algorithm or a number is not allowed.
     """
-    checks.check(env, algorithm)
-    # The algorithm's own are checked with it.
-    for one in hyperparameters or ():
-        check_numbers(algorithm, one)
     every = hyperparameters or [{}] * len(seeds)
     numbers = [{**algorithm.hyperparameters, **one} for one in every]
     devices = list(devices or jax.devices())[: len(seeds)]

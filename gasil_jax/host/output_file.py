@@ -5,6 +5,7 @@ import errno
 import os
 import pathlib
 import re
+import sys
 import uuid
 from collections.abc import Iterator, Sequence
 
@@ -18,6 +19,11 @@ _FULL = (errno.ENOSPC, errno.EDQUOT)
 
 class WriteError(OSError):
     """A file or folder could not be written; the message is one line with its path."""
+
+
+def note(text: str) -> None:
+    """Print a line to stderr about something that is allowed but may be a mistake."""
+    print(f"note: {text}", file=sys.stderr)
 
 
 def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
@@ -68,11 +74,7 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 
 def make_parent(path: pathlib.Path) -> None:
-    """Create the folder of a file, and check that a file can be written in it.
-
-    Raises:
-      InputError: if it can't be created or written to.
-    """
+    """Create the folder of a file, and check that a file can be written in it."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = _partial(path)
@@ -92,23 +94,12 @@ def is_temporary(path: pathlib.Path) -> bool:
     return re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name) is not None
 
 
-def delete_temporary(path: pathlib.Path) -> None:
-    """Delete the temporary files of killed processes; none may write the file now."""
-    for other in path.parent.glob(f".{path.stem}.*{path.suffix}"):
-        if is_temporary(other):
-            with contextlib.suppress(OSError):
-                other.unlink()
-
-
 @contextlib.contextmanager
 def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
     """Yield a temporary path beside the file, which is renamed to it at the end.
 
     A reader never sees a half written file, and several processes may write the same
     file. If the block raises an error, the temporary file is deleted.
-
-    Raises:
-      WriteError: if it can't be written.
     """
     partial = _partial(path)
     try:

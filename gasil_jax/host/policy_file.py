@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from gasil_jax import numpy_policy, policy
-from gasil_jax.host import command_line, output_file
+from gasil_jax.host import output_file
 
 
 def save(
@@ -28,7 +28,7 @@ def save(
     """
     weights = policy.weights(states, env)
     if "network" in weights:
-        command_line.note(f"{path.name} is not written: {numpy_policy.OWN_NETWORK}")
+        output_file.note(f"{path.name} is not written: {numpy_policy.OWN_NETWORK}")
         return
     arrays: dict[str, Any] = {
         "seeds": np.asarray(seeds, np.int64),

@@ -22,12 +22,7 @@ _SECONDS_BEFORE_ANNOUNCEMENT = 1.0
 
 @contextlib.contextmanager
 def announced(title: str, name: str) -> Iterator[None]:
-    """Print a line to stderr if the `with` block takes more than a second.
-
-    Args:
-      title: name of the program or run; the line is "TITLE: NAME".
-      name: what the block does.
-    """
+    """Print a line to stderr if the `with` block takes more than a second."""
     timer = threading.Timer(_SECONDS_BEFORE_ANNOUNCEMENT, _line, (title, name))
     timer.daemon = True
     timer.start()

@@ -1,4 +1,4 @@
-"""Check before compiling that a batch of runs fits the devices and the disk."""
+"""Check before compiling that programs fit the devices' memory and the disk."""
 
 import contextlib
 import math
@@ -12,20 +12,19 @@ import jax
 from gasil_envs import wrappers
 from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import Config
+from gasil_jax.errors import InputError
+from gasil_jax.host.programs import Program
+from gasil_jax.host.sweep import Recording
 
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
 _BATCHES_PER_PROGRAM = 8
 # Memory of a gradient step, or of a network's pass over a batch, in outputs of its
-# layers. XLA reports 1.9 to 3.1, and twice that with a penalty on the gradient.
+# layers. XLA reports 1.9 to 3.1.
 _OUTPUTS_PER_STEP = 2.5
 # Memory of an evaluated episode, in states of its environment. XLA reports 7 (point
 # mass) and 25 (hopper).
 _STATES_PER_EPISODE = 7
-# The folder of all control groups, and the file that lists those of this process.
-_CONTROL_GROUPS = pathlib.Path("/sys/fs/cgroup")
-_OWN_CONTROL_GROUPS = pathlib.Path("/proc/self/cgroup")
 
 
 class Need(NamedTuple):
@@ -44,6 +43,31 @@ class Need(NamedTuple):
     shared: int = 0
 
 
+def check(
+    env: Any,
+    programs: Sequence[Program],
+    recording: Recording,
+    devices: Sequence[jax.Device],
+    folder: pathlib.Path,
+) -> None:
+    """Raise `InputError`, with the sizes, if programs do not fit memory or disk."""
+    sizes = []
+    for each in programs:
+        count, one = len(each.runs), need(env, each.algorithm)
+        check_memory(one, each.algorithm, count, devices)
+        if recording.evaluate_every is not None:
+            check_episodes(
+                env,
+                recording.evaluate_episodes,
+                count,
+                devices,
+                option="evaluate_episodes",
+            )
+        sizes.append(one.state * count)
+    # One more, because the best checkpoint is kept too.
+    _check_disk(sizes, folder, recording.keep_checkpoints + 1, programs)
+
+
 def _size(tree: Any) -> int:
     def bytes_of(leaf: Any) -> int:
         # A key consists of two 32-bit words.
@@ -56,25 +80,28 @@ def _size(tree: Any) -> int:
 def need(env: Any, algorithm: Algorithm) -> Need:
     """Estimate the bytes that one run needs; memory is within a factor of two."""
     state = jax.eval_shape(lambda: train.init(env, algorithm, jax.random.key(0)))
-    config = algorithm.config
+    config, settings = algorithm.config, algorithm.settings
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + wrappers.action_size(env) + 12
     batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
     steps = _gradient_steps(env, algorithm)
     # What is learned may be large, and is copied if it is not donated. Gradient steps
     # come after the batch's other uses, and one after the other.
-    learned = _size(state.agent) + _size(state.actor_critic)
-    memory = _size(state) + learned + max(batches, *steps.values())
+    agent, networks = _size(state.agent), _size(state.actor_critic)
+    memory = _size(state) + agent + networks + max(batches, *steps.values())
     data = _size(jax.eval_shape(algorithm.agent.data))
+    buffers = "".join(
+        f", with {name} {settings[name]}"
+        for name in ("buffer_steps", "sil_buffer_steps")
+        if name in settings
+    )
     episodes = (state.environments, state.history, state.rewards)
     parts = {
         f"batches, with batch_steps {config.batch_steps}": batches,
         f"running episodes, with num_envs {config.num_envs}": _size(episodes),
-        f"the state of agent {algorithm.agent.name!r}{_of_buffer(algorithm)}": (
-            2 * _size(state.agent)
-        ),
+        f"the state of agent {algorithm.agent.name!r}{buffers}": 2 * agent,
         f"the data of agent {algorithm.agent.name!r}": data,
-        "networks": 2 * _size(state.actor_critic),
+        "networks": 2 * networks,
         **steps,
     }
     largest = max(parts, key=lambda part: parts[part])
@@ -96,18 +123,13 @@ def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
             widths = widths if widths in settings else "hidden_sizes"
             sizes = {name: minibatch_size, "batch_steps": settings["batch_steps"]}
             largest = max(sizes, key=lambda size: sizes[size])
-            rows = sizes[largest]
+            # A model of delayed rewards draws whole windows.
+            window = settings.get(name.replace("minibatch_size", "window_steps"), 1)
+            rows = max(sizes[largest], minibatch_size * window)
             outputs = _OUTPUTS_PER_STEP * 4 * rows * (inputs + sum(settings[widths]))
             words = f"{largest} {rows} and {widths} {settings[widths]}"
             steps[f"outputs of layers, with {words}"] = int(outputs)
     return steps
-
-
-def _of_buffer(algorithm: Algorithm) -> str:
-    """Return the size of the agent's buffer in words, if it has one."""
-    names = ("buffer_steps", "sil_buffer_steps")
-    sizes = {x: y for x, y in algorithm.settings.items() if x in names}
-    return "".join(f", with {name} {size}" for name, size in sizes.items())
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
@@ -129,58 +151,29 @@ def available(devices: Sequence[jax.Device]) -> int | None:
     return min(free, default=None)
 
 
-class _Files(NamedTuple):
-    """The files of a control group's limit and use, and the field of its cache."""
-
-    limit: str
-    used: str
-    cached: str
-
-
-_VERSION_1 = _Files(
-    "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
-)
-_VERSION_2 = _Files("memory.max", "memory.current", "inactive_file")
-
-
 def _free_in_control_groups(
-    root: pathlib.Path = _CONTROL_GROUPS, own: pathlib.Path = _OWN_CONTROL_GROUPS
+    root: pathlib.Path = pathlib.Path("/sys/fs/cgroup"),
+    own: pathlib.Path = pathlib.Path("/proc/self/cgroup"),
 ) -> list[int]:
-    """Return the bytes left below each limit of this process's control groups.
+    """Return the bytes left below each limit of this process's control group.
 
     A group's limit also holds for the groups in it. The kernel's cache of files counts
     as free.
-
-    Args:
-      root: the folder of all groups.
-      own: the file that lists the groups of this process.
     """
-    free = []
-    try:
-        lines = own.read_text().splitlines()
-    except OSError:  # Only Linux has control groups.
-        return []
-    for line in lines:
-        _, controllers, path = line.split(":", 2)
-        names, top = _VERSION_2, root
-        if controllers:
-            names, top = _VERSION_1, root / "memory"
-            if "memory" not in controllers.split(","):
-                continue
-        group = top / path.lstrip("/")
+    free: list[int] = []
+    # Only Linux has control groups, and a group may have no limit.
+    with contextlib.suppress(OSError, LookupError):
+        group = root / own.read_text().strip().split(":", 2)[2].lstrip("/")
         for folder in (group, *group.parents):
-            # The group may have no such file, or no limit.
             with contextlib.suppress(OSError, ValueError, LookupError):
-                free.append(_free_in(folder, names))
-            if folder == top:
+                limit = int((folder / "memory.max").read_text())
+                used = int((folder / "memory.current").read_text())
+                lines = (folder / "memory.stat").read_text().splitlines()
+                cached = int(dict(map(str.split, lines))["inactive_file"])
+                free.append(limit - used + cached)
+            if folder == root:
                 break
     return free
-
-
-def _free_in(group: pathlib.Path, names: _Files) -> int:
-    limit, used = (int((group / x).read_text()) for x in (names.limit, names.used))
-    lines = (group / "memory.stat").read_text().splitlines()
-    return limit - used + int(dict(map(str.split, lines))[names.cached])
 
 
 def _padded(count: int, devices: Sequence[jax.Device]) -> int:
@@ -189,36 +182,27 @@ def _padded(count: int, devices: Sequence[jax.Device]) -> int:
 
 
 def check_memory(
-    one: Need, config: Config, num_members: int, devices: Sequence[jax.Device]
+    one: Need, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
-    """Check that training fits the devices' memory.
-
-    Args:
-      one: what one run needs.
-      config: PPO's settings of the runs.
-      num_members: number of members that are trained at once.
-      devices: the devices that they are sharded over, at most one for each member.
-
-    Raises:
-      ValueError: if it does not fit; the message gives the sizes.
-    """
+    """Raise `InputError` if members, trained at once, do not fit into memory."""
     used = devices[:num_members]
     required = _padded(num_members, used) * one.memory + len(used) * one.shared
-    if (free := available(used)) is not None and required > free:
-        # Each device trains the same number of members.
-        fit = max(0, free // len(used) - one.shared) // one.memory * len(used)
-        if fit == 0:
-            alone = _in_words(one.memory + one.shared)
-            raise ValueError(
-                f"a single seed needs about {alone} of memory, and "
-                f"{_in_words(free)} are free: most is for {one.largest_part}"
-            )
-        sizes = f"num_envs {config.num_envs} and batch_steps {config.batch_steps}"
-        raise ValueError(
-            f"seeds are {num_members} (over all points): they need about "
-            f"{_in_words(required)} of memory, {_in_words(one.memory)} each with "
-            f"{sizes}, and {_in_words(free)} are free: at most {fit} fit"
+    if (free := available(used)) is None or required <= free:
+        return
+    # Each device trains the same number of members.
+    fit = max(0, free // len(used) - one.shared) // one.memory * len(used)
+    if fit == 0:
+        raise InputError(
+            f"a single seed needs about {_in_words(one.memory + one.shared)} of "
+            f"memory, and {_in_words(free)} are free: most is for {one.largest_part}"
         )
+    config = algorithm.config
+    raise InputError(
+        f"seeds are {num_members} (over all points): they need about "
+        f"{_in_words(required)} of memory, {_in_words(one.memory)} each with num_envs "
+        f"{config.num_envs} and batch_steps {config.batch_steps}, and "
+        f"{_in_words(free)} are free: at most {fit} fit"
+    )
 
 
 def check_episodes(
@@ -229,80 +213,45 @@ def check_episodes(
     *,
     option: str = "episodes",
 ) -> None:
-    """Check that an evaluation's parallel episodes fit the devices' memory.
-
-    Args:
-      env: one environment.
-      num_episodes: number of episodes of each policy.
-      num_policies: number of policies that are evaluated at once.
-      devices: the devices that they are sharded over, at most one for each policy.
-      option: name of the option that sets the number of episodes.
-
-    Raises:
-      ValueError: if they do not fit; the message gives the sizes.
-    """
+    """Raise `InputError` if an evaluation's episodes do not fit the devices' memory."""
     state = _size(jax.eval_shape(env.reset, jax.random.key(0)))
     used = devices[:num_policies]
     each, free = _STATES_PER_EPISODE * state * num_episodes, available(used)
     required = _padded(num_policies, used) * each
     if free is not None and required > free:
-        raise ValueError(
+        raise InputError(
             f"{option} is {num_episodes}: the episodes of {num_policies} policies at "
             f"once need at least {_in_words(required)} of memory, and "
             f"{_in_words(free)} are free"
         )
 
 
-def check_disk(
-    sizes: Sequence[tuple[int, int]],
+def _check_disk(
+    sizes: Sequence[int],
     folder: pathlib.Path,
     num_checkpoints: int,
-    *,
-    written: int = 0,
+    programs: Sequence[Program],
 ) -> None:
-    """Check that the checkpoints fit the disk.
-
-    Args:
-      sizes: of each program the bytes of a member's checkpoint, and the members.
-      folder: the folder of the checkpoints; it need not exist.
-      num_checkpoints: number of checkpoints to keep of each member.
-      written: bytes of the runs' earlier checkpoints, which new ones replace.
-
-    Raises:
-      ValueError: if they do not fit; the message gives the sizes.
-    """
+    """Raise `InputError` if checkpoints of these sizes do not fit the disk."""
     while not folder.exists():
         folder = folder.parent
-    programs = [size * count for size, count in sizes]
+    written = 0
+    for each in programs:
+        # Earlier checkpoints, which new ones replace; damaged ones are kept.
+        for path in each.path.glob("checkpoints/[0-9]*[0-9]/**/*"):
+            # Another process may delete it meanwhile.
+            with contextlib.suppress(OSError):
+                written += path.stat().st_size if path.is_file() else 0
     # While a checkpoint is being written there is one more.
-    required = num_checkpoints * sum(programs) + max(programs, default=0)
-    free = _free_disk(folder)
-    if free is not None and required > free + written:
-        members = sum(count for _, count in sizes)
-        raise ValueError(
-            f"out is in {folder.absolute()}, where {_in_words(free)} are free: "
-            f"{num_checkpoints} checkpoints of {members} seeds (over all points), and "
-            f"one that is being written, need {_in_words(required)}"
-        )
-
-
-def size_of_checkpoints(folder: pathlib.Path) -> int:
-    """Return the bytes of a folder's checkpoints, of which there may be none.
-
-    Damaged ones do not count, because they are kept.
-    """
-    size = 0
-    for path in folder.glob("checkpoints/[0-9]*[0-9]/**/*"):
-        # Another process may delete it meanwhile.
-        with contextlib.suppress(OSError):
-            size += path.stat().st_size if path.is_file() else 0
-    return size
-
-
-def _free_disk(folder: pathlib.Path) -> int | None:
+    required = num_checkpoints * sum(sizes) + max(sizes, default=0)
     usage = shutil.disk_usage(folder)
     # A virtual file system such as /proc has no size.
-    return usage.free if usage.total else None
+    if usage.total and required > usage.free + written:
+        raise InputError(
+            f"out is in {folder.absolute()}, where {_in_words(usage.free)} are free: "
+            f"{num_checkpoints} checkpoints of each run, and one that is being "
+            f"written, need {_in_words(required)}"
+        )
 
 
 def _in_words(number: int) -> str:

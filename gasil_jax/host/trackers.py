@@ -19,7 +19,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host import command_line
+from gasil_jax.host.output_file import note
 
 _Config = Mapping[str, Any]
 #: What each member has of its own, by its label.
@@ -117,10 +117,7 @@ def _lacks_key() -> bool:
 
 
 def _identifier(path: pathlib.Path) -> str:
-    """Return the random identifier in a file, which is created if it is missing.
-
-    It distinguishes runs whose folders have the same name.
-    """
+    """Return the random identifier in a file, which is created if it is missing."""
     with contextlib.suppress(FileExistsError), path.open("x") as file:
         file.write(uuid.uuid4().hex)
     return path.read_text()
@@ -157,7 +154,7 @@ def check(names: Sequence[str]) -> None:
                 f'(pip install "gasil_jax[{name}]")'
             ) from None
     if "wandb" in names and _lacks_key():
-        command_line.note(
+        note(
             "log is 'wandb' and there is no API key: the run is kept in its folder, "
             "for `wandb sync` (`wandb login` beforehand logs online)"
         )
@@ -171,18 +168,7 @@ def make(
     config: _Config,
     members: _Members,
 ) -> list[Tracker]:
-    """Return the trackers of a run.
-
-    Args:
-      names: names in `TRACKERS`.
-      folder: folder of the run, or of a program of a sweep.
-      run_name: name that the run has in the trackers.
-      config: settings to show with the run.
-      members: those that each member has of its own, such as its seed, by its label.
-
-    Raises:
-      InputError: if a tracker can't start.
-    """
+    """Return the trackers of a run."""
     kinds = [TRACKERS[name][1] for name in names]
     return [kind(folder, run_name, config, members) for kind in kinds]
 

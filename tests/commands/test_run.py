@@ -332,7 +332,7 @@ def test_a_run_in_which_no_episode_can_end_is_told(capsys):
             "--physics mujoco",
             ["physics is mujoco, which has no effect: point_mass has none"],
         ),
-        ("--solver mjx", ["solver is mjx, which has no effect"]),
+        ("--physics mjx", ["physics is mjx, which has no effect"]),
         ("--integrator euler", ["integrator is euler, which has no effect"]),
         (
             "--no-normalize-rewards --reward-clip 3",

@@ -29,7 +29,7 @@ EACH_NAME = [
 
 
 @functools.cache
-def env_and_functions(name, physics="mjx"):
+def env_and_functions(name, physics="jax"):
     """The environment, and its jitted and vmapped reset and step."""
     env = gasil_envs.make(name, physics=physics)
     return env, jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
@@ -74,7 +74,7 @@ def gymnasium_transitions(name):
 @pytest.mark.parametrize("physics", locomotion.PHYSICS)
 @pytest.mark.parametrize("name", EACH_NAME[1:])
 def test_one_step_equals_gymnasiums(name, physics):
-    if physics == "mjx" and name in ("humanoidstandup", "pusher"):
+    if physics == "jax" and name in ("humanoidstandup", "pusher"):
         pytest.skip("the one has humanoid's model, the other MJX's own step")
     env, reset, step = env_and_functions(name, physics)
     # Here, and not in a test of its own, so that a step is compiled once. A reset is

@@ -24,7 +24,7 @@ from gasil_envs.physics import (
     solver,
 )
 from gasil_envs.physics.interface import PhysicsState
-from gasil_envs.physics.mjx import MjxPhysics
+from gasil_envs.physics.ours import ours_or_mjx
 from gasil_jax import rollout
 from gasil_jax.distributions import GAUSSIAN
 
@@ -57,13 +57,15 @@ def test_a_batch_of_one_is_a_batch():
     np.testing.assert_array_equal(tiled(jnp.ones((3, 1))), np.full((3, 1), 2.0))
 
 
-@pytest.mark.parametrize(("name", "expected"), [("small", True), ("mjx", False)])
+@pytest.mark.parametrize(
+    ("name", "expected"), [("jax", True), ("mujoco", True), ("mjx", False)]
+)
 def test_only_our_physics_gets_the_option_that_keeps_loops(monkeypatch, name, expected):
     monkeypatch.setenv("XLA_FLAGS", "")
-    registry.prepare(registry.Settings(solver=name), 1)
+    registry.prepare(registry.Settings(physics=name), 1)
     assert ("disable_loop_unrolling" in os.environ["XLA_FLAGS"]) is expected
     monkeypatch.setenv("XLA_FLAGS", "")
-    gasil_envs.make("inverted_pendulum", solver=name)
+    gasil_envs.make("inverted_pendulum", physics=name)
     assert ("disable_loop_unrolling" in os.environ["XLA_FLAGS"]) is expected
 
 
@@ -286,7 +288,7 @@ BALL = """<mujoco><option cone="{cone}" timestep="0.01"/><worldbody>
 @pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
 def test_a_model_that_the_small_solver_cant_take_falls_back(cone, caplog):
     model = mujoco.MjModel.from_xml_string(BALL.format(cone=cone))
-    physics = MjxPhysics(model)
+    physics = ours_or_mjx(model)
     assert ("its friction cones are elliptic" in caplog.text) == (cone == "elliptic")
     data = mujoco.MjData(model)
     data.qvel[:] = [0.3, 0.0, -0.2, 1.0, 2.0, 3.0]

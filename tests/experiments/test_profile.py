@@ -125,7 +125,7 @@ def test_what_a_benchmark_measured_is_a_line_for_each_task():
 def test_mjx_is_timed_in_a_process_without_the_option_of_our_loops(monkeypatch):
     monkeypatch.setattr(benchmark, "_FLAGS", "")
     monkeypatch.setenv("XLA_FLAGS", "")
-    batching.keep_loops("small")
+    batching.keep_loops("jax")
     option = "'disable_loop_unrolling' in __import__('os').environ['XLA_FLAGS']"
     build = functools.partial(
         benchmark.Row, "ant", "mjx", 8, functools.partial(eval, option)

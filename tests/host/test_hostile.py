@@ -158,7 +158,7 @@ CASES = [
             ("reward_delay", is_whole),
             ("obs_noise", is_real),
             ("action_noise", is_real),
-            ("physics", is_one_of("mjx", "mujoco")),
+            ("physics", is_one_of("jax", "mjx", "mujoco")),
             ("terminal_limits", is_bool),
             ("observe_phase", lambda x: x is False),  # Without a delay.
             ("max_episode_steps", lambda x: x is None or is_whole(x, 1, 100)),

@@ -18,18 +18,18 @@ from jax.experimental.xla_metadata import set_xla_metadata
 _LOOPS = "xla_cpu_disable_loop_unrolling"
 
 
-def keep_loops(solver: str) -> None:
+def keep_loops(physics: str) -> None:
     """Make XLA's CPU backend compile loops over a small batch to vector instructions.
 
     Otherwise XLA unrolls these loops and computes one number at a time: with 8 to 32
     environments our physics is then 2 to 3 times slower, and MJX by half faster. So
-    nothing is done for the solver "mjx". The option is of a whole process: this
+    nothing is done for physics "mjx". The option is of a whole process: this
     function adds it to the environment variable XLA_FLAGS, so call it before JAX
     starts. If XLA_FLAGS has --xla_backend_extra_options already, the variable is not
     changed.
     """
     flags = os.environ.get("XLA_FLAGS", "")
-    if solver != "mjx" and "xla_backend_extra_options" not in flags:
+    if physics != "mjx" and "xla_backend_extra_options" not in flags:
         flags = f"{flags} --xla_backend_extra_options={_LOOPS}"
         os.environ["XLA_FLAGS"] = flags.strip()
 
@@ -90,6 +90,17 @@ def total(x: jax.Array, axis: int = 0) -> jax.Array:
     out it computes for a whole vector of the batch at once.
     """
     return add(jax.lax.index_in_dim(x, i, axis, False) for i in range(x.shape[axis]))
+
+
+def constant_times(matrix: np.ndarray, x: jax.Array) -> jax.Array:
+    """Return a constant matrix (n, m) times (m, ..., B), without its zeros."""
+    rows = [
+        add([float(row[i]) * x[i] for i in np.flatnonzero(row)])
+        if row.any()
+        else jnp.zeros_like(x[0])
+        for row in matrix
+    ]
+    return stacked(rows) if rows else x[:0]
 
 
 def fold(function: Any, rows: jax.Array) -> jax.Array:

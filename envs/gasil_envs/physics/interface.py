@@ -27,7 +27,12 @@ class Physics(Protocol):
     """Steps one model with pure functions, which work under `jax.jit` and `jax.vmap`.
 
     The constructor takes the names of the ``mjData`` arrays that are returned.
+
+    Attributes:
+      name: jax, mjx or mujoco.
     """
+
+    name: str
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

@@ -164,6 +164,8 @@ class MujocoPhysics:
         may use, divided by the local devices of JAX's default backend.
     """
 
+    name = "mujoco"
+
     def __init__(
         self,
         model: mujoco.MjModel,
@@ -187,7 +189,7 @@ class MujocoPhysics:
         # MJX may lack some of these, and placing bodies needs none.
         placed.geom_contype[:] = placed.geom_conaffinity[:] = 0
         placed.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self._at_start = MjxPhysics(placed, fields, solver="mjx")
+        self._at_start = MjxPhysics(placed, fields)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

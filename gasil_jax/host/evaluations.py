@@ -6,37 +6,21 @@ length. Evaluations do not change training, not by a single bit.
 """
 
 import math
-import pathlib
 import time
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import jax
 import numpy as np
 
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host import metrics_files
 from gasil_jax.host.members import Members
+from gasil_jax.host.tables import TableWriter
 from gasil_jax.host.trackers import Tracker
 from gasil_jax.train import TrainState
 
-#: Columns of evaluations.csv after those that identify the members.
-COLUMNS = ("env_steps", "mean", "min", "max", "length")
 # Far from the usual seed numbers, because training takes its keys from those.
 _ROOT = 2**32 - 1
-
-
-class EvaluationSchedule(NamedTuple):
-    """The times of evaluations and their number of episodes.
-
-    Attributes:
-      every: environment steps per seed between two evaluations, rounded up to whole
-        iterations; the untrained and the final policy are always evaluated.
-      num_episodes: number of episodes of each policy, in fresh environments.
-    """
-
-    every: int
-    num_episodes: int
 
 
 def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Array:
@@ -50,32 +34,32 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
     )
 
 
-class PeriodicEvaluation:
+class Evaluation:
     """Evaluates all members with one compiled program, sharded as training is.
 
     Args:
       members: the members that are trained.
-      schedule: the times of evaluations and their number of episodes.
-      path: the file evaluations.csv.
-      labels: columns that identify the members, (members,) each.
-      checkpoint: see `metrics_files.MetricsWriter`.
+      every: environment steps per seed between two evaluations, rounded up to whole
+        iterations; the untrained and the final policy are always evaluated.
+      num_episodes: number of episodes of each policy, in fresh environments.
+      table: writes evaluations.csv.
       trackers: trackers that also get the scores.
 
     Attributes:
+      table: as given.
       seconds: time of all evaluations in this process, including compilation.
-
-    Raises:
-      ValueError: if rows that the checkpoint has seen are missing or have changed.
     """
+
+    #: Columns of evaluations.csv after those that identify the members.
+    COLUMNS = ("env_steps", "mean", "min", "max", "length")
 
     def __init__(
         self,
         members: Members,
-        schedule: EvaluationSchedule,
-        path: pathlib.Path,
         *,
-        labels: Mapping[str, Sequence[Any]],
-        checkpoint: Mapping[str, Any] | None = None,
+        every: int,
+        num_episodes: int,
+        table: TableWriter,
         trackers: Sequence[Tracker] = (),
     ):
         def score(state: TrainState, seed: jax.Array) -> dict[str, jax.Array]:
@@ -84,17 +68,14 @@ class PeriodicEvaluation:
                 members.algorithm,
                 state,
                 key=evaluation_key(seed, state.iteration),
-                num_episodes=schedule.num_episodes,
+                num_episodes=num_episodes,
             )
 
-        self.seconds = 0.0
-        self._interval = math.ceil(schedule.every / members.config.batch_steps)
+        self.table, self.seconds = table, 0.0
+        self._interval = math.ceil(every / members.config.batch_steps)
         self._members, self._trackers = members, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
-        self.writer = metrics_files.MetricsWriter(
-            path, labels, checkpoint, columns=COLUMNS
-        )
 
     def iterations_left(self, done: int) -> int:
         """Return the iterations from `done` to the next evaluation, at least one."""
@@ -107,10 +88,6 @@ class PeriodicEvaluation:
 
     def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
         """Evaluate the policies, write the scores and log them to the trackers.
-
-        Args:
-          states: the members' training states, padded as in training; not donated.
-          done: number of iterations so far.
 
         Returns:
           The columns of evaluations.csv, (members,) each.
@@ -126,7 +103,7 @@ class PeriodicEvaluation:
             "max": returns.max(axis=1),
             "length": length.mean(axis=1),
         }
-        self.writer.write({name: x[:, None] for name, x in scores.items()})
+        self.table.write({name: x[:, None] for name, x in scores.items()})
         for tracker in self._trackers:
             tracker.log(int(scores["env_steps"][0]), {"evaluation": scores["mean"]})
         self.seconds += time.monotonic() - started

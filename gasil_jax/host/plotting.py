@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from gasil_jax.statistics import (
-    FEW_POINTS,
     FEWEST_SEEDS,
     are_numbers,
     bootstrap_interval,
@@ -96,13 +95,7 @@ def draw_returns(
 def label_ends(
     axes: Any, ends: Mapping[str, float], color_of: Mapping[str, Any]
 ) -> None:
-    """Write names beside the ends of lines, apart from each other.
-
-    Args:
-      axes: where the lines are, which must all be drawn.
-      ends: the y value at which each line ends, by its name, the highest first.
-      color_of: the color of each name.
-    """
+    """Write names beside the ends of lines, apart from each other."""
     low, high = axes.get_ylim()
     gap = 0.06  # Of the height of the axes, for this font size.
     heights = [(y - low) / (high - low) for y in ends.values()]
@@ -119,13 +112,7 @@ def label_ends(
 
 
 def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:
-    """Write below a figure what its lines and intervals are.
-
-    Args:
-      figure: the figure.
-      num_seeds: number of seeds of each line.
-      more: what else there is to say.
-    """
+    """Write below a figure what its lines and intervals are."""
     *others, largest = sorted(set(num_seeds))
     seeds = f"{', '.join(map(str, others))}{' or ' if others else ''}{largest}"
     seeds += " seed" if largest == 1 else " seeds"
@@ -216,7 +203,6 @@ def marginals(
     values: Mapping[str, Sequence[Any]],
     returns: np.ndarray,
     *,
-    importance: Mapping[str, float | None],
     best: int | None,
     left_out: int,
 ) -> None:
@@ -226,7 +212,6 @@ def marginals(
       path: the image file.
       values: each point's value of every hyperparameter that varies, by name.
       returns: each point's mean final return, (points,), all finite.
-      importance: `statistics.importance` of each hyperparameter.
       best: index of the point that is marked as the best; None for none.
       left_out: number of points without a return, which are not among these.
     """
@@ -239,9 +224,7 @@ def marginals(
     grid = figure.subplots(rows, columns, sharey=True, squeeze=False)
     for axes, name in zip(grid.flat, values):
         _draw_marginal(axes, values[name], returns, best=best)
-        share = importance[name]
-        title = "" if share is None else f"importance {share:.0%}"
-        axes.set(xlabel=name.replace("_", " "), title=title)
+        axes.set(xlabel=name.replace("_", " "))
     for axes in grid.flat[len(values) :]:
         axes.remove()
     for axes in grid[:, 0]:
@@ -252,12 +235,6 @@ def marginals(
     text = "point: mean over its seeds; mean: over the points of each value"
     if any(len(groups(x)) < len(set(x)) for x in values.values()):
         text += ", or of neighbouring values with fewer than two points each"
-    if any(share is not None for share in importance.values()):
-        text += "; importance: share of the points' variance that these means explain, "
-        text += "corrected for their number"
-        if len(returns) < FEW_POINTS:
-            text += f" (uncertain with {len(returns)} points: shares may add up to "
-            text += "more than 100%)"
     if left_out:
         text += f"; {left_out} of {len(returns) + left_out} points are left out, "
         text += "because a seed has no return"

@@ -1,13 +1,12 @@
-"""Find and load the training states and policies that a run or a sweep has saved."""
+"""Load the training states and policies that a folder holds."""
 
 import contextlib
-import dataclasses
 import functools
 import math
 import pathlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,60 +21,88 @@ from gasil_jax.config import Range
 from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     checkpoint,
-    command_line,
     environments,
-    json_reader,
-    run_folder,
+    programs,
+    results,
+    sweep,
+    tables,
+    training,
 )
 from gasil_jax.host.members import member
-from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.plan import stored_plan
-from gasil_jax.sweeps.programs import Program
+from gasil_jax.host.output_file import note
+from gasil_jax.host.programs import Program
+from gasil_jax.host.sweep import Sweep
 
 
-class _Summary(TypedDict):
-    """The field of a sweep's summary.json that is read here."""
+def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
+    """Return the environment's and the agent's name, and the programs of a point.
 
-    best_by_mean: int | None
+    The programs have the runs of that point alone. Only their tables can be read if
+    Python alone can make what was trained.
 
-
-def find(
-    description: Mapping[str, Any], point: int | None
-) -> list[tuple[Program, list[int]]]:
-    """Return the programs of a run, or of a sweep's point, with its members in each.
-
-    The run or sweep is described by `run_folder.read`; the point is as in `load`.
+    Args:
+      folder: folder of the run or sweep, which need not be finished.
+      point: number of the point; default the best by mean.
 
     Raises:
-      InputError: if the folder has no such point.
+      InputError: if it is no such folder, or has no such point.
     """
-    folder = description["out"]
-    if "points" not in description:
-        if point is not None:
-            raise InputError(
-                f"point is {point}: {folder} is a run, which has no points"
-            )
-        run = programs.of_run(description, description["algorithm"])
-        return [(run, list(range(len(run.runs))))]
-    plan = stored_plan(description)
-    last = len(plan.points) - 1
-    if point is None:
-        with contextlib.suppress(FileNotFoundError):
-            point = json_reader.read(folder / "summary.json", _Summary)["best_by_mean"]
-        if point is None:
+    described = sweep.described(folder)
+    agent = str(described["algorithm"].get("agent"))
+    chosen = _choose_point(folder, described["points"], point)
+    if described["only_python"] is None:
+        return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
+    return described["env"], agent, programs.labelled(folder / "programs", chosen)
+
+
+def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
+    """Return the seed with the highest final return of a point; None if unknown.
+
+    A policy of the zoo has one seed, which needs no name.
+    """
+    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
+        return None
+    scores = {}
+    for each in find(folder, point)[2]:
+        table = each.table("metrics.csv", ("episode_return",))
+        for i, columns in zip(each.indices, table, strict=True):
+            if columns:
+                final = tables.final_returns(columns["episode_return"])
+                scores[each.labels["seed"][i]] = float(
+                    np.nan_to_num(final, nan=-np.inf)
+                )
+    return max(scores, key=scores.__getitem__) if scores else None
+
+
+def _choose_point(
+    folder: pathlib.Path, points: Sequence[Mapping[str, Any]], point: int | None
+) -> int:
+    """Return the number of the requested point; by default the best by mean."""
+    last = len(points) - 1
+    if point is None and last > 0:
+        if (point := results.best_point(folder)) is None:
             raise InputError(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"
             )
+        values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
+        note(f"{folder}: point {point}, the best by mean ({values})")
+    point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
-    requested, saved = {plan.runs[point, seed] for seed in plan.seeds}, []
-    for each in plan.stored(folder):
-        if indices := [i for i, run in enumerate(each.runs) if run in requested]:
-            saved.append((each, indices))
-    if not saved:
-        raise InputError(f"point is {point}: none of its seeds is in {folder} yet")
-    return saved
+    return point
+
+
+def _programs(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
+    """Return the programs that hold a point's runs, with no other runs."""
+    runs = {stored.runs[point, seed] for seed in stored.seeds}
+    of_point = []
+    for each in stored.stored(folder):
+        if kept := [i for i, run in enumerate(each.runs) if run in runs]:
+            of_point.append(each.only(kept))
+    if not of_point:
+        raise InputError(f"run is {folder}: none of its seeds has begun")
+    return of_point
 
 
 def load(
@@ -84,57 +111,87 @@ def load(
     point: int | None = None,
     *,
     seed: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
 ) -> tuple[Any, Algorithm, list[int], Any]:
-    """Return environment, algorithm, seed numbers and states (seed, ...) of a run.
+    """Return environment, algorithm, seed numbers and states (seed, ...) of a point.
 
     Args:
       folder: folder of the run or sweep, which need not be finished.
       which: the checkpoint to load: "last", or "best", which has the best evaluation
         or, without evaluations, the highest returns in training.
-      point: number of a sweep's point; default the best by mean.
+      point: number of the point; default the best by mean.
       seed: number of the seed; default all seeds.
+      env: the environment; default that which config.json describes.
+      algorithm: the algorithm; default that which config.json describes.
 
     Raises:
       InputError: if it is not the folder of a run, if it has no such checkpoint or
-        seed, or if "best" is requested of a point that shares its checkpoints with
-        other points.
+        seed, if the checkpoint is damaged, or if "best" is requested of a point that
+        shares its checkpoints with other points.
     """
     for name, number in (("point", point), ("seed", seed)):
         if number is not None and number not in Range(-math.inf, whole=True):
             raise refusal(name, number, "a whole number")
     if not isinstance(which, str) or which not in ("last", "best"):
         raise refusal("which", which, "'last' or 'best'")
-    description = run_folder.read(folder)
-    every = find(description, point)
-    settings = dataclasses.asdict(description["settings"])
-    with command_line.input_checked():
-        env = environments.make_env(description["env"], **settings)
+    stored = sweep.read(folder, algorithm)
+    point = _choose_point(folder, stored.points, point)
+    if env is None:
+        with _named(folder):
+            env = training.make_env(stored)
+    return env, *restore(folder, stored, env, point=point, which=which, seed=seed)
+
+
+@contextlib.contextmanager
+def _named(folder: pathlib.Path) -> Any:
+    try:
+        yield
+    except ValueError as error:
+        raise InputError(f"run is {folder}: {error}") from None
+
+
+def restore(
+    folder: pathlib.Path,
+    stored: Sweep,
+    env: Any,
+    *,
+    point: int,
+    which: str = "last",
+    seed: int | None = None,
+) -> tuple[Algorithm, list[int], Any]:
+    """Return algorithm, seed numbers and states (seed, ...) of a point; see `load`."""
     states: dict[int, train.TrainState] = {}
-    for program, indices in every:
-        if which == "best" and len(indices) < len(program.runs):
+    every = _programs(folder, stored, point)
+    for each in every:
+        if which == "best" and len(each.runs) < each.num_members:
             raise InputError(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        root = program.path / "checkpoints"
-        chosen, errors = checkpoint.latest(root)
-        for error in errors:
-            print(f"warning: {error}", file=sys.stderr)
+        root = each.path / "checkpoints"
         if which == "best":
-            chosen = checkpoint.best(root)
+            with _named(folder):
+                chosen = checkpoint.best(root)
+        else:
+            chosen, errors = checkpoint.latest(root)
+            for error in errors:
+                print(f"warning: {error}", file=sys.stderr)
         if chosen is None:
             scored = " with a score" if which == "best" else ""
             raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
-        init = functools.partial(train.first_state, env, program.algorithm)
-        keys = jax.random.split(jax.random.key(0), len(program.runs))
-        with command_line.input_checked():
+        init = functools.partial(train.first_state, env, each.algorithm)
+        keys = jax.random.split(jax.random.key(0), each.num_members)
+        with _named(folder):
             # The leaves of all members have the same shapes.
             restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
-        states |= {program.seeds[i]: member(restored, i) for i in indices}
-    seeds = sorted(states)
+        own = zip(each.seeds, each.indices, strict=True)
+        states |= {number: member(restored, i) for number, i in own}
+    seeds = [x for x in stored.seeds if x in states]
     if seed is not None:
         if seed not in seeds:
-            raise InputError(f"seed is {seed}: the run has {seeds[0]} to {seeds[-1]}")
+            listed = ", ".join(map(str, seeds))
+            raise InputError(f"seed is {seed}: the run has {listed}")
         seeds = [seed]
 
     # JAX would compile a program for each shape, but only it can stack random keys.
@@ -143,8 +200,7 @@ def load(
         return jax.device_put(library.stack(leaves))
 
     stacked = jax.tree.map(stack, *(states[x] for x in seeds))
-    first, (index, *_) = every[0]
-    return env, first.runs[index].algorithm, seeds, stacked
+    return every[0].algorithm, seeds, stacked
 
 
 class Policies(NamedTuple):
@@ -191,10 +247,9 @@ def load_policies(
         return Policies(env, train.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":
         raise InputError(f"run is {folder}: it has no points and no checkpoints")
-    with command_line.input_checked():
-        arrays = numpy_policy.read(folder, seed)
-        about = numpy_policy.about(str(folder))
-        env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
+    arrays = numpy_policy.read(folder, seed)
+    about = numpy_policy.about(str(folder))
+    env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
     return Policies(env, int(env.episode_length), [about["seed"]], [arrays])
 
 
@@ -204,6 +259,8 @@ def load_reward(
     *,
     which: str = "last",
     point: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
 ) -> Callable[[Any, Any], jax.Array]:
     """Return the reward that a run's discriminator has learned, as a pure function.
 
@@ -215,6 +272,8 @@ def load_reward(
       seed: number of the seed; default the run's first.
       which: see `load`.
       point: see `load`.
+      env: see `load`; needed if the environment was made in Python.
+      algorithm: see `load`; needed if it was made in Python.
 
     Raises:
       ValueError: as `load` does, or if the run's agent has no discriminator, or a bonus
@@ -222,7 +281,9 @@ def load_reward(
     """
     if not isinstance(folder, str | pathlib.PurePath):
         raise refusal("folder", folder, "a string or a pathlib.Path")
-    env, algorithm, _, states = load(pathlib.Path(folder), which, point, seed=seed)
+    env, algorithm, _, states = load(
+        pathlib.Path(folder), which, point, seed=seed, env=env, algorithm=algorithm
+    )
     agent, state = algorithm.agent, member(states, 0)
     if not isinstance(agent, AdversarialAgent):
         raise InputError(

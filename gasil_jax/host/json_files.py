@@ -1,17 +1,20 @@
-"""Read the JSON files of a run folder, and check their content against a type."""
+"""Write JSON files, and read them with their content checked against a type."""
 
 import contextlib
 import dataclasses
-import hashlib
 import json
 import math
 import pathlib
 import types
 import typing
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, get_args, get_origin, get_type_hints
 
+import jax
+import numpy as np
+
 from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.host import output_file
 
 _DESCRIPTIONS = {
     str: "a string",
@@ -21,13 +24,26 @@ _DESCRIPTIONS = {
     types.NoneType: "null",
 }
 
-#: The field that `metrics_files.write_json` adds, with the hash of the others.
-HASH = "sha256"
+
+def write(path: pathlib.Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file atomically."""
+    with output_file.atomic(path) as partial:
+        partial.write_text(to_json(content) + "\n")
 
 
-def digest(content: Any) -> str:
-    """Return the SHA-256 of the content of a JSON file, however it is laid out."""
-    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+def to_json(content: Mapping[str, Any]) -> str:
+    """Return what `write` writes; raise `TypeError` if a value has no JSON form."""
+    return json.dumps(content, indent=2, default=_to_json, allow_nan=False)
+
+
+def _to_json(value: Any) -> Any:
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        return np.asarray(value).tolist()
+    if isinstance(value, pathlib.PurePath):
+        return str(value)
+    raise TypeError(f"{type(value).__name__} has no JSON form")
 
 
 @contextlib.contextmanager
@@ -42,47 +58,17 @@ def blamed(path: pathlib.Path) -> Iterator[None]:
         raise
     # Deeply nested brackets cause a RecursionError.
     except (ValueError, RecursionError, LookupError, TypeError) as error:
-        raise InputError(
-            f"{path} is damaged, or another program wrote it: {error}"
-        ) from None
+        raise InputError(f"{path} is damaged: {error}") from None
 
 
 def read(path: pathlib.Path, kind: Any) -> Any:
-    """Return the content of a JSON file, checked against a type and its own hash.
-
-    Args:
-      path: the file.
-      kind: the type: a dataclass, of which an instance is returned; a `TypedDict`,
-        whose undeclared fields are returned unchecked; str, int (0 or more), float
-        (finite), bool or None; a tuple, which is a list in the file; a dict; a union of
-        these; or `Any`, which is not checked, but whose lists become tuples.
-
-    Raises:
-      InputError: if the content has another type, which the message names, or if it
-        has changed since it was written.
-      NotImportable: if it names an agent that can't be imported here.
-      OSError: if there is no such file.
-    """
+    """Return the content of a JSON file, checked against a type."""
     with blamed(path):
-        content = json.loads(path.read_text())
-        written = content.pop(HASH, None) if isinstance(content, dict) else None
-        value = as_type(kind, content, "")
-        if written not in (None, digest(content)):
-            raise ValueError(f"it was changed: to use it as it is, delete its {HASH}")
-        return value
+        return as_type(kind, json.loads(path.read_text()), "")
 
 
 def as_type(kind: Any, value: Any, name: str) -> Any:
-    """Return a value of a JSON file as a type; see `read`.
-
-    Args:
-      kind: the type.
-      value: the value.
-      name: name of the field that holds it, such as "config.alpha".
-
-    Raises:
-      InputError: if the value has another type.
-    """
+    """Return a value of a JSON file as a type; see `read`."""
     origin, arguments = get_origin(kind), get_args(kind)
     if kind is Any:
         return _with_tuples(value)
@@ -103,32 +89,24 @@ def as_type(kind: Any, value: Any, name: str) -> Any:
             kinds = arguments[:1] * len(value)
         if len(value) == len(kinds):
             return tuple(as_type(one, x, name) for one, x in zip(kinds, value))
-    elif isinstance(value, dict):
-        if dataclasses.is_dataclass(kind):
-            return _with_fields(kind, value, name)
-        if typing.is_typeddict(kind):
-            hints = get_type_hints(kind)
-            if missing := sorted(kind.__required_keys__ - set(value)):
-                raise InputError(f"{_join(name, missing[0])} is missing")
-
-            def of(key: str) -> Any:
-                return hints.get(key, Any)
-
-            return {
-                key: as_type(of(key), x, _join(name, key)) for key, x in value.items()
-            }
+    elif isinstance(value, dict) and dataclasses.is_dataclass(kind):
+        hints = get_type_hints(kind)
+        for key in value:
+            if key not in hints:
+                raise InputError(f"{_join(name, key)} is unknown")
+        made: Any = kind
+        return made(**{x: as_type(hints[x], y, x) for x, y in value.items()})
+    elif isinstance(value, dict) and typing.is_typeddict(kind):
+        if missing := sorted(kind.__required_keys__ - set(value)):
+            raise InputError(f"{_join(name, missing[0])} is missing")
+        hints = get_type_hints(kind)
+        return {
+            key: as_type(hints.get(key, Any), x, _join(name, key))
+            for key, x in value.items()
+        }
     elif kind in _DESCRIPTIONS and _is_plain(kind, value):
         return value
     raise InputError(f"{name or 'it'} is {value!r}: it must be {_describe(kind)}")
-
-
-def _with_fields(kind: Any, value: dict[str, Any], name: str) -> Any:
-    """Return an instance of a dataclass; fields that are missing have their default."""
-    hints = get_type_hints(kind)
-    for key in value:
-        if key not in hints:
-            raise InputError(f"{_join(name, key)} is unknown")
-    return kind(**{key: as_type(hints[key], x, key) for key, x in value.items()})
 
 
 def _is_plain(kind: Any, value: Any) -> bool:

@@ -23,11 +23,7 @@ class _Unfinished(Exception):
 
 
 def _run_module(program: str, arguments: Sequence[str]) -> int:
-    """Run a command line in this process and return its exit status.
-
-    Raises:
-      _Unfinished: if it was interrupted or its folder could not be written.
-    """
+    """Run a command line in this process and return its exit status."""
     status = importlib.import_module(program).main(arguments)
     if status not in (0, _BAD_INPUT):
         raise _Unfinished(f"status {status}")
@@ -41,19 +37,6 @@ def run_on_ray(
 
     The cluster is RAY_ADDRESS's, else a running one, else a new one. If a task's worker
     or node dies, the task is run again elsewhere.
-
-    Args:
-      program: name of the module to start, which workers must have installed.
-      jobs: the arguments of each job, by the job's name in messages. Folders in the
-        arguments must be the same on every node.
-      devices: number of CPU devices of a job and of CPUs that it reserves; default 1.
-        Where the cluster has GPUs, a job reserves one of them and one CPU instead.
-
-    Raises:
-      ChildProcessError: if jobs have failed; the others are done.
-      InputError: if Ray is not installed, if no node has that many CPUs, or if all jobs
-        have failed because of bad input.
-      Interrupted: if a signal was received; it was passed on to the running jobs.
     """
     try:
         import ray

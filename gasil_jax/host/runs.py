@@ -10,7 +10,7 @@ from typing import Any
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import ranges
 from gasil_jax.errors import InputError
-from gasil_jax.host import descriptions, json_reader
+from gasil_jax.host import descriptions, json_files
 from gasil_jax.host.environments import Settings
 
 #: Raise this by hand when a change makes the same settings give different numbers, by
@@ -19,7 +19,7 @@ from gasil_jax.host.environments import Settings
 ALGORITHM_VERSION = 2
 
 #: Settings of an environment that compute the same thing in different ways.
-_WAYS = ("physics", "solver")
+_WAYS = ("physics",)
 
 #: The names of settings in a run's key and in stored runs, where they differ from those
 #: here. So a setting can be renamed, and stored runs keep their keys.
@@ -82,8 +82,8 @@ class Run:
         values = descriptions.describe(self.algorithm)
         for name, value in values.items():
             if callable(value):
-                raise InputError(f"{name} is a function: a stored run needs points")
-            if name.endswith("_schedule"):
+                values[name] = "a function"
+            elif name.endswith("_schedule"):
                 values[name] = [[float(x) for x in point] for point in value]
         # 1 and 1.0 are the same number, and so the same run.
         for part in self.algorithm.parts:
@@ -119,31 +119,29 @@ class Run:
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
     @functools.cached_property
+    def identity(self) -> tuple[str, int]:
+        """What stays the same when training is continued to more steps."""
+        return identity(self._fields, self.seed)
+
+    @functools.cached_property
     def shapes(self) -> str:
         """The settings that runs of one compiled program share, as JSON."""
-        traced = self.algorithm.hyperparameters
-        numbers = {STORED_NAMES.get(name, name) for name in traced}
+        traced = {STORED_NAMES.get(x, x) for x in self.algorithm.hyperparameters}
         algorithm = {
-            name: None if name in numbers else value
+            name: None if name in traced else value
             for name, value in self._fields["algorithm"].items()
         }
         return json.dumps({**self._fields, "algorithm": algorithm}, sort_keys=True)
 
 
-def read_run(
-    experiment: Mapping[str, Any], seed: int, total_steps: int | None = None
-) -> Run:
-    """Return a stored run.
+def identity(experiment: Mapping[str, Any], seed: int) -> tuple[str, int]:
+    """Return `Run.identity` from a parsed `Run.experiment` and a seed."""
+    algorithm = {**experiment["algorithm"], "total_steps": None}
+    return json.dumps({**experiment, "algorithm": algorithm}, sort_keys=True), seed
 
-    Args:
-      experiment: its `Run.experiment`, parsed from JSON. Settings that are missing,
-        because they are newer than the stored run, have their defaults.
-      seed: its seed.
-      total_steps: length of training to use instead of the stored one; None keeps it.
 
-    Raises:
-      ValueError: if a name is unknown, or a value of another type.
-    """
+def read_run(experiment: Mapping[str, Any], seed: int) -> Run:
+    """Return a stored run."""
     fields = dict(experiment)
     own = {name: fields.pop(name) for name in ("env", "algorithm_version")}
     current = {stored: name for name, stored in STORED_NAMES.items()}
@@ -152,7 +150,5 @@ def read_run(
         if settings.pop(name, value) != value:
             raise InputError(f"{name} is not {value!r}: this setting is no more")
     algorithm = descriptions.read(settings)
-    if total_steps is not None:
-        algorithm = algorithm.replace(total_steps=total_steps)
-    settings = json_reader.as_type(Settings, fields, "settings")
-    return Run(algorithm=algorithm, seed=seed, settings=settings, **own)
+    environment = json_files.as_type(Settings, fields, "settings")
+    return Run(algorithm=algorithm, seed=seed, settings=environment, **own)

@@ -1,0 +1,4 @@
+from .locomotion import Locomotion as Locomotion
+from .locomotion import Task as Task
+from .registry import make as make
+from .registry import names as names

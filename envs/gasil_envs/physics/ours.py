@@ -1,0 +1,97 @@
+"""Our own physics in pure JAX, and which engine steps a model that it lacks."""
+
+import logging
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from gasil_envs.physics import dynamics
+from gasil_envs.physics.batching import batch_last, in_tiles
+from gasil_envs.physics.interface import Fields, Physics, PhysicsState
+from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
+from gasil_envs.precision import full_precision
+
+_LOGGER = logging.getLogger(__name__)
+
+
+def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
+    """Return why our physics does not take a model; None if it does."""
+    return dynamics.unsupported(model, fields) or left_out(model)
+
+
+def ours_or_mjx(
+    model: mujoco.MjModel,
+    fields: Sequence[str] = (),
+    iterations: int = 4,
+    ls_iterations: int = 8,
+) -> Physics:
+    """Return our physics, or MJX's and a warning that says which part ours lacks.
+
+    Raises:
+      ValueError: if neither takes the model.
+    """
+    reason = unsupported(model, fields)
+    if reason is None:
+        return JaxPhysics(model, fields, iterations, ls_iterations)
+    try:
+        physics = MjxPhysics(model, fields, iterations, ls_iterations)
+    except Unsupported as error:
+        raise ValueError(
+            f"physics 'jax' does not support this model: {reason}; physics 'mjx' "
+            f"neither: {error.part} (use physics 'mujoco')"
+        ) from None
+    _LOGGER.warning(
+        "physics 'mjx' is used, some ten times slower than 'jax', because of a part of "
+        "the model that 'jax' lacks: %s",
+        reason,
+    )
+    return physics
+
+
+class JaxPhysics:
+    """Steps a MuJoCo model with our dynamics and solver; see `interface.Physics`.
+
+    Args:
+      model: a model that `unsupported` has nothing against.
+      fields: names of the ``mjData`` arrays to return.
+      iterations: largest number of Newton iterations.
+      ls_iterations: largest number of steps of each of its line searches.
+    """
+
+    name = "jax"
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        fields: Sequence[str] = (),
+        iterations: int = 4,
+        ls_iterations: int = 4,
+    ):
+        self._dynamics = dynamics.make(model, fields, iterations, ls_iterations)
+
+    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
+        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
+        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
+
+    @full_precision
+    def kinematics(self, state: PhysicsState) -> Fields:
+        """Return the fields at `state`, with all forces 0."""
+        return batch_last(partial(dynamics.kinematics, self._dynamics))(state)
+
+    @full_precision
+    def step(
+        self, state: PhysicsState, control: jax.Array, frame_skip: int
+    ) -> tuple[PhysicsState, Fields]:
+        """Advance `frame_skip` time steps under one control (nu,)."""
+
+        def many(x: Any) -> Any:
+            return dynamics.step(self._dynamics, x[0], x[1], frame_skip)
+
+        # Tiles take half as long again to compile, which a single simulation, for a
+        # picture or an adapter, would not earn back.
+        with jax.named_scope("physics"):
+            return batch_last(many, in_tiles(many))((state, control))

@@ -1,0 +1,1 @@
+"""The commands: ``python -m gasil_jax.run`` and the others."""

@@ -1,0 +1,419 @@
+"""The options of `run` and `sweep`: read them with a preset, check them."""
+
+import argparse
+import dataclasses
+import pathlib
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Literal
+
+import jax
+
+from gasil_envs import user_code
+from gasil_jax import algorithms, checks, presets, train
+from gasil_jax.agents import PPOGASIL
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.cli import parsing
+from gasil_jax.cli.parsing import Parser, check_minimum, input_checked
+from gasil_jax.config import Config, names
+from gasil_jax.errors import InputError
+from gasil_jax.host import (
+    descriptions,
+    devices,
+    environments,
+    folders,
+    points,
+    sweep,
+    trackers,
+)
+from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
+from gasil_jax.host.progress import announced
+from gasil_jax.host.sweep import Recording, Sweep
+from gasil_jax.rewards import REWARD_MODELS
+
+#: The options that `--help` shows; `--help-all` shows all.
+COMMON = frozenset(
+    "env agent preset seeds out resume evaluate_every log grid random "
+    "reward_delay obs_noise action_noise physics total_steps num_envs batch_steps "
+    "minibatch_size num_epochs hidden_sizes learning_rate gamma gae_lambda "
+    "entropy_coefficient initial_std decompose_rewards alpha discriminator_updates "
+    "discriminator_learning_rate buffer_steps behavior_cloning_coefficient "
+    "sil_coefficient novelty_coefficient imitation_weight expert".split()
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Train an agent on an environment, many seeds at once.
+
+    Attributes:
+      env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
+        humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
+        brax:NAME, gymnax:NAME, navix:NAME or playground:NAME, for example
+        gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
+      agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
+        ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
+        settings: this help shows those of the one that is named beside it.
+      preset: the settings to start from: tuned, searched for each environment and
+        agent; scaled, one rule of PPO for all continuous tasks; gymnax, one setting for
+        discrete actions; or paper, the paper's own protocol, with one environment per
+        seed. Options override them. The defaults that this help shows are the preset's
+        if --env is named beside --help.
+      seeds: number of seeds to train.
+      first_seed: number of the first seed. A seed's random numbers depend only on
+        its number.
+      out: folder, created if it is missing; default runs/ENV-AGENT-TIME.
+      resume: train what is missing in the folder `out`, with its settings. total_steps
+        and seeds may grow; checkpoint_every, keep_checkpoints, devices and log may
+        differ. If the folder holds nothing yet, training begins.
+      checkpoint_every: environment steps per seed between two checkpoints; by
+        default a checkpoint is written every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
+        with the best evaluation or, without evaluate_every, with the best returns.
+      evaluate_every: environment steps per seed between two evaluations of the
+        policy's mean action in fresh environments, rounded up to whole iterations;
+        by default none. The untrained policy is evaluated too. The scores are undelayed
+        returns, in evaluations.csv.
+      evaluate_episodes: episodes per seed in each evaluation; default 10.
+      log: trackers to log to besides metrics.csv: tensorboard, wandb.
+      devices: number of CPU devices that share the seeds; default one for each core.
+        All visible GPUs are used in any case.
+      decompose_rewards: whether PPO learns from a reward for each step, which a network
+        learns from the delayed sums, instead of from the delayed reward itself.
+      normalize_rewards: whether to divide PPO's rewards by the standard deviation of
+        their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
+        that unit, not in the environment's. It has no effect on the agents gasil and
+        gail, which do not use the environment's reward.
+    """
+
+    env: str
+    agent: str = PPOGASIL.name
+    preset: str = presets.DEFAULT
+    seeds: int = 1
+    first_seed: int = 0
+    out: pathlib.Path | None = None
+    resume: bool = False
+    checkpoint_every: int | None = None
+    keep_checkpoints: int = 2
+    evaluate_every: int | None = None
+    evaluate_episodes: int | None = None
+    log: tuple[str, ...] = ()
+    devices: int | None = None
+    decompose_rewards: bool = False
+    normalize_rewards: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class SweepOptions(Options):
+    """Train every point of a grid, or random points, with many seeds each.
+
+    Attributes:
+      grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
+      random: number of points to draw from the grid or, without a grid, from the
+        ranges of the paper's appendix. The draw's seed is first_seed.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
+        instead of grid and random.
+      shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
+        from 1 on. Other processes train the others in the same folder. With --resume it
+        continues.
+      launcher: train all shards on a cluster: ray. With --resume it continues them.
+      shards: number of shards that the launcher makes.
+    """
+
+    grid: tuple[str, ...] = ()
+    random: int | None = None
+    points_file: pathlib.Path | None = None
+    shard: str | None = None
+    launcher: Literal["ray"] | None = None
+    shards: int | None = None
+
+
+def read(
+    kind: type[Options], arguments: Sequence[str] | None, program: str
+) -> tuple[Options, Sweep]:
+    """Return the options of a command line, and what they train.
+
+    With --resume, options that are not given are those of the sweep in the folder,
+    whose points come first; otherwise they are the preset's.
+    """
+    first, stored = _first_options(arguments), None
+    if first.resume:
+        if first.out is None:
+            raise InputError("resume needs --out and the folder to continue")
+        if folders.has_config(first.out):
+            stored = sweep.read(first.out)
+        elif first.env is None:
+            raise InputError(
+                f"out is {first.out}, which holds no run to continue: to begin one "
+                "there, give --env"
+            )
+    algorithm, default = _defaults(kind, first, stored)
+    parser = Parser(program, "--env NAME [options]", kind, COMMON)
+    parser.add_fields(kind, "run", default)
+    settings = Settings() if stored is None else stored.settings
+    parser.add_fields(Settings, "environment", settings)
+    agent = algorithm.agent
+    own = {type(model): model for model in algorithm.rewards}
+    parser.add_fields(Config, "training", algorithm.config)
+    parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
+    for model in REWARD_MODELS:
+        parser.add_fields(model, model.switch, own.get(model, model()))
+    values = parser.read(arguments, _why_not(algorithm))
+    options = kind(**parser.fields(values, "run"))
+    switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
+    on = [switch for switch, is_on in switches.items() if is_on]
+    changes = [parser.fields(values, title) for title in ("training", "agent", *on)]
+    with input_checked():
+        changed = algorithm.replace(**switches).replace(
+            **{name: value for part in changes for name, value in part.items()}
+        )
+    requested = Sweep(
+        options.env,
+        changed,
+        _seeds(options, stored),
+        settings=Settings(**parser.fields(values, "environment")),
+        recording=Recording(
+            options.checkpoint_every,
+            options.keep_checkpoints,
+            options.evaluate_every,
+            options.evaluate_episodes or Recording.evaluate_episodes,
+            options.log,
+        ),
+        preset=options.preset,
+    )
+    _check(options, requested)
+    _note_without_effect(
+        options,
+        requested,
+        default=algorithm,
+        off={x: parser.fields(values, x) for x in switches if x not in on},
+    )
+    requested = _with_points(options, requested, stored)
+    if stored is not None:
+        assert options.out is not None
+        requested = requested.continued_from(options.out)
+    return options, requested
+
+
+def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+    """Return the options that decide which others there are, and their defaults."""
+
+    def delay(text: str) -> int:
+        try:
+            return max(1, points.whole_number(text))
+        except (ValueError, OverflowError):
+            return 1
+
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--out", type=pathlib.Path, nargs="?")
+    parser.add_argument("--env", nargs="?")
+    parser.add_argument("--resume", action="store_true")
+    for name, default in (("agent", Options.agent), ("preset", presets.DEFAULT)):
+        parser.add_argument(f"--{name}", nargs="?", default=default, const=default)
+    parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
+    return parser.parse_known_args(parsing.words(arguments))[0]
+
+
+def _defaults(
+    kind: type[Options], first: argparse.Namespace, stored: Sweep | None
+) -> tuple[Algorithm, Options]:
+    """Return the algorithm and the options that hold where none are given."""
+    if stored is not None:
+        recording = stored.recording
+        return stored.algorithm, kind(
+            env=stored.env,
+            agent=stored.algorithm.agent.name,
+            preset=stored.preset or presets.DEFAULT,
+            seeds=len(stored.seeds),
+            first_seed=stored.seeds[0],
+            checkpoint_every=recording.checkpoint_every,
+            keep_checkpoints=recording.keep_checkpoints,
+            evaluate_every=recording.evaluate_every,
+            evaluate_episodes=(
+                None
+                if recording.evaluate_every is None
+                else recording.evaluate_episodes
+            ),
+            log=recording.log,
+            **_switches(stored.algorithm),
+        )
+    with input_checked():
+        agent = descriptions.find_agent(first.agent)
+        algorithm = Algorithm(agent())
+        if first.env is not None:
+            algorithm = presets.preset(
+                first.env,
+                agent,
+                first.preset,
+                reward_delay=first.reward_delay,
+                action_size=_action_size(first.env, first.preset),
+            )
+    taken = {
+        f.name for each in (SweepOptions, Settings) for f in dataclasses.fields(each)
+    }
+    for name in names(agent):
+        if name in taken:
+            raise InputError(
+                f"agent {first.agent!r} has a setting {name!r}, a name that is taken "
+                "by an option: it must be a new one"
+            )
+    missing: Any = dataclasses.MISSING
+    return algorithm, kind(
+        env=missing, agent=first.agent, preset=first.preset, **_switches(algorithm)
+    )
+
+
+def _switches(algorithm: Algorithm) -> dict[str, Any]:
+    """Return which models of rewards an algorithm has, by their switches."""
+    return {x.switch: algorithm.settings[x.switch] for x in REWARD_MODELS}
+
+
+def _action_size(env: str, preset: str) -> int | None:
+    """Return the dimension of an action, if a preset needs it for an environment."""
+    if preset != "scaled" or env in presets.ACTION_SIZES:
+        return None
+    # The environment's arrays start JAX.
+    devices.use_devices(Settings(), None, environments.available_cores())
+    with announced(env, "building the environment"):
+        built = environments.make_env(env)
+    if environments.is_discrete(built):
+        raise InputError(
+            "preset is 'scaled', a rule for the dimension of an action: those of "
+            f"{env} are discrete, it must be another preset, such as 'gymnax'"
+        )
+    return int(built.action_size)
+
+
+def _why_not(algorithm: Algorithm) -> Callable[[str], str | None]:
+    def why_not(name: str) -> str | None:
+        why = algorithm.why_not(name)
+        return why if " is a setting of " in why else None
+
+    return why_not
+
+
+def _seeds(options: Options, stored: Sweep | None) -> Sequence[int]:
+    if not 1 <= options.seeds <= sweep.MOST_SEEDS:
+        raise InputError(
+            f"seeds is {options.seeds}: it must be from 1 to {sweep.MOST_SEEDS:,}"
+        )
+    if not 0 <= options.first_seed <= (most := 2**32 - options.seeds):
+        raise InputError(
+            f"first_seed is {options.first_seed}: it must be from 0 to {most}"
+        )
+    if stored is not None:
+        if (options.seeds, options.first_seed) == (len(stored.seeds), stored.seeds[0]):
+            return stored.seeds
+    return range(options.first_seed, options.first_seed + options.seeds)
+
+
+def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sweep:
+    """Return the sweep with the points that the options name."""
+    if not isinstance(options, SweepOptions):
+        return (
+            requested
+            if stored is None
+            else dataclasses.replace(requested, points=stored.points)
+        )
+    new = bool(options.grid) or options.random is not None
+    if not new and options.points_file is None:
+        if stored is None:
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random or "
+                "--points-file"
+            )
+        return dataclasses.replace(requested, points=stored.points)
+    named = points.make_points(
+        options.grid,
+        options.random,
+        options.points_file,
+        seed=options.first_seed,
+        algorithm=requested.algorithm,
+    )
+    points.check(named, requested.algorithm)
+    every = points.completed(named, requested.algorithm)
+    return dataclasses.replace(requested, points=every)
+
+
+def _check(options: Options, requested: Sweep) -> None:
+    """Raise `InputError` if a value is not allowed. Nothing is built or compiled."""
+    with input_checked():
+        environments.check(options.env, requested.settings)
+        presets.check(options.preset)
+        algorithms.check(requested.algorithm)
+        trackers.check(options.log)
+    check_minimum(
+        options,
+        devices=1,
+        checkpoint_every=1,
+        keep_checkpoints=1,
+        evaluate_every=1,
+        evaluate_episodes=1,
+    )
+    check_minimum(requested.settings, max_episode_steps=1)
+    if options.evaluate_episodes is not None and options.evaluate_every is None:
+        raise InputError(
+            f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
+        )
+    if options.out is not None:
+        if not options.resume and getattr(options, "shard", None) is None:
+            folders.refuse_used(options.out)
+        folders.check_writable(options.out)
+
+
+def _note_without_effect(
+    options: Options,
+    requested: Sweep,
+    *,
+    default: Algorithm,
+    off: Mapping[str, Mapping[str, Any]],
+) -> None:
+    """Print a note for each option that was changed but has no effect."""
+    algorithm, settings = requested.algorithm, requested.settings
+    for name in environments.without_effect(options.env, settings):
+        value = getattr(settings, name)
+        note(f"{name} is {value}, which has no effect: {options.env} has none")
+    for model in REWARD_MODELS:
+        for name, value in off.get(model.switch, {}).items():
+            if value != getattr(model(), name):
+                note(f"{name} is {value}, which has no effect: {model.switch} is off")
+    for name, reason in points.without_effect(algorithm).items():
+        value = algorithm.settings.get(name)
+        if value not in (None, default.settings.get(name)):
+            note(f"{name} is {value}, which has no effect: {reason}")
+    # Other presets refuse an agent or a task that they have nothing for.
+    lacking = presets.describe_lack(
+        options.env,
+        algorithm.agent.name,
+        presets.DEFAULT,
+        reward_delay=settings.reward_delay,
+    )
+    if options.preset == presets.DEFAULT and lacking is not None and not options.resume:
+        note(f"{lacking}: options that are not given have their defaults")
+
+
+def make_folder(options: Options) -> pathlib.Path:
+    """Create the folder if it is missing, and return it."""
+    if options.out is not None:
+        return folders.create(options.out)
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
+    return folders.create_new(name)
+
+
+def check_agent(env: Any, algorithm: Algorithm) -> None:
+    """Check that the agent can run in the environment; trace an agent of the user's."""
+
+    def begin() -> Any:
+        state = train.init(env, algorithm, jax.random.key(0))
+        return train.train_step(env, algorithm, state)
+
+    with input_checked():
+        checks.check(env, algorithm)
+        if ":" in algorithm.agent.name:
+            package = pathlib.Path(train.__file__).parent
+            what = f"agent {algorithm.agent.name!r} can't be traced"
+            with user_code.refused(what, package):
+                with announced(algorithm.agent.name, "tracing the agent"):
+                    jax.eval_shape(begin)

@@ -1,1 +1,0 @@
-"""Curves of finished runs."""

@@ -1,0 +1,173 @@
+"""Read or draw the points of a sweep. A point holds changed settings, by name."""
+
+import itertools
+import json
+import math
+import pathlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from gasil_jax import algorithms
+from gasil_jax.agents import agents_with
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import names, ranges
+from gasil_jax.errors import InputError, did_you_mean, refusal
+from gasil_jax.rewards import REWARD_MODELS
+
+Point = Mapping[str, Any]
+
+_FIXED = ("total_steps", "num_envs")
+#: The ranges of the paper's appendix, from which `--random` draws.
+PAPER_RANGES: Mapping[str, tuple[Any, ...]] = {
+    "learning_rate": (3e-4, 1e-4, 5e-5, 3e-5),
+    "discriminator_updates": (1, 5, 10, 20),
+    "discriminator_learning_rate": (3e-4, 1e-4, 2e-5, 1e-5),
+    "buffer_steps": (1000, 10000),
+    "alpha": (0.02, 0.1, 0.2, 1.0),
+}
+
+
+def whole_number(text: str) -> int:
+    """Return the whole number in a text, which may be written as 1e6."""
+    try:
+        return int(text)
+    except ValueError:
+        if (number := float(text)).is_integer():
+            return int(number)
+        raise
+
+
+def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
+    """Return the names that a sweep may vary, with the type of their values."""
+    return {
+        name: int if allowed.whole else float
+        for part in algorithm.parts
+        for name, allowed in ranges(part).items()
+        if name not in _FIXED
+    }
+
+
+def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
+    """Return points that all have the same names, without repetitions.
+
+    A point that lacks a name has the algorithm's own value.
+    """
+    listed = list(every)
+    varied = list(dict.fromkeys(name for point in listed for name in point))
+    own = algorithm.settings
+    kinds = _kinds(algorithm)
+    whole = [
+        {x: kinds.get(x, float)(point.get(x, own[x])) for x in varied}
+        for point in listed
+    ]
+    return tuple(x for i, x in enumerate(whole) if x not in whole[:i])
+
+
+def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
+    """Return the values by name from entries NAME=VALUE,VALUE,..."""
+    values: dict[str, tuple[Any, ...]] = {}
+    kinds = _kinds(algorithm)
+    for entry in grid:
+        name, _, listed = entry.partition("=")
+        name = name.replace("-", "_")
+        if name in values:
+            raise InputError(f"grid has {name} twice: give all its values in one entry")
+        if name not in kinds:
+            raise InputError(f"grid: {_why_not(name, algorithm)}")
+        number = whole_number if kinds[name] is int else float
+        try:
+            values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
+        except ValueError:
+            like = "whole numbers" if kinds[name] is int else "numbers"
+            raise InputError(
+                f"grid has {entry!r}: it must be {like}, like {name}=10,20"
+            ) from None
+    return values
+
+
+def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
+    """Return the points that a JSON file lists."""
+    source = f"points_file is {path}"
+    try:
+        every = json.loads(path.read_text())
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"{source}, which can't be read: {error}") from None
+    if not isinstance(every, list) or not every:
+        raise InputError(f"{source}: it must hold a list of points, one or more")
+    if not all(isinstance(point, dict) for point in every):
+        raise InputError(f"{source}: each point must be an object, NAME: VALUE")
+    check(every, algorithm, f"{source}: ")
+    return every
+
+
+def check(every: Iterable[Point], algorithm: Algorithm, source: str = "") -> None:
+    """Check that points change what can vary, to values that are allowed."""
+    allowed = _kinds(algorithm)
+    unused = without_effect(algorithm)
+    try:
+        for point in every:
+            for name, value in point.items():
+                if name not in allowed:
+                    raise InputError(_why_not(name, algorithm))
+                if value is None:
+                    raise refusal(name, value, "a number")
+                if name in unused:
+                    raise InputError(f"{name} can't vary: {unused[name]}")
+            algorithms.check(algorithm.replace(**point))
+    except ValueError as error:
+        raise InputError(f"{source}{error}") from None
+
+
+def without_effect(algorithm: Algorithm) -> dict[str, str]:
+    """Return the names of settings that have no effect, each with the reason."""
+    if algorithm.agent.uses_reward:
+        return {}
+    reason = f"agent {algorithm.agent.name!r} does not use the environment's reward"
+    every = [x for model in REWARD_MODELS for x in (model.switch, *names(model))]
+    return dict.fromkeys(every, reason)
+
+
+def _why_not(name: str, algorithm: Algorithm) -> str:
+    """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
+    allowed = tuple(_kinds(algorithm))
+    of_models = {x for model in REWARD_MODELS for x in names(model)}
+    if name not in algorithm.settings and (name in of_models or agents_with(name)):
+        return f"{algorithm.why_not(name)}. What can vary: {', '.join(allowed)}"
+    return f"{name!r} can't vary: {did_you_mean(name, allowed)}"
+
+
+def make_points(
+    grid: Sequence[str],
+    random: int | None,
+    points_file: pathlib.Path | None,
+    *,
+    seed: int,
+    algorithm: Algorithm,
+) -> list[Point]:
+    """Return the points of a sweep."""
+    if points_file is not None:
+        if grid or random is not None:
+            raise InputError("points_file can't be combined with grid or random")
+        return _read(points_file, algorithm)
+    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
+    if random is None:
+        every = itertools.product(*values.values())
+        return [dict(zip(values, point, strict=True)) for point in every]
+    kinds = _kinds(algorithm)
+    values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
+    sizes = [len(listed) for listed in values.values()]
+    count = math.prod(sizes)
+    if not 1 <= random <= min(count, 10_000):
+        raise InputError(
+            f"random is {random}: it must be from 1 to {min(count, 10_000):,}, of "
+            f"{count:,} points"
+        )
+    generator, drawn = np.random.default_rng(seed), dict[tuple[int, ...], None]()
+    while len(drawn) < random:
+        drawn[tuple(int(generator.integers(size)) for size in sizes)] = None
+    return [
+        {name: x[i] for (name, x), i in zip(values.items(), at, strict=True)}
+        for at in drawn
+    ]

@@ -1,0 +1,296 @@
+"""What a folder of training holds: points and seeds, described by its config.json.
+
+A point is a set of changed settings (a trial, in the words of other packages), a run is
+a point with a seed, and the runs that share shapes are a program, one vmapped batch. A
+sweep is all runs of some points and seeds. `gasil_jax.run` trains a sweep of one point.
+
+    config.json         the sweep
+    programs/NAME/      a program: its runs, tables, checkpoints
+    results.csv, ...    what `results` makes of them once no run is missing
+
+Continuing a folder is training the runs that are missing. Uniting two folders is
+copying the programs of one into programs/ of the other and continuing that.
+"""
+
+import contextlib
+import dataclasses
+import functools
+import hashlib
+import pathlib
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any, Required, TypedDict
+
+import jax
+
+from gasil_jax import algorithms
+from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError, refusal, shown
+from gasil_jax.host import descriptions, folders, json_files, points, programs
+from gasil_jax.host.environments import Settings
+from gasil_jax.host.points import Point
+from gasil_jax.host.programs import Program
+from gasil_jax.host.runs import Run
+
+#: The columns of tables that identify a member.
+LABELS = ("point", "seed")
+#: The largest number of seeds. Their absolute numbers are below 2**32.
+MOST_SEEDS = 2**20
+
+
+@dataclasses.dataclass(frozen=True)
+class Recording:
+    """What is recorded of training, and when. It does not change a run's numbers.
+
+    Attributes:
+      checkpoint_every: environment steps per seed between two checkpoints, rounded up
+        to whole iterations; None writes one every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep, besides the best one; 0
+        writes none.
+      evaluate_every: environment steps per seed between two evaluations; None for none.
+      evaluate_episodes: episodes per seed in each evaluation.
+      log: names of trackers.
+    """
+
+    checkpoint_every: int | None = None
+    keep_checkpoints: int = 2
+    evaluate_every: int | None = None
+    evaluate_episodes: int = 10
+    log: tuple[str, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True)
+class Sweep:
+    """The points and seeds of a folder.
+
+    Attributes:
+      env: name of the environment.
+      algorithm: the algorithm that the points change.
+      seeds: absolute seed numbers.
+      points: changed settings, by name; all have the same names.
+      settings: settings of the environment.
+      recording: what is recorded.
+      preset: name of the preset that the settings began with.
+      only_python: why no command line can make the environment or the algorithm again;
+        None if one can.
+    """
+
+    env: str
+    algorithm: Algorithm
+    seeds: Sequence[int]
+    points: Sequence[Point] = ({},)
+    settings: Settings = dataclasses.field(default_factory=Settings)
+    recording: Recording = dataclasses.field(default_factory=Recording)
+    preset: str | None = None
+    only_python: str | None = None
+
+    @functools.cached_property
+    def runs(self) -> Mapping[tuple[int, int], Run]:
+        """The run of each (index of the point, seed)."""
+        every = [self.algorithm.replace(**point) for point in self.points]
+        return {
+            (index, seed): Run(self.env, changed, seed, self.settings)
+            for index, changed in enumerate(every)
+            for seed in self.seeds
+        }
+
+    def part(self, number: int = 1, count: int = 1) -> list[Run]:
+        """Return the runs of shard `number`, counted from 1, of `count` shards.
+
+        They do not depend on which runs are trained already. The sizes of shards differ
+        by one run at most, and the runs of a program are divided as little as possible.
+        """
+        ordered = [x for each in programs.group(self.runs.values()) for x in each.runs]
+        total = len(ordered)
+        if count > total:
+            raise InputError(
+                f"shard is {number}/{count}: {total} runs (points x seeds) make "
+                f"{total} shards at most"
+            )
+        return ordered[(number - 1) * total // count : number * total // count]
+
+    def stored(self, folder: pathlib.Path) -> list[Program]:
+        """Return the programs in the sweep's folder that hold runs of it."""
+        return programs.read(folder / "programs", self.runs.values())
+
+    def trained(self, folder: pathlib.Path) -> list[Program]:
+        """Return the programs that are trained to their end."""
+        return [x for x in self.stored(folder) if x.is_finished]
+
+    def missing(self, trained: Iterable[Program]) -> list[tuple[int, int]]:
+        """Return the (index of the point, seed) of each run that no program has."""
+        done = {run for each in trained for run in each.runs}
+        return [member for member, run in self.runs.items() if run not in done]
+
+    def unfinished(
+        self, folder: pathlib.Path, requested: Collection[Run] | None = None
+    ) -> list[Program]:
+        """Return the programs to train for requested runs, by default all."""
+        every = list(self.runs.values()) if requested is None else requested
+        asked, member_of = set(every), {run: x for x, run in self.runs.items()}
+        held = [x for x in self.stored(folder) if not asked.isdisjoint(x.runs)]
+        begun, others = programs.unfinished(every, held)
+        new = [
+            x.below(
+                folder / "programs",
+                dict(zip(LABELS, zip(*(member_of[run] for run in x.runs)))),
+            )
+            for x in programs.group(others)
+        ]
+        return [*begun, *new]
+
+    def grown(self, more: Sequence[Point]) -> "Sweep":
+        """Return the sweep with more points, those that it has first."""
+        every = points.completed([*self.points, *more], self.algorithm)
+        return dataclasses.replace(self, points=every)
+
+    def write(self, folder: pathlib.Path) -> None:
+        """Write config.json."""
+        algorithm = descriptions.describe(self.algorithm)
+        content = {
+            "env": self.env,
+            "settings": self.settings,
+            "algorithm": {
+                name: "a function" if callable(x) else x
+                for name, x in algorithm.items()
+            },
+            "points": [dict(point) for point in self.points],
+            "seeds": list(self.seeds),
+            "recording": self.recording,
+            "preset": self.preset,
+            "only_python": self.only_python,
+            "expert_sha256": _expert_hash(self.algorithm),
+        }
+        json_files.write(folder / folders.CONFIG, content)
+
+    def continued_from(self, folder: pathlib.Path, *, option: str = "out") -> "Sweep":
+        """Return this sweep with the points of the one in the folder before its own.
+
+        If none has begun there, it is this one. What is there must be the same but for
+        longer training and more seeds and points.
+        """
+        if not folders.has_config(folder):
+            return self
+        stored = described(folder)
+        before = dataclasses.replace(self, points=stored["points"])
+        grown = before.grown(self.points)
+        if changed := _differences(stored, grown):
+            raise InputError(
+                f"{option} is {folder}, where {'; '.join(changed)}: only total_steps "
+                "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
+                "devices and log may differ"
+            )
+        return grown
+
+
+class Config(TypedDict, total=False):
+    """The content of config.json."""
+
+    env: Required[str]
+    settings: Required[Settings]
+    algorithm: Required[dict[str, Any]]
+    points: Required[tuple[dict[str, float], ...]]
+    seeds: Required[tuple[int, ...]]
+    recording: Required[Recording]
+    preset: Required[str | None]
+    only_python: Required[str | None]
+    expert_sha256: str | None
+
+
+def described(folder: pathlib.Path) -> Config:
+    """Return the content of config.json, also of what only Python can make."""
+    path = folder / folders.CONFIG
+    try:
+        content: Config = json_files.read(path, Config)
+    except (FileNotFoundError, NotADirectoryError):
+        why = f"has no {folders.CONFIG}" if folder.exists() else "does not exist"
+        raise InputError(
+            f"run is {folder}, which {why}: it must be the folder of a run or a sweep"
+        ) from None
+    with json_files.blamed(path):
+        if not content["points"]:
+            raise ValueError("it has no points")
+        check_seeds(content["seeds"])
+    return content
+
+
+def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
+    """Return the sweep in a folder.
+
+    An algorithm that only Python can make is an argument.
+    """
+    stored = described(folder)
+    if algorithm is None and (why := stored["only_python"]) is not None:
+        raise InputError(
+            f"run is {folder}, which was trained from Python with what no command line "
+            f"can name ({why}): use gasil_jax.fit, gasil_jax.load_policy or "
+            "python -m gasil_jax.plot"
+        )
+    with json_files.blamed(folder / folders.CONFIG):
+        if algorithm is None:
+            algorithm = descriptions.read(stored["algorithm"])
+        algorithms.check(algorithm)
+        points.check(stored["points"], algorithm, "points: ")
+        every = points.completed(stored["points"], algorithm)
+    names = ("env", "settings", "seeds", "recording", "preset", "only_python")
+    fields: dict[str, Any] = {name: stored[name] for name in names}  # type: ignore[literal-required]
+    return Sweep(algorithm=algorithm, points=every, **fields)
+
+
+def check_seeds(seeds: Sequence[int]) -> None:
+    """Raise `InputError` unless these are different numbers of seeds."""
+    if not 1 <= len(seeds) <= MOST_SEEDS:
+        raise refusal("seeds", len(seeds), f"from 1 to {MOST_SEEDS:,}")
+    if not all(0 <= x < 2**32 for x in seeds) or len(set(seeds)) < len(seeds):
+        each = f"different whole numbers from 0 to {2**32 - 1}"
+        raise refusal("seeds", list(seeds), each)
+
+
+def _differences(before: Config, now: Sweep) -> list[str]:
+    """Return "NAME was A, is B" for each field in which two sweeps must not differ."""
+    algorithm = descriptions.describe(now.algorithm)
+    agents = before["algorithm"].get("agent"), algorithm["agent"]
+    if agents[0] != agents[1]:
+        return [f"agent was {agents[0]}, is {agents[1]}"]
+    old_recording, new_recording = vars(before["recording"]), vars(now.recording)
+    evaluations = ("evaluate_every", "evaluate_episodes")
+    changes = []
+    for old, new in (
+        ({"env": before["env"]}, {"env": now.env}),
+        (vars(before["settings"]), vars(now.settings)),
+        (before["algorithm"], algorithm),
+        ({x: old_recording[x] for x in evaluations}, new_recording),
+    ):
+        for name, value in old.items():
+            other = new.get(name)
+            if callable(other) or name in ("total_steps", "expert"):
+                continue
+            if json_files.as_type(Any, value, name) != other:
+                changes.append(f"{name} was {shown(value)}, is {shown(other)}")
+    if algorithm["total_steps"] < before["algorithm"]["total_steps"]:
+        changes.append(f"total_steps was {before['algorithm']['total_steps']}")
+    if not set(before["seeds"]) <= set(now.seeds):
+        changes.append(f"seeds were {shown(list(before['seeds']))}")
+    if before.get("expert_sha256") != _expert_hash(now.algorithm):
+        changes.append("the trajectories of the expert were others")
+    return changes
+
+
+def _expert_hash(algorithm: Algorithm) -> str | None:
+    """Return the hash of the expert's trajectories, None without an expert."""
+    if getattr(algorithm.agent, "expert", None) is None:
+        return None
+    digest = hashlib.sha256()
+    for values in jax.tree.leaves(algorithm.agent.data()):
+        digest.update(values.tobytes())
+    return digest.hexdigest()
+
+
+def parse_shard(text: str) -> tuple[int, int]:
+    """Return the number of a shard, from 1 on, and their count, from "3/8"."""
+    with contextlib.suppress(ValueError):
+        number, count = map(int, text.split("/"))
+        if 1 <= number <= count and text == f"{number}/{count}":
+            return number, count
+    raise InputError(
+        f"shard is {text!r}: it must be NUMBER/COUNT, such as 1/8 up to 8/8"
+    )
