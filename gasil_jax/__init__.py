@@ -4,11 +4,13 @@ The public names are listed in ``__init__.pyi``. A module is imported when a nam
 is first used, so that `gasil_jax.numpy_policy` needs no JAX.
 """
 
+import contextlib
+import importlib.metadata
 import os
+import sys
 
 import lazy_loader
 
-from gasil_jax import compatibility as compatibility
 from gasil_jax.host import interruption
 
 if interruption.runs_as_program(__name__):
@@ -16,6 +18,14 @@ if interruption.runs_as_program(__name__):
     # XLA reads it on import. Before jaxlib 0.12 it reports an error for each program
     # that it loads from the cache.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
-del interruption, os
+if sys.platform == "win32":
+    raise ImportError("gasil_jax runs on Linux and macOS: on Windows, use WSL")
+with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+    if importlib.metadata.version("jaxlib") == "0.10.2":
+        raise ImportError(
+            "jaxlib 0.10.2 gives wrong numbers on a CPU (jax issue 39103): install "
+            "another one, 0.10.1 or 0.12 and later"
+        )
+del contextlib, importlib, interruption, os, sys
 __version__ = "0.1.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,23 +1,24 @@
 """All that decides how a run learns: an agent, reward models, and the config of PPO."""
 
 import dataclasses
-import inspect
 from collections.abc import Mapping
 from typing import Any
+
+import jax
+import jax.numpy as jnp
 
 from gasil_jax.agents import AGENTS, Agent, agents_with
 from gasil_jax.config import (
     SCHEDULE_SUFFIX,
     Config,
-    Range,
-    check_declared,
+    Schedule,
     names,
     traced_names,
     validate,
     validate_config,
     validate_switch,
 )
-from gasil_jax.errors import refusal, shown, unknown
+from gasil_jax.errors import refusal, unknown
 from gasil_jax.rewards import REWARD_MODELS, RewardModel
 
 
@@ -105,6 +106,44 @@ class Algorithm:
             )
         return unknown("setting", name, tuple(self.settings))
 
+    def at(
+        self, hyperparameters: Mapping[str, jax.Array], iteration: jax.Array
+    ) -> "Algorithm":
+        """Return the algorithm with its numbers in an iteration, by their schedules.
+
+        Args:
+          hyperparameters: the run's own numbers by name, () each, before schedules.
+          iteration: int32 (), number of iterations before this one.
+        """
+        config, numbers = self.config, dict(hyperparameters)
+        # In float32, because int32 would overflow at 2^31 steps.
+        env_steps = iteration.astype(jnp.float32) * config.batch_steps
+        # A user's own loop may run for more iterations than the config has.
+        decay = numbers["learning_rate_decay"]
+        remaining = jnp.maximum(1.0 - decay * (iteration / config.num_iterations), 0)
+        numbers["learning_rate"] = numbers["learning_rate"] * remaining
+        for name, value in self.settings.items():
+            if name.endswith(SCHEDULE_SUFFIX):
+                number = name.removesuffix(SCHEDULE_SUFFIX)
+                numbers[number] = numbers[number] * schedule_factor(value, env_steps)
+        return self.replace(**numbers)
+
+
+def schedule_factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
+    """Return a schedule's factor, float32 (), at `env_steps`, float32 ().
+
+    Args:
+      schedule: an Optax schedule, or (steps, factor) points with increasing steps. The
+        factor is linear between points and constant beyond them.
+      env_steps: number of environment steps that the run has taken.
+    """
+    if callable(schedule):
+        return jnp.asarray(schedule(env_steps), jnp.float32)
+    if not schedule:
+        return jnp.float32(1.0)
+    steps, factors = (jnp.array(column, jnp.float32) for column in zip(*schedule))
+    return jnp.interp(env_steps, steps, factors)
+
 
 def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
     """Return an algorithm by names: ``algorithm("ppo+bc", num_envs=8)``.
@@ -122,6 +161,13 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
     return Algorithm(AGENTS[agent]()).replace(**settings)
 
 
+#: Columns of a sweep's tables, whose names no setting may have.
+_COLUMNS = frozenset(
+    "point seed mean worst_seed diverged diverged_seeds final_return final_length "
+    "final_evaluation agent".split()
+)
+
+
 def check(algorithm: Algorithm) -> None:
     """Check that every setting of an algorithm is allowed, alone and with the others.
 
@@ -130,66 +176,33 @@ def check(algorithm: Algorithm) -> None:
     """
     if not isinstance(algorithm, Algorithm):
         raise refusal("algorithm", algorithm, "a gasil_jax.Algorithm")
-    agent, rewards = algorithm.agent, algorithm.rewards
+    agent, rewards, config = algorithm.agent, algorithm.rewards, algorithm.config
+    if not isinstance(config, Config):
+        raise refusal("config", config, "a gasil_jax.Config")
     if not isinstance(agent, Agent):
         raise refusal("agent", agent, "an instance of a class from gasil_jax.Agent")
     if not isinstance(rewards, tuple) or not all(
         isinstance(model, RewardModel) for model in rewards
     ):
         raise refusal("rewards", rewards, "a tuple of models of rewards")
-    validate_config(algorithm.config)
+    validate_config(config)
     taken = {*_COLUMNS, *names(Config)}
     taken.update(x for model in REWARD_MODELS for x in (model.switch, *names(model)))
     for part in (agent, *(x for x in rewards if type(x) not in REWARD_MODELS)):
-        what = f"agent {agent.name!r}" if part is agent else type(part).__name__
-        _check_functions(part, what)
-        check_declared(type(part), what)
         for name in names(part):
             if name in taken:
                 raise ValueError(
-                    f"{what} has a setting {name!r}, a name that is taken: it must be "
-                    "a new one"
-                )
-            number = name.removesuffix(SCHEDULE_SUFFIX)
-            if number != name and number not in algorithm.hyperparameters:
-                raise ValueError(
-                    f"{what} has a setting {name!r}, but no number {number!r}"
+                    f"{type(part).__name__} has a setting {name!r}, a name that is "
+                    "taken: it must be a new one"
                 )
         taken.update(names(part))
     for part in (agent, *rewards):
-        validate(part, algorithm.config.total_steps)
-
-
-def _check_functions(part: Any, what: str) -> None:
-    """Check what a part defines in place of its base class's functions and numbers.
-
-    Raises:
-      ValueError: if a value in place of a function can't be called, or if an agent's
-        `num_streams` or `history_episodes` is not a whole number in its range.
-    """
-    for base in type(part).__mro__[1:]:
-        for name, function in vars(base).items():
-            if inspect.isfunction(function) and not name.startswith("_"):
-                if not callable(given := getattr(part, name)):
-                    raise ValueError(
-                        f"{what} has {name} {shown(given)}: it must be a function"
-                    )
-    if isinstance(part, Agent):
-        for name, allowed in (
-            ("num_streams", Range(1, 2**31 - 1, whole=True)),
-            ("history_episodes", Range(0, 2**31 - 1, whole=True)),
-        ):
-            if (given := getattr(part, name)) not in allowed:
-                raise ValueError(
-                    f"{what} has {name} {shown(given)}: it must be {allowed}"
-                )
-
-
-#: Columns of a sweep's tables, whose names no setting may have.
-_COLUMNS = frozenset(
-    "point seed mean worst_seed diverged diverged_seeds final_return final_length "
-    "final_evaluation agent".split()
-)
+        validate(part, config.total_steps)
+    if agent.num_streams > 1 and type(agent).mix is Agent.mix:
+        raise ValueError(
+            f"agent {agent.name!r} has {agent.num_streams} reward streams: it must "
+            "have a function mix that combines their advantages"
+        )
 
 
 def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> None:
@@ -200,14 +213,10 @@ def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> N
     """
     if not isinstance(hyperparameters, Mapping):
         raise refusal("hyperparameters", hyperparameters, "numbers by name")
-    names_ = algorithm.hyperparameters
     for name in hyperparameters:
-        if name not in names_:
-            if name in algorithm.settings:
-                raise ValueError(
-                    f"{name} is not traced: change it with algorithm.replace instead"
-                )
-            raise ValueError(algorithm.why_not(name))
-    changed = algorithm.replace(**hyperparameters)
-    for part in changed.parts:
+        if name in algorithm.settings and name not in algorithm.hyperparameters:
+            raise ValueError(
+                f"{name} is not traced: change it with algorithm.replace instead"
+            )
+    for part in algorithm.replace(**hyperparameters).parts:
         validate(part, algorithm.config.total_steps)

@@ -1,4 +1,8 @@
-"""Check the environment, the algorithm and the key before anything compiles."""
+"""Whether an algorithm can train in an environment, before anything compiles.
+
+These are the checks at the door of Python: `make_train`, `init` and `fit` call them.
+What is behind the door trusts its arguments.
+"""
 
 from collections.abc import Iterator
 from typing import Any
@@ -14,6 +18,30 @@ from gasil_jax.context import Sizes, sizes_of
 from gasil_jax.errors import refusal, shown
 
 
+def check(env: Any, algorithm: Algorithm) -> None:
+    """Raise `ValueError` if the algorithm can't train in the environment.
+
+    Nothing is compiled, and the environment is not traced. Of the agent, only networks
+    of the user's own are traced.
+    """
+    _check_interface(env)
+    algorithms.check(algorithm)
+    agent, config = algorithm.agent, algorithm.config
+    sizes = sizes_of(env, config.num_envs)
+    with user_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
+        agent.check(sizes)
+    _check_networks(agent, sizes)
+    reason = None
+    if sizes.discrete:
+        reason = "the environment's actions are discrete"
+    elif type(agent).policy_network is not Agent.policy_network:
+        reason = f"agent {agent.name!r} has a policy_network of its own, with one mean"
+    if config.policy_components > 1 and reason:
+        raise ValueError(
+            f"policy_components is {config.policy_components}: it must be 1, {reason}"
+        )
+
+
 def check_environment(env: Any) -> None:
     """Raise `ValueError` if an environment's sizes or states do not fit training.
 
@@ -27,45 +55,33 @@ def check_environment(env: Any) -> None:
         user_environment.check(type(innermost).__name__, env, env)
 
 
-def check(env: Any, algorithm: Algorithm) -> None:
-    """Raise `ValueError` if the algorithm can't train in the environment.
-
-    Nothing is compiled, and the environment is not traced. Of the agent, only networks
-    of the user's own are traced.
-    """
-    _check_interface(env)
-    algorithms.check(algorithm)
-    agent, num_envs = algorithm.agent, algorithm.config.num_envs
-    sizes = sizes_of(env, num_envs)
-    with user_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
-        agent.check(sizes)
-    _check_components(algorithm, sizes)
-    _check_networks(agent, sizes)
+def check_key(key: Any) -> None:
+    """Raise `ValueError` unless this is a single random key, of either kind."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != jnp.uint32:
+        raise refusal("key", key, "like jax.random.key(0)")
+    if typed and key.shape:
+        raise ValueError(
+            f"key has shape {key.shape}: it must be a single key (to train with "
+            "several, use jax.vmap)"
+        )
 
 
-def _check_components(algorithm: Algorithm, sizes: Sizes) -> None:
-    """Raise `ValueError` if the policy can't be a mixture of Gaussians but is to be."""
-    count, agent = algorithm.config.policy_components, algorithm.agent
-    if count == 1:
-        return
-    if sizes.discrete:
-        reason = "the environment's actions are discrete"
-    elif type(agent).policy_network is not Agent.policy_network:
-        reason = f"agent {agent.name!r} has a policy_network of its own, with one mean"
-    else:
-        return
-    raise ValueError(f"policy_components is {count}: it must be 1, {reason}")
+def check_state(state: Any) -> None:
+    """Raise `ValueError` unless this is the training state of one run."""
+    if not hasattr(state, "iteration"):
+        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
+    if shape := jnp.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
 
 
 def _check_networks(agent: Any, sizes: Sizes) -> None:
-    """Raise `ValueError` if a network of the user's own returns a wrong shape.
-
-    Only these are traced.
-    """
-    observation, action = (
-        jnp.zeros((2, sizes.observation)),
-        jnp.zeros((2, sizes.action)),
-    )
+    """Raise `ValueError` if a network of the user's own returns a wrong shape."""
+    observation = jnp.zeros((2, sizes.observation))
+    action = jnp.zeros((2, sizes.action))
     for function, arguments, inputs, shape in (
         ("policy_network", (sizes,), (observation,), (2, sizes.action)),
         ("value_network", (sizes,), (observation,), (2,)),
@@ -74,19 +90,13 @@ def _check_networks(agent: Any, sizes: Sizes) -> None:
         what = f"{function} of agent {agent.name!r}"
         with user_code.refused(f"{what} fails"):
             network = getattr(agent, function, lambda *_: None)(*arguments)
-        if network is None or type(network).__module__ == networks.__name__:
-            continue
-        with user_code.refused(f"{what} can't be traced"):
-            output, variables = jax.eval_shape(
-                lambda network=network, inputs=inputs: network.init_with_output(
-                    jax.random.key(0), *inputs
-                )
-            )
-        expected = f"float32{list(shape)}"
-        given = " and ".join(
-            f"{x.dtype}{list(x.shape)}" for x in jax.tree.leaves(output)
-        )
-        if given != expected:
+            if network is None or type(network).__module__ == networks.__name__:
+                continue
+            key = jax.random.key(0)
+            output, variables = jax.eval_shape(network.init_with_output, key, *inputs)
+        leaves = jax.tree.leaves(output)
+        given = " and ".join(f"{x.dtype}{list(x.shape)}" for x in leaves)
+        if given != (expected := f"float32{list(shape)}"):
             raise ValueError(
                 f"{what} returns {given} for 2 steps: it must be {expected}"
             )
@@ -107,23 +117,15 @@ def _check_interface(env: Any) -> None:
             f"env is {shown(env)}, which has no {lacking}: it must be an environment "
             "with Brax's interface, as gasil_jax.make_env gives"
         )
-    _refuse_automatic_resets(env)
-    if jax.config.read("jax_enable_x64"):
-        raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
-
-
-def _refuse_automatic_resets(env: Any) -> None:
-    """Raise `ValueError` if a wrapper resets the environment when an episode ends.
-
-    The value of a truncated episode would then be bootstrapped from the first
-    observation of the next one.
-    """
+    # The value of a truncated episode would be bootstrapped from the next one's start.
     for level in _levels(env):
         if "AutoReset" in (name := type(level).__name__):
             raise ValueError(
                 f"env is wrapped in {name}: it must not reset itself (for a Brax "
                 "environment use brax.envs.get_environment)"
             )
+    if jax.config.read("jax_enable_x64"):
+        raise ValueError("jax_enable_x64 is True: training is in float32, unset it")
 
 
 def _levels(env: Any) -> Iterator[Any]:
@@ -133,29 +135,3 @@ def _levels(env: Any) -> Iterator[Any]:
         yield level
         # `getattr` would skip levels: wrappers forward attributes of what they wrap.
         level = getattr(level, "__dict__", {}).get("env")
-
-
-def check_state(state: Any) -> None:
-    """Raise `ValueError` unless this is the training state of one run."""
-    if not hasattr(state, "iteration"):
-        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
-    if shape := jnp.shape(state.iteration):
-        raise ValueError(
-            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
-        )
-
-
-def check_key(key: Any) -> None:
-    """Raise `ValueError` unless this is a single random key.
-
-    A key of the older kind, uint32 (2,), is accepted too; its shape is not checked.
-    """
-    dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not typed and dtype != jnp.uint32:
-        raise refusal("key", key, "like jax.random.key(0)")
-    if typed and key.shape:
-        raise ValueError(
-            f"key has shape {key.shape}: it must be a single key (to train with "
-            "several, use jax.vmap)"
-        )

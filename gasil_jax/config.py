@@ -16,6 +16,7 @@ import jax
 import numpy as np
 from flax import struct
 
+from gasil_envs import user_code
 from gasil_jax.errors import refusal, unknown
 
 #: A factor that multiplies a number, as a function of environment steps. Either an
@@ -25,10 +26,8 @@ Schedule = tuple[tuple[float, float], ...] | Callable[[Any], Any]
 #: What follows the name of a number in the name of its schedule.
 SCHEDULE_SUFFIX = "_schedule"
 
-#: Counts and shapes are int32.
-_LARGEST_COUNT = 2**31 - 1
-#: All other numbers are float32.
-_LARGEST_FLOAT = 3.4e38
+#: Counts are int32, and all other numbers float32.
+_LARGEST_COUNT, _LARGEST_FLOAT = 2**31 - 1, 3.4e38
 
 
 class Range(NamedTuple):
@@ -42,72 +41,51 @@ class Range(NamedTuple):
     """
 
     low: float
-    high: float = math.inf
+    high: float = _LARGEST_FLOAT
     excludes_low: bool = False
     whole: bool = False
 
-    def __contains__(self, value: object) -> bool:
-        """Return whether a value is a number in the range; a bool is not."""
-        number = _as_float(value)
-        if number is None or (self.whole and not isinstance(value, numbers.Integral)):
+    def __contains__(self, value: Any) -> bool:
+        kind: Any = numbers.Integral if self.whole else numbers.Real
+        if not isinstance(value, kind) or isinstance(value, bool):
             return False
-        if self.excludes_low:
-            # JAX computes in float32, and takes its subnormal numbers as 0.
-            single = np.float32(np.clip(number, -_LARGEST_FLOAT, _LARGEST_FLOAT))
-            above = bool(single - self.low >= np.finfo(np.float32).tiny)
-        else:
-            above = number >= self.low
-        return above and number <= self.high and math.isfinite(number)
+        is_above = value > self.low if self.excludes_low else value >= self.low
+        return bool(is_above and value <= self.high)
 
     def __str__(self) -> str:
         if self.whole:
-            most = "" if math.isinf(self.high) else f" and at most {self.high:.0f}"
+            most = "" if self.high >= _LARGEST_COUNT else f", at most {self.high:.0f}"
             return f"a whole number, {self.low:g} or more{most}"
         least = f"{'more than ' * self.excludes_low}{self.low:g}"
-        least += " in float32" if self.excludes_low else " or more"
-        most = "finite" if math.isinf(self.high) else f"at most {self.high:g}"
+        least += "" if self.excludes_low else " or more"
+        most = f"at most {self.high:g}" if self.high < _LARGEST_FLOAT else "finite"
         return f"{least} and {most}"
 
 
-def _as_float(value: Any) -> float | None:
-    """Return a real number, infinite if it is too large; None if it is no number."""
-    # NumPy's integers are not `int`, but `bool` is, and NumPy's durations are integers.
-    is_real = isinstance(value, numbers.Real)
-    if not is_real or isinstance(value, bool | np.timedelta64):
-        return None
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
-
-
-_COUNT = Range(1, whole=True)
+_COUNT = Range(1, _LARGEST_COUNT, whole=True)
 
 
 def number(
     default: float,
     low: float,
-    high: float = math.inf,
+    high: float = _LARGEST_FLOAT,
     *,
     excludes_low: bool = False,
-    traced: bool = True,
 ) -> Any:
-    """Declare a number; if it is traced, runs of one program may have different values.
+    """Declare a number, a traced leaf of the pytree: each run may have its own.
 
     Args:
       default: the default value.
       low: the lowest value.
       high: the highest value.
       excludes_low: whether the value must be more than `low`.
-      traced: whether the number is a traced leaf of the pytree. Otherwise it is a
-        constant when a program is compiled, and Python code may branch on it.
     """
-    return _field(default, traced, range=Range(low, high, excludes_low))
+    return _field(default, traced=True, range=Range(low, high, excludes_low))
 
 
-def count(default: int | None) -> Any:
+def count(default: int | None, most: float = _LARGEST_COUNT) -> Any:
     """Declare a whole number from 1 on, or None if that is the default."""
-    return _field(default, range=_COUNT)
+    return _field(default, range=Range(1, most, whole=True))
 
 
 def widths(*default: int) -> Any:
@@ -179,7 +157,8 @@ class Config(struct.PyTreeNode):
       initial_std: standard deviation of the untrained policy's actions.
     """
 
-    total_steps: int = count(1_000_000)
+    # More than an int32: what is counted are iterations.
+    total_steps: int = count(1_000_000, most=2**60)
     num_envs: int = count(16)
     batch_steps: int = count(2048)
     num_epochs: int = count(10)
@@ -235,24 +214,6 @@ def ranges(kind: Any) -> Mapping[str, Range]:
     }
 
 
-def check_declared(kind: type, what: str) -> None:
-    """Check that every field of a class is declared with a function of this module.
-
-    Args:
-      kind: the class of an agent or a reward model.
-      what: what it is, for the message.
-
-    Raises:
-      ValueError: if a field is not.
-    """
-    for field in dataclasses.fields(kind):
-        if "allowed" not in field.metadata:
-            raise ValueError(
-                f"{what} has a setting {field.name!r} without a range: it must be "
-                "declared with gasil_jax.config.number, or another function there"
-            )
-
-
 def validate(settings: Any, total_steps: int) -> None:
     """Check that every setting of a part of an algorithm is allowed.
 
@@ -266,25 +227,28 @@ def validate(settings: Any, total_steps: int) -> None:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
     for field in dataclasses.fields(settings):
-        value, allowed = getattr(settings, field.name), field.metadata["allowed"]
+        name, value = field.name, getattr(settings, field.name)
+        if "allowed" not in field.metadata:
+            raise ValueError(
+                f"setting {name!r} has no range: it must be declared with "
+                "gasil_jax.config.number, or another function there"
+            )
+        allowed = field.metadata["allowed"]
         if "range" in allowed and not (value is None and field.default is None):
-            validate_number(field.name, value, allowed["range"])
+            validate_number(name, value, allowed["range"])
         elif "switch" in allowed:
-            validate_switch(field.name, value)
-        elif "choices" in allowed:
-            if not isinstance(value, str):
-                raise refusal(field.name, value, "a string")
-            if value not in allowed["choices"]:
-                raise ValueError(unknown(field.name, value, allowed["choices"]))
+            validate_switch(name, value)
+        elif "choices" in allowed and value not in allowed["choices"]:
+            raise ValueError(unknown(name, value, allowed["choices"]))
         elif "widths" in allowed:
             if not isinstance(value, tuple):
-                raise refusal(field.name, value, "a tuple of sizes")
+                raise refusal(name, value, "a tuple of sizes")
             for size in value:
-                validate_number(field.name, size, _COUNT)
+                validate_number(name, size, _COUNT)
         elif "schedule" in allowed:
-            _validate_schedule(field.name, value, total_steps)
+            _validate_schedule(name, value, total_steps)
         elif "text" in allowed and not isinstance(value, str | None):
-            raise refusal(field.name, value, "a string or None")
+            raise refusal(name, value, "a string or None")
 
 
 def validate_config(config: Config) -> None:
@@ -293,16 +257,15 @@ def validate_config(config: Config) -> None:
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
-    if not isinstance(config, Config):
-        raise refusal("config", config, "a gasil_jax.Config")
-    # The number of iterations is an int32, so there may be more steps than that.
-    validate_number("batch_steps", config.batch_steps, _COUNT)
-    most = _LARGEST_COUNT * config.batch_steps
-    validate_number("total_steps", config.total_steps, _COUNT, most=most)
-    rest = config.replace(total_steps=min(config.total_steps, _LARGEST_COUNT))
-    validate(rest, config.total_steps)
-    for size in ("num_envs", "minibatch_size"):
-        _validate_divides(size, getattr(config, size), config.batch_steps)
+    validate(config, config.total_steps)
+    for name in ("num_envs", "minibatch_size"):
+        size, batch_steps = getattr(config, name), config.batch_steps
+        if batch_steps % size:
+            divisors = [n for n in range(1, batch_steps + 1) if batch_steps % n == 0]
+            raise ValueError(
+                f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
+                f"the nearest that does is {min(divisors, key=lambda n: abs(n - size))}"
+            )
 
 
 def validate_switch(name: str, value: Any) -> None:
@@ -311,9 +274,7 @@ def validate_switch(name: str, value: Any) -> None:
         raise refusal(name, value, "True or False")
 
 
-def validate_number(
-    name: str, value: Any, allowed: Range, *, most: float = _LARGEST_COUNT
-) -> None:
+def validate_number(name: str, value: Any, allowed: Range) -> None:
     """Raise `ValueError` unless a value is a number in the range, or traced."""
     if shape := getattr(value, "shape", ()):
         raise ValueError(
@@ -325,55 +286,29 @@ def validate_number(
     is_array = isinstance(value, np.ndarray | jax.Array)
     if is_array and jax.numpy.issubdtype(value.dtype, np.number):
         value = value.item()
-    if isinstance(value, str):
-        raise refusal(name, value, "a number")
-    most = most if allowed.whole else _LARGEST_FLOAT
-    if (_as_float(value) or 0.0) > most and math.isinf(allowed.high):
-        raise refusal(name, value, f"{allowed}, at most {most}")
     if value not in allowed:
-        raise refusal(name, value, allowed)
+        raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
 
 
-def _validate_divides(name: str, size: int, batch_steps: int) -> None:
-    if batch_steps % size == 0:
+def _validate_schedule(name: str, schedule: Any, total_steps: int) -> None:
+    """Check points, or the factors of a function at the start and end of training."""
+    if callable(schedule):
+        for step in (0, total_steps):
+            what = f"{name} gives no number at step {step}"
+            with user_code.refused(what), jax.ensure_compile_time_eval():
+                factor = schedule(jax.numpy.float32(step))
+                if isinstance(factor, jax.core.Tracer):
+                    return
+                factor = float(factor)
+            validate_number(f"{name}({step})", factor, Range(0.0))
         return
-    root = math.isqrt(batch_steps)
-    small = [n for n in range(1, root + 1) if batch_steps % n == 0]
-    divisors = [*small, *(batch_steps // n for n in reversed(small))]
-    closest = min(divisors, key=lambda n: abs(n - size))
-    raise ValueError(
-        f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
-        f"the nearest that does is {closest}"
-    )
-
-
-def _validate_schedule(name: str, points: Any, total_steps: int) -> None:
-    if callable(points):
-        _validate_function(name, points, total_steps)
-        return
-    pairs = "(steps, factor) points"
-    if not isinstance(points, tuple) or not all(
-        isinstance(point, tuple) and len(point) == 2 for point in points
+    pairs = "(steps, factor) points, steps increasing"
+    if not isinstance(schedule, tuple) or not all(
+        isinstance(point, tuple) and len(point) == 2 for point in schedule
     ):
-        raise refusal(name, points, pairs)
-    for number in (number for point in points for number in point):
+        raise refusal(name, schedule, pairs)
+    for number in (number for point in schedule for number in point):
         validate_number(name, number, Range(0.0))
-    steps = [point[0] for point in points]
+    steps = [point[0] for point in schedule]
     if steps != sorted(set(steps)):
-        raise refusal(name, points, f"{pairs}, steps increasing")
-
-
-def _validate_function(
-    name: str, function: Callable[[Any], Any], total_steps: int
-) -> None:
-    """Check the factors that a schedule gives at the start and the end of training."""
-    for step in (0, total_steps):
-        try:
-            factor = function(jax.numpy.float32(step))
-            if isinstance(factor, jax.core.Tracer):
-                return
-            number = float(factor)
-        except Exception as error:
-            why = f"{type(error).__name__}: {error}".partition("\n")[0]
-            raise ValueError(f"{name} gives no number at step {step}: {why}") from None
-        validate_number(f"{name}({step})", number, Range(0.0))
+        raise refusal(name, schedule, pairs)

@@ -4,12 +4,14 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import wrappers
 from gasil_jax.buffer import History
 from gasil_jax.config import Config
 from gasil_jax.distributions import Distribution
+from gasil_jax.errors import shown
 from gasil_jax.normalization import Normalizer
 from gasil_jax.rollout import Rollout
 
@@ -78,3 +80,23 @@ class Context(struct.PyTreeNode):
     distribution: Distribution = struct.field(pytree_node=False)
     value: Callable[..., jax.Array] = struct.field(pytree_node=False)
     data: Any = ()
+
+
+def merge_metrics(source: str, *groups: Metrics) -> Metrics:
+    """Return groups of metrics as one, float32 () by name.
+
+    Raises:
+      ValueError: if two have the same name, or one is not a single number; the message
+        names the source, such as "agent 'ppo'".
+    """
+    merged: Metrics = {}
+    for name, value in (pair for group in groups for pair in group.items()):
+        what = f"metric {shown(name)} of {source}"
+        if name in merged:
+            raise ValueError(f"{what} has the name of another metric")
+        if jnp.shape(value):
+            raise ValueError(
+                f"{what} has shape {jnp.shape(value)}: it must be one number"
+            )
+        merged[name] = jnp.asarray(value, jnp.float32)
+    return merged

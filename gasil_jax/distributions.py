@@ -28,7 +28,7 @@ class Distribution(NamedTuple):
 
     Attributes:
       network: class of the policy's network.
-      explore: (params, deviation) -> the params of an untrained policy whose actions
+      explore: (params, std) -> the params of an untrained policy whose actions
         have this standard deviation, if the distribution has one.
       sample: (key, parameters) -> action (..., action); consumes the key.
       log_prob: (parameters, action) -> log density or log probability, (...).
@@ -47,9 +47,9 @@ class Distribution(NamedTuple):
     executed: Callable[[jax.Array, Any, Any], jax.Array]
 
 
-def _with_deviation(params: Any, deviation: jax.Array) -> Any:
+def _with_std(params: Any, std: jax.Array) -> Any:
     own = params["params"]
-    log_std = own["log_std"] + jnp.log(deviation)
+    log_std = own["log_std"] + jnp.log(std)
     return {**params, "params": {**own, "log_std": log_std}}
 
 
@@ -76,7 +76,7 @@ def _gaussian_entropy(parameters: Any) -> jax.Array:
 #: A diagonal Gaussian whose deviation does not depend on the state.
 GAUSSIAN = Distribution(
     network=GaussianPolicy,
-    explore=_with_deviation,
+    explore=_with_std,
     sample=_gaussian_sample,
     log_prob=_gaussian_log_prob,
     entropy=_gaussian_entropy,
@@ -89,12 +89,12 @@ def _one_hot(index: jax.Array, logits: jax.Array) -> jax.Array:
     return jax.nn.one_hot(index, logits.shape[-1], dtype=logits.dtype)
 
 
-def _spread(params: Any, deviation: jax.Array) -> Any:
+def _spread(params: Any, std: jax.Array) -> Any:
     def scaled(path: Any, x: jax.Array) -> jax.Array:
         # Those of hidden layers are still 0.
-        return x * deviation if path[-1].key == "bias" else x
+        return x * std if path[-1].key == "bias" else x
 
-    return jax.tree_util.tree_map_with_path(scaled, _with_deviation(params, deviation))
+    return jax.tree_util.tree_map_with_path(scaled, _with_std(params, std))
 
 
 def _mean_of(index: jax.Array, parameters: Any) -> jax.Array:
@@ -152,7 +152,7 @@ def _categorical_entropy(logits: jax.Array) -> jax.Array:
 #: One of `num_actions` actions.
 CATEGORICAL = Distribution(
     network=CategoricalPolicy,
-    explore=lambda params, deviation: params,
+    explore=lambda params, std: params,
     sample=lambda key, logits: _one_hot(jax.random.categorical(key, logits), logits),
     log_prob=lambda logits, action: jnp.sum(
         action * jax.nn.log_softmax(logits), axis=-1

@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from gasil_jax import numpy_policy
-
 #: The functions that may follow a hidden layer.
 ACTIVATIONS: Mapping[str, Callable[[jax.Array], jax.Array]] = {
     "tanh": nn.tanh,
@@ -157,8 +155,8 @@ class MixturePolicy(_Policy):
         )
         within = nn.initializers.constant(-0.5 * math.log(2.0))
         log_std = self.param("log_std", within, (size,))
-        mean, logits = numpy_policy.components(output, size)
-        return mean, log_std, logits
+        mean, logits = output[..., :-count], output[..., -count:]
+        return mean.reshape(*mean.shape[:-1], count, size), log_std, logits
 
 
 class CategoricalPolicy(_Policy):

@@ -7,8 +7,8 @@ from flax import struct
 
 from gasil_envs import wrappers
 
-# Defined in `numpy_policy`, which must not import JAX.
-from gasil_jax.numpy_policy import CLIP
+#: Largest absolute value of a normalized number; `numpy_policy` has the same.
+CLIP = 10.0
 
 
 class Normalizer(struct.PyTreeNode):

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from gasil_jax import learner
+from gasil_jax import learner, normalization
 from gasil_jax.config import Config
+from gasil_jax.context import Context, Metrics
 from gasil_jax.distributions import Distribution
 from gasil_jax.learner import Learner
 from gasil_jax.permutation import permutation
@@ -106,48 +107,69 @@ def standardize(advantage: jax.Array) -> jax.Array:
     return (advantage - mean) / (std + 1e-8)
 
 
-def evaluate_streams(
-    actor_critic: ActorCritic,
-    rewards: jax.Array,
-    observation: jax.Array,
-    *,
-    next_observation: jax.Array,
-    terminated: jax.Array,
-    ended: jax.Array,
-    value: Callable[[Any, jax.Array], jax.Array],
-    config: Config,
-) -> tuple[jax.Array, jax.Array]:
-    """Return values and advantages of every reward stream, (time, env, stream) each.
+@jax.named_scope("advantages")
+def advantages(
+    actor_critic: ActorCritic, rewards: jax.Array, context: Context
+) -> tuple[jax.Array, jax.Array, Metrics]:
+    """Return the standardized advantages and the returns of every reward stream.
 
     Args:
       actor_critic: the networks, with a value for each stream.
-      rewards: float32 (time, env, stream).
-      observation: float32 (time, env, obs), normalized.
-      next_observation: float32 (time, env, obs), normalized.
-      terminated: bool (time, env).
-      ended: bool (time, env).
-      value: (params, observation) -> value.
-      config: discount and lambda.
+      rewards: float32 (time, env) for one stream, or (time, env, stream).
+      context: the iteration's data.
+
+    Returns:
+      Two arrays, float32 (time, env, stream), and as metric "explained_variance", the
+      share of the returns' variance that the values explain, averaged over streams.
     """
-    chex.assert_equal(rewards.shape, (*terminated.shape, len(actor_critic.values)))
+    batch = context.rollout
+    rewards = rewards[..., None] if rewards.ndim == 2 else rewards
+    chex.assert_equal(rewards.shape, (*batch.ended.shape, len(actor_critic.values)))
 
     def evaluate(observation: jax.Array) -> jax.Array:
-        return jnp.stack(
-            [value(critic.params, observation) for critic in actor_critic.values],
-            axis=-1,
-        )
+        observation = normalization.normalize(context.normalizer, observation)
+        values = [context.value(x.params, observation) for x in actor_critic.values]
+        return jnp.stack(values, axis=-1)
 
-    values = evaluate(observation)
+    values = evaluate(batch.observation)
     advantage = generalized_advantage_estimation(
         rewards,
         values,
-        evaluate(next_observation),
-        terminated=terminated[..., None],
-        ended=ended[..., None],
-        gamma=config.gamma,
-        gae_lambda=config.gae_lambda,
+        evaluate(batch.next_observation),
+        terminated=batch.terminated[..., None],
+        ended=batch.ended[..., None],
+        gamma=context.config.gamma,
+        gae_lambda=context.config.gae_lambda,
     )
-    return values, advantage
+    returns = advantage + values
+    residual = jnp.var(returns - values, axis=(0, 1))
+    explained = 1.0 - residual / (jnp.var(returns, axis=(0, 1)) + 1e-8)
+    metrics = {"explained_variance": jnp.mean(explained)}
+    return standardize(advantage), returns, metrics
+
+
+def batch_of(context: Context, advantage: jax.Array, returns: jax.Array) -> Batch:
+    """Return PPO's batch, (steps, ...), of an iteration.
+
+    Args:
+      context: the iteration's data.
+      advantage: float32 (time, env), mixed from those of all streams.
+      returns: float32 (time, env, stream).
+    """
+    steps = context.rollout
+
+    def flat(x: jax.Array) -> jax.Array:
+        return x.reshape(-1, *x.shape[2:])
+
+    return Batch(
+        observation=flat(
+            normalization.normalize(context.normalizer, steps.observation)
+        ),
+        action=flat(steps.action),
+        log_prob=flat(steps.log_prob),
+        advantage=flat(advantage),
+        returns=flat(returns),
+    )
 
 
 def loss(
@@ -158,7 +180,7 @@ def loss(
     distribution: Distribution,
     value: Callable[[Any, jax.Array], jax.Array],
     config: Config,
-) -> tuple[jax.Array, dict[str, jax.Array]]:
+) -> tuple[jax.Array, Metrics]:
     """Return PPO's loss: clipped surrogate, value error and entropy.
 
     See Schulman et al. 2017, equations 7 and 9.
@@ -254,7 +276,7 @@ def update(
     distribution: Distribution,
     value: Callable[[Any, jax.Array], jax.Array],
     config: Config,
-) -> tuple[ActorCritic, dict[str, jax.Array]]:
+) -> tuple[ActorCritic, Metrics]:
     """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
     Args:

@@ -98,11 +98,6 @@ def _cast(x: Any, dtype: Any) -> jax.Array:
     return x if jnp.issubdtype(dtype, jax.dtypes.prng_key) else x.astype(dtype)
 
 
-def _strip_weak_types(tree: Any) -> Any:
-    # A weak type in the first state alone would make JAX compile everything twice.
-    return jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), tree)
-
-
 def init(
     env: Any, key: jax.Array, num_envs: int, *, age_limit: int | None = None
 ) -> EnvironmentStates:
@@ -124,9 +119,11 @@ def init(
     starting_age = jnp.zeros(num_envs, jnp.int32)
     if age_limit is not None:
         starting_age = jax.random.randint(age_key, (num_envs,), 0, age_limit)
+    # A weak type in the first state alone would make JAX compile everything twice.
+    state = jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), state)
     # Each field needs its own array: a shared one could not be donated.
     return EnvironmentStates(
-        state=_strip_weak_types(state),
+        state=state,
         episode_return=jnp.zeros(num_envs, jnp.float32),
         discounted_return=jnp.zeros(num_envs, jnp.float32),
         undiscounted_return=jnp.zeros(num_envs, jnp.float32),
@@ -276,3 +273,21 @@ def collect(
         return carry, transition
 
     return jax.lax.scan(step, environments, jax.random.split(key, num_steps))
+
+
+def metrics(batch: Rollout) -> dict[str, jax.Array]:
+    """Return the metrics of a batch, (time, env, ...).
+
+    Means over the whole episodes that ended in the batch are NaN if none did.
+    """
+    completed = batch.completed
+
+    def mean(x: jax.Array) -> jax.Array:
+        return jnp.sum(jnp.where(completed, x, 0)) / jnp.sum(completed)
+
+    return {
+        "episode_return": mean(batch.episode_return),
+        "episode_length": mean(batch.episode_length),
+        "episodes": jnp.sum(completed),
+        "faulty_steps": jnp.sum(batch.faulty),
+    }

@@ -1,8 +1,4 @@
-"""Interquartile means and their intervals over seeds (Agarwal et al. 2021).
-
-Also, for a sweep, the share of the variance of its points' returns that one
-hyperparameter explains.
-"""
+"""Interquartile means and their intervals over seeds (Agarwal et al. 2021)."""
 
 import numbers
 from collections.abc import Mapping, Sequence
@@ -12,11 +8,8 @@ import numpy as np
 
 #: Fewer seeds tell too little for an interval.
 FEWEST_SEEDS = 5
-#: Fewer points of a sweep tell nothing of a hyperparameter's importance.
 _FEWEST_POINTS = 8
 _MOST_GROUPS = 8
-#: With fewer points a hyperparameter's importance is uncertain.
-FEW_POINTS = 32
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -140,31 +133,3 @@ def groups(values: Sequence[Any]) -> list[np.ndarray]:
     group_of = {x: i * count // len(distinct) for i, x in enumerate(distinct)}
     of_point = np.array([group_of[x] for x in values], int)
     return [np.flatnonzero(of_point == group) for group in range(count)]
-
-
-def importance(values: Sequence[Any], returns: np.ndarray) -> float | None:
-    """Return the share of the points' variance that one hyperparameter explains alone.
-
-    It is epsilon squared, 1 - (S / (n - k)) / (T / (n - 1)), with n points in k groups
-    (`groups`), and S and T the sums of squared distances of their returns to the mean
-    of their group and to the mean of all. It is near 0 on average for a hyperparameter
-    without effect, however many groups there are, and may be below 0; it is 0 if all
-    returns are equal. Effects that only several hyperparameters have together are
-    credited to none.
-
-    Args:
-      values: each point's value of the hyperparameter.
-      returns: each point's return, (points,), all finite.
-
-    Returns:
-      The share, at most 1; None with fewer than eight points, or than two for each
-      group.
-    """
-    parts = groups(values)
-    if len(values) < max(_FEWEST_POINTS, 2 * len(parts)):
-        return None
-    if np.ptp(returns) == 0.0:
-        return 0.0
-    within = sum(np.var(returns[part]) * len(part) for part in parts)
-    rest = within / (len(values) - len(parts))
-    return float(1.0 - rest / np.var(returns, ddof=1))

@@ -5,7 +5,7 @@ from typing import Any
 import jax
 
 from gasil_envs.precision import full_precision
-from gasil_jax import checks, schedules, train
+from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.context import Context
 
@@ -25,9 +25,7 @@ def example_context(env: Any, algorithm: Algorithm, key: jax.Array) -> Context:
     Raises:
       ValueError: if the algorithm is not valid.
     """
-    checks.check_environment(env)
-    checks.check(env, algorithm)
     state, data = train.init(env, algorithm, key), algorithm.agent.data()
-    algorithm = schedules.at(algorithm, state.hyperparameters, state.iteration)
+    algorithm = algorithm.at(state.hyperparameters, state.iteration)
     keys = train.Keys(*jax.random.split(state.key, 6))
     return train.collect(env, algorithm, state, keys=keys, data=data).context

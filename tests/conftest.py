@@ -161,8 +161,9 @@ def _untrained(out, env, **settings):
     import numpy as np
 
     import gasil_jax
-    from gasil_jax.host import checkpoint, run_options
+    from gasil_jax.host import checkpoint, training
     from gasil_jax.host.environments import Settings
+    from gasil_jax.host.sweep import Sweep
 
     algorithm = gasil_jax.algorithm(
         num_envs=1,
@@ -171,17 +172,16 @@ def _untrained(out, env, **settings):
         discriminator_hidden_sizes=(8,),
         buffer_steps=200,
     )
-    options = run_options.Options(
-        env=env,
-        settings=Settings(**settings),
-        **run_options.algorithm_options(algorithm),
-    )
+    sweep = Sweep(env, algorithm, (0,), settings=Settings(**settings))
     out.mkdir()
-    run_options.write_config(options, out)
-    made = run_options.make_env(options)
+    sweep.write(out)
+    made = training.make_env(sweep)
     init = jax.vmap(lambda seed: gasil_jax.init(made, algorithm, jax.random.key(seed)))
     states = jax.jit(init)(np.arange(1, dtype=np.uint32))
-    checkpoint.write(out / "checkpoints", 0, states, {"score": None})
+    (program,) = sweep.unfinished(out)
+    record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
+    with program.opened():
+        checkpoint.write(program.path / "checkpoints", 0, states, record)
     return out
 
 

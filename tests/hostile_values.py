@@ -56,7 +56,6 @@ _KINDS = (
     lambda: [np.float64(0.5), np.longdouble(0.5), np.longdouble("1e4000"), np.int32(1)],
     lambda: [
         np.datetime64("2020-01-01"),
-        np.timedelta64(3),
         np.str_("3"),
         np.void(b""),
     ],
@@ -116,9 +115,9 @@ def as_number(value):
     """Return a value as a Python number, or None if it is not a single real number."""
     if isinstance(value, np.ndarray | jax.Array):
         kind = jnp.issubdtype
-        plain = kind(value.dtype, np.number) and not kind(value.dtype, np.timedelta64)
+        plain = kind(value.dtype, np.number)
         value = value.item() if value.shape == () and plain else None
-    if isinstance(value, bool | np.bool_ | np.timedelta64):
+    if isinstance(value, bool | np.bool_):
         return None
     if isinstance(value, np.floating):
         return float(value)

@@ -19,3 +19,13 @@ FLAGS = (
 #: For agents with a discriminator.
 DISCRIMINATOR = {"discriminator_hidden_sizes": (8,)}
 DISCRIMINATOR_FLAGS = ("--discriminator-hidden-sizes", "8")
+#: Four iterations of the discriminator's agent. Of four members, as the run below has
+#: with the padding for two devices, all have one compiled program.
+SMALL = (
+    *(*FLAGS, *DISCRIMINATOR_FLAGS, "--total-steps", "1e3", "--batch-steps", "256"),
+    *("--num-epochs", "2", "--buffer-steps", "300", "--discriminator-updates", "3"),
+    *("--alpha", "0.5", "--alpha-schedule", "0", "0.5", "500", "1"),
+    *("--learning-rate", "3e-4", "--first-seed", "5"),
+)
+#: Two programs of two points each. The first step of points 2 and 3 is beyond float32.
+GRID = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=3,1")

@@ -75,17 +75,15 @@ def follow_return(
     *,
     return_: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of the policy's returns, updated by a batch's episodes.
+    """Return the moving mean of the policy's returns after a batch's episodes.
 
     Args:
       policy_return: float32 (), the mean before the batch.
-      has_episodes: bool (), whether there were episodes before the batch.
+      has_episodes: bool (), whether there were episodes before the batch; whether there
+        are after it is returned too.
       completed: bool (time, env), whether a whole episode ended with this step.
-      return_: float32 (time, env), the episode's return up to this step, of the
-        environment's own rewards; NaN if it has a faulty step, and does not count.
-
-    Returns:
-      The mean, and whether there are episodes after the batch.
+      return_: float32 (time, env), the episode's return up to this step; NaN if it does
+        not count.
     """
     counted = completed & jnp.isfinite(return_)
     count = jnp.sum(counted)

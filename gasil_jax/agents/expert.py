@@ -32,10 +32,7 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _version(source: str) -> Any:
-    """Return names, modification times and sizes of an expert's files.
-
-    It is None if they can't be read.
-    """
+    """Return names, times and sizes of an expert's files; None if they are not read."""
     paths = [pathlib.Path(source)]
     if source.startswith(_MINARI):
         try:
@@ -52,22 +49,18 @@ def _version(source: str) -> Any:
 @functools.lru_cache(maxsize=4)
 def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
     """Load an expert; `version` makes the cache read a changed file again."""
-    if source.startswith(_MINARI):
-        name = source.removeprefix(_MINARI)
-        _require_minari(name)
+    is_minari = source.startswith(_MINARI)
+    form = "an .npz file with arrays 'observation' and 'action'"
+    if is_minari:
+        _require_minari(source)
         form = "a local data set with arrays as observations and actions"
-
-        def read() -> dict[str, np.ndarray]:
-            return _read_minari(name)
-    else:
-        form = "an .npz file with arrays 'observation' and 'action'"
-
-        def read() -> dict[str, np.ndarray]:
-            return npz.read(pathlib.Path(source), lambda name: name in _NAMES)
-
     # What is wrong in a data set decides the type of the error.
     try:
-        arrays = read()
+        arrays = (
+            _read_minari(source.removeprefix(_MINARI))
+            if is_minari
+            else npz.read(pathlib.Path(source), lambda name: name in _NAMES)
+        )
         numbered = np.ndim(arrays.get("action", 0)) == 1
         shapes = (None, None), (None,) if numbered else (None, None)
         observation, action = (
@@ -84,14 +77,14 @@ def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
     return observation, action
 
 
-def _require_minari(name: str) -> None:
+def _require_minari(source: str) -> None:
     """Raise `ValueError` unless Minari and what it needs for data sets is installed."""
     try:
         importlib.import_module("h5py")  # Minari needs it to read a data set.
         importlib.import_module("minari")
     except ImportError:
         raise ValueError(
-            f"expert is 'minari:{name}': it needs the package minari "
+            f"expert is {source!r}: it needs the package minari "
             '(pip install "gasil_jax[minari]")'
         ) from None
 
@@ -102,11 +95,8 @@ def _read_minari(name: str) -> dict[str, np.ndarray]:
     episodes = list(minari.load_dataset(name).iterate_episodes())
     # An episode has one observation more than actions.
     observations = [e.observations[: len(e.actions)] for e in episodes]
-    arrays = (
-        np.concatenate(observations),
-        np.concatenate([e.actions for e in episodes]),
-    )
-    return dict(zip(_NAMES, arrays))
+    arrays = observations, [e.actions for e in episodes]
+    return dict(zip(_NAMES, map(np.concatenate, arrays)))
 
 
 def vectors(action: jax.Array, size: int) -> jax.Array:
@@ -127,20 +117,19 @@ def check(source: str | None, sizes: Sizes) -> None:
             "minari:NAME"
         )
     observation, action = load(source)
-    if action.ndim == 1:
-        if not sizes.discrete:
-            raise ValueError(
-                f"expert {source!r} has numbers as actions: the environment's are "
-                f"vectors of size {sizes.action}"
-            )
-        if not np.isin(action, np.arange(sizes.action)).all():
-            raise ValueError(
-                f"expert {source!r} has actions from {action.min():g} to "
-                f"{action.max():g}: the environment's are whole numbers from 0 to "
-                f"{sizes.action - 1}"
-            )
-    width = sizes.action if action.ndim == 1 else action.shape[1]
-    given = (observation.shape[1], width)
+    numbered = action.ndim == 1
+    if numbered and not sizes.discrete:
+        raise ValueError(
+            f"expert {source!r} has numbers as actions: the environment's are vectors "
+            f"of size {sizes.action}"
+        )
+    if numbered and not np.isin(action, np.arange(sizes.action)).all():
+        raise ValueError(
+            f"expert {source!r} has actions from {action.min():g} to "
+            f"{action.max():g}: the environment's are whole numbers from 0 to "
+            f"{sizes.action - 1}"
+        )
+    given = (observation.shape[1], sizes.action if numbered else action.shape[1])
     if given != (sizes.observation, sizes.action):
         raise ValueError(
             f"expert {source!r} has observations of size {given[0]} and actions of "

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
-import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import user_code
@@ -133,106 +132,37 @@ class Agent(struct.PyTreeNode):
         return None
 
 
-#: What the functions of an `Agent` that train return, in order.
-_OUTPUTS: Mapping[str, tuple[str, ...]] = {
-    "update_and_reward": ("state", "rewards", "metrics"),
-    "update_policy": ("state", "actor_critic", "metrics"),
-    "mix": ("advantage", "metrics"),
-}
+def call(agent: Agent, function: str, *arguments: Any, **like: Any) -> Any:
+    """Call a function of an agent, and return the values that it returns.
 
+    Args:
+      agent: the agent.
+      function: the function's name.
+      *arguments: its arguments.
+      **like: what it returns by name, as arrays of the same shapes and dtypes, in
+        order; all functions but `remember` return metrics besides.
 
-class Checked:
-    """An agent whose functions check what they return.
-
-    So an error names the agent's function and not a line of the training loop. They
-    raise `ValueError` if they return too few or too many values, metrics that are no
-    dict, rewards or an advantage of a wrong shape, or a state or networks of other
-    shapes or dtypes than they were given.
+    Raises:
+      ValueError: if it returns anything else. The loop would broadcast or convert it.
     """
-
-    def __init__(self, agent: Agent):
-        """Wrap an agent.
-
-        Raises:
-          ValueError: if it has several reward streams and no `mix`.
-        """
-        self._agent, self.name = agent, agent.name
-        if agent.num_streams > 1 and type(agent).mix is Agent.mix:
-            raise ValueError(
-                f"agent {agent.name!r} has {agent.num_streams} reward streams: it must "
-                "have a function mix that combines their advantages"
-            )
-
-    def remember(self, state: Any, context: Context) -> Any:
-        """Call `Agent.remember`."""
-        after = self._agent.remember(state, context)
-        self._check_leaves("remember", "state", after, before=state)
-        return after
-
-    def update_and_reward(self, state: Any, context: Context, key: jax.Array) -> Any:
-        """Call `Agent.update_and_reward`."""
-        outputs = self._call("update_and_reward", state, context, key)
-        self._check_leaves("update_and_reward", "state", outputs[0], before=state)
-        rewards, expected = outputs[1], context.rollout.reward.shape
-        if self._agent.num_streams > 1 or jnp.ndim(rewards) == 3:
-            expected = (*expected, self._agent.num_streams)
-        self._check_shape("update_and_reward", "rewards", rewards, expected=expected)
-        return outputs
-
-    def update_policy(
-        self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
-    ) -> Any:
-        """Call `Agent.update_policy`."""
-        outputs = self._call("update_policy", state, actor_critic, context, key)
-        self._check_leaves("update_policy", "state", outputs[0], before=state)
-        self._check_leaves(
-            "update_policy", "actor_critic", outputs[1], before=actor_critic
-        )
-        return outputs
-
-    def mix(self, state: Any, advantages: jax.Array, context: Context) -> Any:
-        """Call `Agent.mix`."""
-        outputs = self._call("mix", state, advantages, context)
-        self._check_shape(
-            "mix", "an advantage", outputs[0], expected=advantages.shape[:2]
-        )
-        return outputs
-
-    def _call(self, function: str, *arguments: Any) -> Any:
-        name, expected = self._agent.name, _OUTPUTS[function]
-        outputs = getattr(self._agent, function)(*arguments)
+    what = f"{function} of agent {agent.name!r}"
+    outputs = getattr(agent, function)(*arguments)
+    names = [*like, *["metrics"] * (function != "remember")]
+    outputs = (outputs,) if len(names) == 1 else outputs
+    if not isinstance(outputs, tuple | list) or len(outputs) != len(names):
         count = len(outputs) if isinstance(outputs, tuple | list) else 1
-        if count != len(expected):
-            raise ValueError(
-                f"{function} of agent {name!r} returns {count} "
-                f"value{'s' * (count != 1)}: it must return {len(expected)}, "
-                f"{', '.join(expected)}"
-            )
-        if not isinstance(outputs[-1], Mapping):
-            raise ValueError(
-                f"{function} of agent {name!r} returns metrics {outputs[-1]!r}: they "
-                "must be a dict"
-            )
-        return outputs
-
-    def _check_leaves(
-        self, function: str, what: str, value: Any, *, before: Any
-    ) -> None:
-        # Undoing an update would broadcast other shapes and convert other dtypes.
-        # Leaves may be Python's numbers until their shapes are evaluated.
-        shapes = jax.eval_shape(lambda: (before, value))
-        if change := user_code.first_change(*shapes):
-            path, expected, given = change
-            raise ValueError(
-                f"{function} of agent {self._agent.name!r}: the returned {what}{path} "
-                f"is {given}: it must be {expected}, as before"
-            )
-
-    def _check_shape(
-        self, function: str, what: str, value: Any, *, expected: tuple[int, ...]
-    ) -> None:
-        if jnp.shape(value) != expected:
-            raise ValueError(
-                f"{function} of agent {self._agent.name!r} returns {what} of shape "
-                f"{jnp.shape(value)}: it must be {expected}"
-            )
+        raise ValueError(
+            f"{what} returns {count} value{'s' * (count != 1)}: it must return "
+            f"{len(names)}, {', '.join(names)}"
+        )
+    returned = dict(zip(names, outputs))
+    if not isinstance(metrics := returned.pop("metrics", {}), Mapping):
+        raise ValueError(f"{what} returns metrics {metrics!r}: they must be a dict")
+    # Leaves may be Python's numbers until their shapes are evaluated.
+    if change := user_code.first_change(*jax.eval_shape(lambda: (like, returned))):
+        path, expected, given = change
+        path = path.replace("['", "", 1).replace("']", "", 1)
+        raise ValueError(
+            f"{what}: the returned {path} is {given}: it must be {expected}"
+        )
+    return outputs

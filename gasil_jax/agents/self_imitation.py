@@ -92,9 +92,9 @@ def returns_to_go(
       gamma: discount.
 
     Returns:
-      Two arrays (env, steps of history), in time order, oldest step first: the
-      discounted return from the step on, and a mask of the steps whose episode ended
-      in the last batch and whose return is finite.
+      Two arrays (env, steps of history), oldest step first: the discounted return from
+      the step on, and a mask of the steps whose episode ended in the last batch and
+      whose return is finite.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
     length = reward.shape[1]
@@ -138,10 +138,9 @@ def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> R
     def write(ring: jax.Array, new: Any) -> jax.Array:
         return ring.at[index].set(new, mode="drop")
 
+    observation = flat(history.in_time(history.observation))
     return Replay(
-        observation=write(
-            replay.observation, flat(history.in_time(history.observation))
-        ),
+        observation=write(replay.observation, observation),
         action=write(replay.action, flat(history.in_time(history.action))),
         return_=write(replay.return_, flat(return_)),
         priority=write(replay.priority, _MAX_ADVANTAGE),
@@ -244,11 +243,9 @@ class PPOSIL(Agent):
     sil_buffer_steps: int = count(50_000)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Replay:
-        """Return an empty replay."""
         return init_replay(self.sil_buffer_steps, sizes.observation, sizes.action)
 
     def remember(self, state: Replay, context: Context) -> Replay:
-        """Add the steps of the episodes that ended in a batch to the replay."""
         config = context.config
         assert context.history is not None  # Ensured by `history_episodes`.
         return insert(state, context.history, config.num_steps, gamma=config.gamma)
@@ -256,17 +253,12 @@ class PPOSIL(Agent):
     def update_policy(
         self, state: Replay, actor_critic: ActorCritic, context: Context, key: jax.Array
     ) -> tuple[Replay, ActorCritic, Metrics]:
-        """Take gradient steps on the loss, if the replay is not empty."""
-
-        def normalize(x: jax.Array) -> jax.Array:
-            return normalization.normalize(context.normalizer, x)
-
         # The replay's returns are in the environment's unit, the value's targets in
         # that of the normalized reward.
         scale = return_scale(state) / context.reward_scale
 
         def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
-            observation = normalize(rows.observation)
+            observation = normalization.normalize(context.normalizer, rows.observation)
             parameters = context.policy(params["policy"], observation)
             log_prob = context.distribution.log_prob(parameters, rows.action)
             (critic,) = params["values"]

@@ -15,6 +15,7 @@ from gasil_jax.agents import PPOGASIL
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli import parsing
 from gasil_jax.cli.parsing import Parser, check_minimum, input_checked
+from gasil_jax.cli.reporting import HelpShown
 from gasil_jax.config import Config, names
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
@@ -52,6 +53,7 @@ class Options:
         humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
         brax:NAME, gymnax:NAME, navix:NAME or playground:NAME, for example
         gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
+        --list-envs prints all names.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
         settings: this help shows those of the one that is named beside it.
@@ -137,6 +139,9 @@ def read(
     With --resume, options that are not given are those of the sweep in the folder,
     whose points come first; otherwise they are the preset's.
     """
+    if "--list-envs" in parsing.words(arguments):
+        print(*environments.names(), sep="\n")
+        raise HelpShown(0)
     first, stored = _first_options(arguments), None
     if first.resume:
         if first.out is None:
@@ -161,6 +166,12 @@ def read(
         parser.add_fields(model, model.switch, own.get(model, model()))
     values = parser.read(arguments, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
+    if stored is not None:
+        for name, now in (("agent", options.agent), ("preset", options.preset)):
+            if now != (before := getattr(default, name)):
+                raise InputError(
+                    f"{name} is {now!r}: {options.out} was begun with {before!r}"
+                )
     switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
     on = [switch for switch, is_on in switches.items() if is_on]
     changes = [parser.fields(values, title) for title in ("training", "agent", *on)]
@@ -180,19 +191,19 @@ def read(
             options.evaluate_episodes or Recording.evaluate_episodes,
             options.log,
         ),
-        preset=options.preset,
+        preset=options.preset if stored is None else stored.preset,
     )
     _check(options, requested)
+    requested = _with_points(options, requested, stored)
+    if stored is not None:
+        assert options.out is not None
+        requested = requested.continued_from(options.out)
     _note_without_effect(
         options,
         requested,
         default=algorithm,
         off={x: parser.fields(values, x) for x in switches if x not in on},
     )
-    requested = _with_points(options, requested, stored)
-    if stored is not None:
-        assert options.out is not None
-        requested = requested.continued_from(options.out)
     return options, requested
 
 
@@ -205,12 +216,11 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
         except (ValueError, OverflowError):
             return 1
 
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = Parser("gasil_jax", "", Options)
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
-    parser.add_argument("--env", nargs="?")
-    parser.add_argument("--resume", action="store_true")
-    for name, default in (("agent", Options.agent), ("preset", presets.DEFAULT)):
-        parser.add_argument(f"--{name}", nargs="?", default=default, const=default)
+    for name in ("env", "agent", "preset"):
+        parser.add_argument(f"--{name}", nargs="?")
+    parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
     return parser.parse_known_args(parsing.words(arguments))[0]
 
@@ -220,6 +230,15 @@ def _defaults(
 ) -> tuple[Algorithm, Options]:
     """Return the algorithm and the options that hold where none are given."""
     if stored is not None:
+        for name, given, own in (
+            ("agent", first.agent, stored.algorithm.agent.name),
+            ("preset", first.preset, stored.preset),
+        ):
+            if given not in (None, own):
+                raise InputError(
+                    f"out is {first.out}, where {name} was {own}, is {given}: leave it "
+                    "out or name another folder"
+                )
         recording = stored.recording
         return stored.algorithm, kind(
             env=stored.env,
@@ -238,29 +257,31 @@ def _defaults(
             log=recording.log,
             **_switches(stored.algorithm),
         )
+    name = first.agent or Options.agent
+    preset = first.preset or presets.DEFAULT
     with input_checked():
-        agent = descriptions.find_agent(first.agent)
+        agent = descriptions.find_agent(name)
         algorithm = Algorithm(agent())
         if first.env is not None:
             algorithm = presets.preset(
                 first.env,
                 agent,
-                first.preset,
+                preset,
                 reward_delay=first.reward_delay,
-                action_size=_action_size(first.env, first.preset),
+                action_size=_action_size(first.env, preset),
             )
     taken = {
         f.name for each in (SweepOptions, Settings) for f in dataclasses.fields(each)
     }
-    for name in names(agent):
-        if name in taken:
+    for setting in names(agent):
+        if setting in taken:
             raise InputError(
-                f"agent {first.agent!r} has a setting {name!r}, a name that is taken "
-                "by an option: it must be a new one"
+                f"agent {name!r} has a setting {setting!r}, a name that is taken by an "
+                "option: it must be a new one"
             )
     missing: Any = dataclasses.MISSING
     return algorithm, kind(
-        env=missing, agent=first.agent, preset=first.preset, **_switches(algorithm)
+        env=missing, agent=name, preset=preset, **_switches(algorithm)
     )
 
 
@@ -378,19 +399,30 @@ def _note_without_effect(
         for name, value in off.get(model.switch, {}).items():
             if value != getattr(model(), name):
                 note(f"{name} is {value}, which has no effect: {model.switch} is off")
+    unchanged = {x: y for model in REWARD_MODELS for x, y in vars(model()).items()}
+    unchanged |= default.settings
     for name, reason in points.without_effect(algorithm).items():
         value = algorithm.settings.get(name)
-        if value not in (None, default.settings.get(name)):
+        if value not in (None, unchanged[name]):
             note(f"{name} is {value}, which has no effect: {reason}")
-    # Other presets refuse an agent or a task that they have nothing for.
+
+
+def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
+    """Print a note if the default preset has nothing for the agent and the task.
+
+    Other presets refuse an agent or a task that they have nothing for.
+    """
     lacking = presets.describe_lack(
         options.env,
-        algorithm.agent.name,
+        requested.algorithm.agent.name,
         presets.DEFAULT,
-        reward_delay=settings.reward_delay,
+        reward_delay=requested.settings.reward_delay,
     )
     if options.preset == presets.DEFAULT and lacking is not None and not options.resume:
-        note(f"{lacking}: options that are not given have their defaults")
+        more = ""
+        if environments.is_discrete(env):
+            more = " (--preset gymnax has one setting for discrete actions)"
+        note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

@@ -64,6 +64,8 @@ class Parser(argparse.ArgumentParser):
         if match := re.match(r"argument (?:--)?([\w-]+)(?:/\S+)?: (.*)", message):
             name, why = match[1].replace("-", "_"), match[2]
             message = f"{name} {why}" if why.startswith("is ") else f"{name}: {why}"
+        if match := re.match(r"the following arguments are required: (\S+)", message):
+            message = f"{match[1].strip(',')} is missing: see --help"
         raise InputError(message.replace("\n", " "))
 
     def add_fields(
@@ -199,7 +201,10 @@ def _of_type(hint: Any) -> dict[str, Any]:
     if get_origin(hint) in (typing.Union, types.UnionType) and len(optional) == 1:
         return _of_type(optional[0])
     if get_origin(hint) is tuple:
-        return {**_of_type(get_args(hint)[0]), "nargs": "*", "action": _Once}
+        one = _of_type(get_args(hint)[0])
+        if get_args(hint)[0] is int:
+            one["type"] = _number(whole_number, "whole numbers, separated by spaces")
+        return {**one, "nargs": "*", "action": _Once}
     if get_origin(hint) is typing.Literal:
         return {"type": _choice(get_args(hint)), "metavar": "|".join(get_args(hint))}
     if hint is bool:

@@ -29,7 +29,8 @@ class Options:
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
-      labels: labels of the runs; default "ENVIRONMENT, AGENT".
+      labels: labels of the runs; default "ENVIRONMENT, AGENT", and the folder of those
+        that would look alike.
     """
 
     runs: tuple[pathlib.Path, ...] = dataclasses.field(metadata=POSITIONAL)
@@ -177,6 +178,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         read(run, label, options.point)
         for run, label in zip(options.runs, labels, strict=True)
     ]
+    if not options.labels:
+        every = [run.label for run in runs]
+        runs = [
+            run
+            if every.count(run.label) == 1
+            else run._replace(label=f"{run.label} ({folder})")
+            for run, folder in zip(runs, options.runs, strict=True)
+        ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial)

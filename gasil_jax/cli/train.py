@@ -15,7 +15,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import folders, results, saved, training
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interruption, noted
-from gasil_jax.host.output_file import WriteError
+from gasil_jax.host.output_file import WriteError, note
 from gasil_jax.host.programs import NOWHERE, Program
 from gasil_jax.host.progress import announced
 from gasil_jax.host.results import Results, speed_in_words
@@ -44,6 +44,7 @@ def train(
             num_devices=options.devices,
         )
         options_.check_agent(env, requested.algorithm)
+    options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):
         if not (options.resume or shard[1] > 1) or not folders.has_config(folder):
@@ -87,17 +88,11 @@ def write(
     with announced(requested.env, "writing the results"):
         told = results.read(requested, requested.trained(folder))
         best = results.write(folder, told)["best_by_mean"] or 0
-        states = None
-        # Its own states are not read from the disk, which may be full.
-        for program, outcome in outcomes:
-            if len(requested.runs) == len(program.runs) == len(requested.seeds):
-                states = outcome.states
-        if states is None:
-            try:
-                _, _, states = saved.restore(folder, requested, env, point=best)
-            except InputError as error:
-                print(f"note: policy.npz is not written: {error}", file=sys.stderr)
-        if states is not None:
+        try:
+            states = saved.states_of(folder, requested, env, best, outcomes)
+        except InputError as error:
+            note(f"policy.npz is not written: {error}")
+        else:
             results.write_policies(folder, told, states, env)
     faults = np.any([x > 0 for x in told.faults.values()], axis=(0, 1))
     if faults.any():

@@ -284,11 +284,7 @@ def _folders(root: pathlib.Path) -> list[pathlib.Path]:
 
 def read(folder: pathlib.Path) -> Checkpoint:
     """Return the checkpoint in `folder` after checking its manifest and its hashes."""
-    try:
-        manifest = json_files.read(folder / _MANIFEST, _Manifest)
-        hashes = _hashes(folder)
-    except _DAMAGE_ERRORS as error:
-        raise ValueError(f"{folder} is damaged: {error}") from None
+    manifest, hashes = _manifest(folder), _hashes(folder)
     files, record = manifest["files"], manifest["record"]
     if hashes != files:
         name = min(
@@ -296,6 +292,14 @@ def read(folder: pathlib.Path) -> Checkpoint:
         )
         raise ValueError(f"{folder} is damaged: {name} is not what was written")
     return Checkpoint(folder, int(folder.name), record)
+
+
+def _manifest(folder: pathlib.Path) -> _Manifest:
+    try:
+        manifest: _Manifest = json_files.read(folder / _MANIFEST, _Manifest)
+        return manifest
+    except _DAMAGE_ERRORS as error:
+        raise ValueError(f"{folder} is damaged: {error}") from None
 
 
 def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
@@ -311,7 +315,10 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
 
 def best(root: pathlib.Path) -> Checkpoint | None:
     """Return the checkpoint with the highest score, None if none has one."""
-    scores = _scores(_folders(root))
+    folders = _folders(root)
+    for folder in folders:
+        _manifest(folder)
+    scores = _scores(folders)
     return read(max(scores, key=scores.__getitem__)) if scores else None
 
 
@@ -324,10 +331,9 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
     """Return the scores of the checkpoints that have one and can be read."""
     scores = {}
     for folder in folders:
-        with contextlib.suppress(*_DAMAGE_ERRORS):
-            record = json_files.read(folder / _MANIFEST, _Manifest)["record"]
-            if record["score"] is not None:
-                scores[folder] = record["score"]
+        with contextlib.suppress(ValueError):
+            if (score := _manifest(folder)["record"]["score"]) is not None:
+                scores[folder] = score
     return scores
 
 

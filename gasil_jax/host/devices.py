@@ -18,7 +18,7 @@ from gasil_jax.host.output_file import note
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
     """Make JAX use the host's cores as devices; call it before JAX starts."""
-    count = min(requested or environments.available_cores(), num_members)
+    count = min(requested or environments.available_cores(), max(1, num_members))
     environments.prepare(settings, count)
     try:
         jax.config.update("jax_num_cpu_devices", count)

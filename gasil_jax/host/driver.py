@@ -291,7 +291,8 @@ def drive(
             return None
         with progress.aside("evaluating the policies"):
             scores = evaluation.score(training.states, training.done)
-        score = float(scores["mean"].mean(dtype=np.float64))
+        mean = float(scores["mean"].mean(dtype=np.float64))
+        score = mean if math.isfinite(mean) else None
         return scores
 
     def save() -> None:

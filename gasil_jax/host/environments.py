@@ -1,7 +1,9 @@
 """What the host needs of ``gasil_envs``: to make environments, and what they are."""
 
+import contextlib
 from typing import Any
 
+from gasil_envs import registry, worlds
 from gasil_envs.locomotion import Locomotion
 from gasil_envs.physics.native import available_cores
 from gasil_envs.pictures import can_draw as can_be_drawn
@@ -19,9 +21,19 @@ __all__ = [
     "is_locomotion",
     "made_with",
     "make_env",
+    "names",
     "prepare",
     "without_effect",
 ]
+
+
+def names() -> list[str]:
+    """Return the names of all environments, also of other packages, if installed."""
+    every = list(registry.names())
+    for family in worlds.FAMILIES:
+        with contextlib.suppress(ValueError):
+            every += worlds.names(family)
+    return every
 
 
 def ends_early(env: Any) -> bool:

@@ -1,8 +1,8 @@
 """Train from Python as the command line does: `gasil_jax.fit`."""
 
 import contextlib
+import dataclasses
 import json
-import operator
 import pathlib
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -26,7 +26,7 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.driver import Callback, FitProgress
 from gasil_jax.host.interruption import Interruption, noted
-from gasil_jax.host.programs import Program
+from gasil_jax.host.points import completed
 from gasil_jax.host.sweep import Recording, Sweep, check_seeds
 from gasil_jax.train import TrainState
 
@@ -75,9 +75,10 @@ def fit(
       algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
       points: values of hyperparameters, one mapping from names to values per point.
-        Each point is trained with all seeds, in the same program. The arrays that a
-        callback gets are then (points x seeds, ...), all seeds of the first point
-        first.
+        Each point is trained with all seeds, in the same program, and equal points
+        once. The points that a folder has come first, and are the default. The arrays
+        that a callback gets are then (points x seeds, ...), all seeds of the first
+        point first.
       folder: folder for the files of a run or a sweep, created if it is missing; None
         keeps nothing. All commands can read it, if a command line can name what was
         trained: an environment from `gasil_jax.make_env`, an agent that can be
@@ -138,7 +139,9 @@ def fit(
         evaluate_every=evaluate_every,
         evaluate_episodes=evaluate_episodes,
     )
-    requested = _describe(env, algorithm, numbers, recording).grown(every)
+    requested = _describe(env, _plain(algorithm), numbers, recording)
+    every = completed(every, requested.algorithm)
+    requested = dataclasses.replace(requested, points=every)
     interruption = Interruption()
     with contextlib.ExitStack() as stack:
         if folder is None:
@@ -149,6 +152,9 @@ def fit(
             how_to_continue = "continue with the same arguments and resume=True"
             stack.enter_context(noted(how_to_continue))
             stack.enter_context(interruption)
+            if points is None and folders.has_config(path):
+                # Those of the folder.
+                requested = dataclasses.replace(requested, points=())
             requested = _begin(path, requested, resume=resume)
         missing = requested.unfinished(path)
         outcomes = training.train_programs(
@@ -162,9 +168,10 @@ def fit(
         )
         trained = [x for x in requested.stored(path) if x.training is not None]
         told = results.read(requested, trained)
+        own = list(zip(missing, outcomes))
         states = [
-            _states(path, requested, env, i, list(zip(missing, outcomes)))
-            for i in range(len(requested.points))
+            saved.states_of(path, requested, env, point, own)
+            for point in range(len(requested.points))
         ]
         if folder is not None:
             best = results.write(path, told)["best_by_mean"] or 0
@@ -182,22 +189,14 @@ def fit(
     return FitResult(stacked, told.metrics, told.evaluations)
 
 
-def _states(
-    folder: pathlib.Path,
-    requested: Sweep,
-    env: Any,
-    point: int,
-    trained: Sequence[tuple[Program, Any]],
-) -> TrainState:
-    """Return the states of a point, (seeds, ...), just trained or stored."""
-    runs = [requested.runs[point, seed] for seed in requested.seeds]
-    for program, outcome in trained:
-        if set(runs) <= set(program.runs):
-            places = [program.runs.index(run) for run in runs]
-            if places == list(range(len(program.runs))):
-                return outcome.states
-            return jax.tree.map(operator.itemgetter(np.array(places)), outcome.states)
-    return saved.restore(folder, requested, env, point=point)[2]
+def _plain(algorithm: Algorithm) -> Algorithm:
+    """Return an algorithm whose numbers are Python's, and not arrays."""
+    numbers = {
+        name: x.item()
+        for name, x in algorithm.settings.items()
+        if isinstance(x, np.ndarray | np.generic | jax.Array)
+    }
+    return algorithm.replace(**numbers)
 
 
 def _numbers(seeds: int | Sequence[int] | np.ndarray | jax.Array) -> Sequence[int]:

@@ -80,9 +80,14 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
         try:
             values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
         except ValueError:
-            like = "whole numbers" if kinds[name] is int else "numbers"
+            whole = kinds[name] is int
+            like = (
+                f"whole numbers, like {name}=10"
+                if whole
+                else f"numbers, like {name}=0.1"
+            )
             raise InputError(
-                f"grid has {entry!r}: it must be {like}, like {name}=10,20"
+                f"grid has {entry!r}: it must be {like},{20 if whole else 0.2}"
             ) from None
     return values
 

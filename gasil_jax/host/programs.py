@@ -169,7 +169,8 @@ class Program:
             return [(columns, {}) for columns in metrics]
         scores = self.table("evaluations.csv", ("mean",))
         last = metrics[0]["env_steps"][-1]
-        if not scores[0] or scores[0]["env_steps"][-1] < last:
+        # Training that was stopped has no evaluation at its end.
+        if self.is_finished and not (scores[0] and scores[0]["env_steps"][-1] >= last):
             raise InputError(f"{self.path}/evaluations.csv is damaged: it lacks rows")
         return list(zip(metrics, scores))
 
@@ -241,8 +242,9 @@ def labelled(parent: pathlib.Path, point: int) -> list[Program]:
         labels = json_files.read(path, _Listed)["labels"]
         with json_files.blamed(path):
             indices = tuple(i for i, x in enumerate(labels["point"]) if x == point)
-        if indices:
-            every.append(Program((), path.parent, labels, len(labels), indices))
+            if indices:
+                others = len(labels["seed"])
+                every.append(Program((), path.parent, labels, others, indices))
     return every
 
 

@@ -3,6 +3,7 @@
 import contextlib
 import functools
 import math
+import operator
 import pathlib
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,7 @@ from gasil_jax.host import (
     tables,
     training,
 )
+from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import member
 from gasil_jax.host.output_file import note
 from gasil_jax.host.programs import Program
@@ -95,10 +97,12 @@ def _choose_point(
 
 def _programs(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
     """Return the programs that hold a point's runs, with no other runs."""
-    runs = {stored.runs[point, seed] for seed in stored.seeds}
+    left = {stored.runs[point, seed] for seed in stored.seeds}
     of_point = []
-    for each in stored.stored(folder):
-        if kept := [i for i, run in enumerate(each.runs) if run in runs]:
+    # Two may hold the same run, if one was copied from another folder.
+    for each in sorted(stored.stored(folder), key=lambda x: not x.is_finished):
+        if kept := [i for i, run in enumerate(each.runs) if run in left]:
+            left -= {each.runs[i] for i in kept}
             of_point.append(each.only(kept))
     if not of_point:
         raise InputError(f"run is {folder}: none of its seeds has begun")
@@ -201,6 +205,28 @@ def restore(
 
     stacked = jax.tree.map(stack, *(states[x] for x in seeds))
     return every[0].algorithm, seeds, stacked
+
+
+def states_of(
+    folder: pathlib.Path,
+    stored: Sweep,
+    env: Any,
+    point: int,
+    trained: Sequence[tuple[Program, Outcome]],
+) -> train.TrainState:
+    """Return the states of a point, (seeds, ...), as just trained or from its folder.
+
+    Raises:
+      InputError: as `load` does.
+    """
+    runs = [stored.runs[point, seed] for seed in stored.seeds]
+    for program, outcome in trained:
+        if set(runs) <= set(program.runs):
+            places = np.array([program.runs.index(run) for run in runs])
+            if np.array_equal(places, range(len(program.runs))):
+                return outcome.states
+            return jax.tree.map(operator.itemgetter(places), outcome.states)
+    return restore(folder, stored, env, point=point)[2]
 
 
 class Policies(NamedTuple):

@@ -138,11 +138,6 @@ class Sweep:
         ]
         return [*begun, *new]
 
-    def grown(self, more: Sequence[Point]) -> "Sweep":
-        """Return the sweep with more points, those that it has first."""
-        every = points.completed([*self.points, *more], self.algorithm)
-        return dataclasses.replace(self, points=every)
-
     def write(self, folder: pathlib.Path) -> None:
         """Write config.json."""
         algorithm = descriptions.describe(self.algorithm)
@@ -171,15 +166,14 @@ class Sweep:
         if not folders.has_config(folder):
             return self
         stored = described(folder)
-        before = dataclasses.replace(self, points=stored["points"])
-        grown = before.grown(self.points)
-        if changed := _differences(stored, grown):
+        if changed := _differences(stored, self):
             raise InputError(
                 f"{option} is {folder}, where {'; '.join(changed)}: only total_steps "
                 "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
                 "devices and log may differ"
             )
-        return grown
+        every = points.completed([*stored["points"], *self.points], self.algorithm)
+        return dataclasses.replace(self, points=every)
 
 
 class Config(TypedDict, total=False):
@@ -261,8 +255,8 @@ def _differences(before: Config, now: Sweep) -> list[str]:
         ({x: old_recording[x] for x in evaluations}, new_recording),
     ):
         for name, value in old.items():
-            other = new.get(name)
-            if callable(other) or name in ("total_steps", "expert"):
+            other = "a function" if callable(new.get(name)) else new.get(name)
+            if name in ("total_steps", "expert"):
                 continue
             if json_files.as_type(Any, value, name) != other:
                 changes.append(f"{name} was {shown(value)}, is {shown(other)}")

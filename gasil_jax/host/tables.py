@@ -66,7 +66,8 @@ class TableWriter:
         self._first, self._labels, self._path = tuple(columns), labels, path
         self.rows = rows
         with output_file.errors_named(path):
-            self._file = path.open("a+", newline="")
+            # Latin-1 takes every byte: what is no text is seen when the table is read.
+            self._file = path.open("a+", newline="", encoding="latin-1")
             self._file.seek(0)
             header, size = "", 0
             for number in range(rows + 1 if rows else 0):
@@ -77,7 +78,7 @@ class TableWriter:
                         f"{path} lacks rows that were in it at the last checkpoint: "
                         "restore the file, or begin a new run"
                     )
-                header, size = header if number else line, size + len(line.encode())
+                header, size = header if number else line, size + len(line)
             self._file.truncate(size)
             self._file.seek(0, os.SEEK_END)
         self._columns = tuple(next(csv.reader([header] if header else []), ())) or None

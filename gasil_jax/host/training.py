@@ -37,7 +37,7 @@ def prepare(
     Nothing is compiled before this is done.
     """
     num_members = sum(len(each.runs) for each in programs)
-    devices.use_devices(sweep.settings, num_devices, max(1, num_members))
+    devices.use_devices(sweep.settings, num_devices, num_members)
     env = make_env(sweep)
     with announced(sweep.env, "starting the devices"):
         every = jax.devices()
@@ -87,8 +87,14 @@ def train_programs(
     configs = [each.algorithm.config for each in programs for _ in each.runs]
     total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
     outcomes: list[Outcome] = []
+    if not programs:
+        return outcomes
     steps_before = 0
-    with Progress(title, total_steps, num_members, shown=shown) as progress:
+    points = {run.experiment for each in programs for run in each.runs}
+    called = "seeds" if len(points) == 1 else "runs"
+    with Progress(
+        title, total_steps, num_members, members=called, shown=shown
+    ) as progress:
         for each in programs:
             if interruption.signal is not None:
                 raise Interrupted(interruption.signal)
@@ -97,7 +103,7 @@ def train_programs(
             )
             with each.opened():
                 with progress.aside("starting the trackers"):
-                    own = _trackers(recording.log, each, len(programs) == 1)
+                    own = _trackers(recording.log, each)
                 outcome = driver.drive(
                     members,
                     each.path,
@@ -118,17 +124,16 @@ def train_programs(
     return outcomes
 
 
-def _trackers(names: Sequence[str], program: Program, is_alone: bool) -> list[Tracker]:
+def _trackers(names: Sequence[str], program: Program) -> list[Tracker]:
     """Return the trackers of a program, which has the name of its run or sweep."""
     if not names:
         return []
-    *_, sweep, _, name = program.path.absolute().parts
     run = program.runs[0]
     labels = map("-".join, zip(*(map(str, x) for x in program.labels.values())))
     return trackers.make(
         names,
         program.path,
-        run_name=sweep if is_alone else f"{sweep}-{name}",
+        run_name=program.path.absolute().parent.parent.name,
         config={"env": run.env, **vars(run.settings), **run.algorithm.settings},
         members={
             label: {**own, "seed": seed}

@@ -40,7 +40,7 @@ from gasil_jax.rewards.interface import RewardModel
 
 # Largest count of float32 numbers in a part of a minibatch: 2 MB, which fits a CPU's
 # cache.
-_PART_NUMBERS = 2**19
+_MOST = 2**19
 
 # Shape letters: N environments, H steps of history per environment, T steps of a batch
 # per environment, W windows of a minibatch, S steps that represent a window.
@@ -68,21 +68,15 @@ class Decomposition(struct.PyTreeNode):
 
 
 class Windows(NamedTuple):
-    """The windows that end in a stretch of steps; every field is (N, steps).
+    """The windows that end in a stretch of steps; every field is (N, steps)."""
 
-    Attributes:
-      ends: bool, whether a complete window ends with this step.
-      payout: float32, what the window paid.
-      length: int32, number of steps of the window up to this one.
-    """
-
-    ends: jax.Array
-    payout: jax.Array
-    length: jax.Array
+    ends: jax.Array  # bool, whether a complete window ends with this step
+    payout: jax.Array  # float32, what the window paid
+    length: jax.Array  # int32, number of steps of the window up to this one
 
 
 def ends_window(reward: jax.Array, ended: jax.Array) -> jax.Array:
-    """Return whether a window ends with a step, bool, the shape of both arguments."""
+    """Return whether a window ends with a step, bool."""
     return (reward != 0) | ended
 
 
@@ -114,42 +108,30 @@ def windows(history: History, recorded_steps: jax.Array) -> Windows:
 def window_sums(
     reward: jax.Array, ends: jax.Array, running: tuple[jax.Array, jax.Array]
 ) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
-    """Return each running window's sum and length up to every step of a batch.
+    """Return each running window's sum and length up to every step, (T, N) each.
 
     Args:
       reward: float32 (T, N).
       ends: bool (T, N), whether a window ends with this step.
-      running: sum and number of steps of the windows that run when the batch begins,
-        float32 (N,) each.
-
-    Returns:
-      Sum and length up to and with this step, float32 (T, N) each, and both, (N,) each,
-      of the windows that run when the batch ends.
+      running: sum and number of steps, float32 (N,) each, of the windows that run when
+        the batch begins; those that run when it ends are returned too.
     """
     chex.assert_equal_shape([reward, ends])
 
     def step(running: Any, now: Any) -> Any:
         reward, ends = now
         total, length = running[0] + reward, running[1] + 1.0
-
-        def reset(x: jax.Array) -> jax.Array:
-            return jnp.where(ends, 0.0, x)
-
-        return (reset(total), reset(length)), (total, length)
+        running = jnp.where(ends, 0.0, total), jnp.where(ends, 0.0, length)
+        return running, (total, length)
 
     running, (total, length) = jax.lax.scan(step, running, (reward, ends))
     return total, length, running
 
 
 def at_window_end(values: jax.Array, ends: jax.Array) -> jax.Array:
-    """Return for each step the value at the end of its window.
+    """Return for each step the value at the end of its window, (T, N).
 
-    Args:
-      values: float32 (T, N); only those where a window ends are used.
-      ends: bool (T, N), whether a window ends with this step.
-
-    Returns:
-      float32 (T, N); 0 in steps of a window that does not end in the batch.
+    Steps of a window that does not end in the batch get 0.
     """
 
     def backward(later: jax.Array, now: Any) -> Any:
@@ -164,7 +146,7 @@ def at_window_end(values: jax.Array, ends: jax.Array) -> jax.Array:
 def goodness_of_fit(
     predicted: jax.Array, actual: jax.Array, valid: jax.Array
 ) -> Metrics:
-    """Return how well the network predicts the payouts of windows.
+    """Return how well the network predicts what windows pay per step.
 
     Args:
       predicted: float32 (T, N), mean of the network's rewards over a window.
@@ -173,9 +155,8 @@ def goodness_of_fit(
 
     Returns:
       "decomposition_fit", (), the share of the variance of `actual` that is explained
-      (R2); NaN if fewer than two windows count or all have the same `actual`.
-      "decomposition_error", (), the root of the mean, over windows, of the squared
-      error; NaN if no window counts.
+      (R2), and "decomposition_error", (), the root of the mean squared error. NaN where
+      too few windows count, or all have the same `actual`.
     """
     count = jnp.sum(valid)
 
@@ -249,43 +230,25 @@ def _train(
 
 
 def num_parts(num_windows: int, numbers_per_window: int) -> int:
-    """Return the fewest equal parts of a minibatch that each fit a CPU's cache.
-
-    Args:
-      num_windows: W; the result divides it.
-      numbers_per_window: count of the network's input numbers for a window.
-    """
+    """Return the fewest equal parts of a minibatch that each fit a CPU's cache."""
     divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
 
-    def fits(parts: int) -> bool:
-        return num_windows // parts * numbers_per_window <= _PART_NUMBERS
-
-    return next((parts for parts in divisors if fits(parts)), num_windows)
+    fitting = (n for n in divisors if num_windows // n * numbers_per_window <= _MOST)
+    return next(fitting, num_windows)
 
 
 def mean_gradient(
     gradient: Callable[[Any, Any], Any], params: Any, minibatch: Any, *, parts: int
 ) -> Any:
-    """Return the gradient of a mean over a minibatch, computed part by part.
-
-    Args:
-      gradient: (params, minibatch) -> gradient of the mean.
-      params: a pytree.
-      minibatch: a pytree, (W, ...) each leaf.
-      parts: a divisor of W.
-    """
+    """Return the gradient of a mean over a minibatch, (W, ...), part by part."""
     if parts == 1:
         return gradient(params, minibatch)
     divided = jax.tree.map(lambda x: x.reshape(parts, -1, *x.shape[1:]), minibatch)
 
     def add(total: Any, part: Any) -> Any:
-        return jax.tree.map(jnp.add, total, gradient(params, part))
+        return jax.tree.map(jnp.add, total, gradient(params, part)), None
 
-    total, _ = jax.lax.scan(
-        lambda total, part: (add(total, part), None),
-        jax.tree.map(jnp.zeros_like, params),
-        divided,
-    )
+    total, _ = jax.lax.scan(add, jax.tree.map(jnp.zeros_like, params), divided)
     return jax.tree.map(lambda x: x / parts, total)
 
 
@@ -294,11 +257,13 @@ def sample_window_steps(
 ) -> tuple[jax.Array, jax.Array]:
     """Draw the steps that represent each window, with their weights in its mean.
 
+    A window of at most S steps is represented by all of them, a longer one by S of
+    them, drawn with replacement.
+
     Args:
       key: random key; consumed.
       length: int32 (W,), number of steps of each window.
-      num_steps: S. A window of at most S steps is represented by all of them, a longer
-        one by S of them, drawn with replacement.
+      num_steps: S.
 
     Returns:
       int32 (W, S), the steps' distance from the window's last one, and float32 (W, S).
@@ -350,8 +315,7 @@ class Decompose(RewardModel):
         return self.decomposition_history_episodes
 
     @property
-    def _network(self) -> Any:
-        # Typed as Any because Flax declares that `apply` may also return variables.
+    def _network(self) -> Any:  # Flax declares that `apply` may return variables too.
         return StepReward(self.decomposition_hidden_sizes)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Decomposition:
@@ -373,18 +337,9 @@ class Decompose(RewardModel):
         """Train the network on complete windows, and decompose a batch's rewards.
 
         If the network's update is not finite, it is undone. The rest of the state
-        belongs to the recorded steps and is updated in any case.
-
-        Args:
-          state: the state before the batch.
-          context: with the environment's rewards; its history keeps next observations.
-          key: random key; consumed.
-
-        Returns:
-          The state after the batch; the context with decomposed rewards, in the history
-          too; whether the update of the network was finite, bool (); and metrics: the
-          `goodness_of_fit` of the batch's windows of more than one step, predicted
-          before training on them.
+        belongs to the recorded steps and is updated in any case. The metrics are the
+        `goodness_of_fit` of the batch's windows of more than one step, predicted before
+        training on them.
         """
         network, batch, history = self._network, context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.

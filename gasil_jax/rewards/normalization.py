@@ -70,8 +70,8 @@ def update(
 
 def scale(normalizer: RewardNormalizer) -> jax.Array:
     """Return the number that rewards are divided by, (), more than 0."""
-    _, deviation = normalization.moments(normalizer.sums)
-    return deviation[0]
+    _, std = normalization.moments(normalizer.sums)
+    return std[0]
 
 
 def normalize(
@@ -113,13 +113,11 @@ class Normalize(RewardModel):
     reward_clip: float = number(CLIP, 0.0, excludes_low=True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> RewardNormalizer:
-        """Return a normalizer without rewards."""
         return init(sizes.num_envs)
 
     def update(
         self, state: RewardNormalizer, context: Context, key: jax.Array
     ) -> tuple[RewardNormalizer, Context, jax.Array, Metrics]:
-        """Add a batch's rewards to the running sums, and normalize them."""
         batch = context.rollout
         state = update(state, batch.reward, batch.ended, gamma=context.config.gamma)
         divisor = scale(state)

@@ -6,7 +6,6 @@ import pathlib
 import gymnasium
 import jax
 import jax.numpy as jnp
-import minari
 import numpy as np
 import pytest
 from corridor import LENGTH, Corridor
@@ -18,7 +17,6 @@ from gasil_envs.gymnax_adapter import GymnaxEnv
 from gasil_jax import (
     evaluate,
     evaluation,
-    export_minari,
     normalization,
     numpy_policy,
     plot,
@@ -26,9 +24,8 @@ from gasil_jax import (
     render,
     run,
 )
-from gasil_jax.host import policy_file
+from gasil_jax.host import policy_file, saved
 from gasil_jax.networks import CategoricalPolicy, Discriminator
-from gasil_jax.sweeps import saved_states
 
 SETTINGS = {
     "total_steps": 20 * 256,
@@ -73,7 +70,7 @@ def train(agent, seeds=2, **changes):
 
 # The others use nothing of an action that one of these does not. GAIL's discriminator
 # is that of PPO+GASIL, which is trained below.
-@pytest.mark.parametrize("agent", ["ppo", "ppo+bc", "ppo+sil", "gail"])
+@pytest.mark.parametrize("agent", ["ppo", "ppo+sil", "gail"])
 def test_agents_learn(agent, expert):
     more = {"expert": expert} if agent == "gail" else {}
     env, algorithm, states, metrics = train(agent, **more)
@@ -160,7 +157,6 @@ def test_a_run_from_end_to_end(finished, tmp_path, capsys):
     # Finished, it is not trained again.
     assert run.main(["--resume", "--out", finished]) == 0
     said = capsys.readouterr()
-    assert "initial_std is 0.5, which has no effect: the actions of" in said.err
     assert "gasil_jax.render" in said.out
     assert evaluate.main([finished, "--episodes", "4"]) == 0
     assert evaluate.main([finished, "--episodes", "4", "--stochastic"]) == 0
@@ -181,21 +177,6 @@ def test_a_picture_that_is_none_is_refused(finished, tmp_path, monkeypatch, caps
         assert message in capsys.readouterr().err and not film.exists()
 
 
-def test_good_trajectories_are_exported_with_numbers_as_actions(
-    finished, tmp_path, monkeypatch
-):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    assert export_minari.main([finished, "--name", "corridor/good-v0"]) == 0
-    dataset = minari.load_dataset("corridor/good-v0")
-    assert dataset.spec.action_space == gymnasium.spaces.Discrete(3)
-    episode = next(iter(dataset.iterate_episodes()))
-    assert episode.actions.shape == (20,) and episode.actions.dtype.kind == "i"
-    # GAIL takes them back.
-    env = gasil_jax.make_env("corridor:Corridor")
-    algorithm = gasil_jax.algorithm("gail", expert="minari:corridor/good-v0")
-    gasil_jax.make_train(env, algorithm)
-
-
 @pytest.mark.parametrize(
     ("env", "action", "message"),
     [
@@ -214,7 +195,7 @@ def test_an_expert_with_other_actions_is_refused(env, action, message, tmp_path)
 
 def test_the_discriminators_reward_is_that_of_its_formula(finished):
     reward = gasil_jax.load_reward(finished, 1)
-    _, algorithm, seeds, states = saved_states.load(pathlib.Path(finished))
+    _, algorithm, seeds, states = saved.load(pathlib.Path(finished))
     state = gasil_jax.member(states, seeds.index(1))
     observation = np.tile(np.eye(LENGTH, dtype=np.float32), (3, 1))
     action = np.repeat(np.arange(3), LENGTH)
@@ -232,7 +213,7 @@ def test_the_discriminators_reward_is_that_of_its_formula(finished):
     np.testing.assert_allclose(one, expected, rtol=1e-4)
     with pytest.raises(ValueError, match=r"observation has shape \(3,\): it must be"):
         reward(np.zeros(3), 1)
-    with pytest.raises(ValueError, match="seed is 7: the run has 0 to 1"):
+    with pytest.raises(ValueError, match="seed is 7: the run has 0, 1"):
         gasil_jax.load_reward(finished, 7)
 
 

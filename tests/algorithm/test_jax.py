@@ -1,15 +1,16 @@
 """The installed JAX computes correct numbers."""
 
 import contextlib
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
-import jaxlib
 import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import compatibility, policy
+from gasil_jax import policy
 
 
 @pytest.mark.compiled_as_for_users
@@ -36,9 +37,13 @@ def test_many_batched_orthogonal_matrices_do_not_deadlock():
 
 
 def test_the_release_that_miscompiles_is_refused_at_import():
-    with pytest.raises(ImportError, match=r"0\.10\.2 gives wrong numbers"):
-        compatibility.check("0.10.2")
-    compatibility.check(jaxlib.__version__)
+    code = """
+import importlib.metadata
+importlib.metadata.version = lambda name: "0.10.2"
+import gasil_jax
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert "ImportError: jaxlib 0.10.2 gives wrong numbers" in done.stderr
 
 
 ALGORITHM = gasil_jax.algorithm(
@@ -69,20 +74,19 @@ def assert_close(compiled, eager):
 
 
 @pytest.mark.compiled_as_for_users
-def test_a_compiled_iteration_equals_an_eager_one():
+def test_an_optimized_iteration_equals_a_plain_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
     env = gasil_jax.make_env("point_mass", reward_delay=2, max_episode_steps=2)
-    iterate = lambda state: gasil_jax.train_step(env, ALGORITHM, state)
-    init = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))
+    step = lambda state: gasil_jax.train_step(env, ALGORITHM, state)
     with without_optimizations():  # Both begin with the same state.
-        first = init(jax.random.key(0))
-    state, _ = jax.jit(iterate)(first)
+        first = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))(
+            jax.random.key(0)
+        )
+        plain = jax.jit(step).lower(first).compile()
+    optimized = jax.jit(step).lower(first).compile()
+    state, _ = plain(first)
     assert int(state.agent.buffer.size) == 3
-    compiled = jax.jit(iterate)(state)
-    # Eagerly each operation is compiled by itself, where nothing can be optimized.
-    with jax.disable_jit(), without_optimizations():
-        eager = iterate(state)
-    assert_close(compiled, eager)
+    assert_close(optimized(state), plain(state))
 
 
 @contextlib.contextmanager

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from flax import linen as nn
-from small_training import DISCRIMINATOR_FLAGS, FLAGS, SETTINGS
+from small_training import SETTINGS
 
 import gasil_jax
-from gasil_jax import evaluate, normalization, numpy_policy, policy, run, sweep
+from gasil_jax import evaluation, normalization, numpy_policy, policy, run, sweep
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
-from gasil_jax.host import metrics_files, policy_file
+from gasil_jax.host import policy_file
 from gasil_jax.networks import MixturePolicy
 
 
@@ -166,25 +166,22 @@ def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
     assert between(drawn) < 0.02 and np.mean(drawn > 0) == pytest.approx(0.5, abs=0.05)
 
 
-# The other agents use nothing of a policy that one of these two does not.
-def test_replays_train_it():
+# The other agents use nothing of a policy that this one does not.
+def test_replays_train_it_and_it_is_evaluated():
     env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm("ppo+sil")
-    algorithm = algorithm.replace(**SETTINGS, policy_components=3)
+    algorithm = algorithm.replace(
+        **SETTINGS, policy_components=3, entropy_coefficient=0.01
+    )
     state, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
     assert np.isfinite(metrics["entropy"]).all()
     assert (metrics["skipped_updates"] == 0).all()
     layers = state.actor_critic.policy.params["params"]["MLP_0"]
     assert layers["Dense_1"]["bias"].shape == (3 * (2 + 1),)
-
-
-def test_adaptive_imitation_trains_it_and_it_is_evaluated(tmp_path):
-    flags = [*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "ppo+gasil-adaptive"]
-    flags += ["--policy-components", "3", "--entropy-coefficient", "0.01"]
-    assert run.main([*flags, "--out", str(tmp_path)]) == 0
-    metrics = metrics_files.read_metrics(tmp_path / "metrics.csv", {"seed": [0]})
-    assert np.isfinite(metrics["entropy"]).all()
-    assert (metrics["skipped_updates"] == 0).all()
-    assert evaluate.main([str(tmp_path), "--episodes", "2", "--stochastic"]) == 0
+    act, key = policy.from_state(state, env), jax.random.key(1)
+    score = evaluation.run_episodes(
+        env, act, key, num_episodes=2, num_steps=50, deterministic=False
+    )
+    assert (score["episode_length"] == 50).all()
 
 
 @functools.cache

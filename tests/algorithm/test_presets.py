@@ -11,13 +11,13 @@ import gasil_envs
 import gasil_jax
 from gasil_envs import locomotion
 from gasil_jax import algorithms, presets, run
-from gasil_jax.host import run_options
+from gasil_jax.cli import options
 
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 
 
 def parse(*arguments):
-    return run_options.parse(run_options.Options, ["--env", *arguments], "x").algorithm
+    return options.read(options.Options, ["--env", *arguments], "x")[1].algorithm
 
 
 @pytest.mark.parametrize("name", presets.names())

@@ -7,7 +7,7 @@ import optax
 import pytest
 
 import gasil_jax
-from gasil_jax import schedules
+from gasil_jax.algorithms import schedule_factor
 
 HUMANOID = ((2e6, 0.0), (3e6, 1.0))
 
@@ -17,13 +17,13 @@ HUMANOID = ((2e6, 0.0), (3e6, 1.0))
     [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)],
 )
 def test_the_papers_rule_for_humanoid(steps, expected):
-    result = jax.jit(lambda steps: schedules.factor(HUMANOID, steps))(steps)
+    result = jax.jit(lambda steps: schedule_factor(HUMANOID, steps))(steps)
     np.testing.assert_allclose(result, expected, atol=1e-6)
 
 
 def test_steps_beyond_a_32_bit_integer():
     algorithm = gasil_jax.algorithm(batch_steps=2**21, alpha_schedule=HUMANOID)
-    at = schedules.at(algorithm, algorithm.hyperparameters, jnp.int32(1024))
+    at = algorithm.at(algorithm.hyperparameters, jnp.int32(1024))
     np.testing.assert_allclose(at.agent.alpha, algorithm.agent.alpha)
 
 
@@ -31,7 +31,7 @@ def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
     algorithm = gasil_jax.algorithm(total_steps=4 * 2048, normalize_rewards=True)
     hyperparameters = algorithm.hyperparameters
     for iteration in range(4):
-        now = schedules.at(algorithm, hyperparameters, jnp.int32(iteration))
+        now = algorithm.at(hyperparameters, jnp.int32(iteration))
         rate = hyperparameters["learning_rate"] * (1 - iteration / 4)
         np.testing.assert_allclose(now.config.learning_rate, rate, rtol=1e-6)
         assert now == algorithm.replace(learning_rate=now.config.learning_rate)
@@ -65,7 +65,7 @@ def test_an_optax_schedule_is_the_factor():
     env = gasil_jax.make_env("point_mass")
     gasil_jax.make_train(env, algorithm)  # is accepted
     before = algorithm.hyperparameters
-    at = jax.jit(lambda x: schedules.at(algorithm, before, x).hyperparameters)
+    at = jax.jit(lambda x: algorithm.at(before, x).hyperparameters)
     for iteration in range(6):
         now = at(jnp.int32(iteration))
         expected = before["alpha"] * (1.0 if iteration < 2 else 0.5)
@@ -86,5 +86,5 @@ def test_a_bad_schedule_is_refused(points):
 def test_a_longer_loop_does_not_anneal_below_0():
     algorithm = gasil_jax.algorithm(total_steps=4 * 2048)
     for iteration in (4, 5, 9):
-        at = schedules.at(algorithm, algorithm.hyperparameters, jnp.int32(iteration))
+        at = algorithm.at(algorithm.hyperparameters, jnp.int32(iteration))
         assert at.config.learning_rate == 0.0

@@ -2,41 +2,122 @@
 
 import csv
 import functools
+import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.envs import Wrapper
-from small_training import FLAGS
 
 import gasil_jax
-from gasil_jax import evaluate, evaluation, numpy_policy, policy, run
-from gasil_jax.host import checkpoint
+from gasil_jax import evaluate, evaluation, numpy_policy, policy
+from gasil_jax.host import checkpoint, saved
 
 # With the other tests that use it, so that it is trained once.
-pytestmark = pytest.mark.xdist_group("trained_point_mass")
+on_trained_point_mass = pytest.mark.xdist_group("trained_point_mass")
+on_trained = pytest.mark.xdist_group("commands")
+
+
+@on_trained
+def test_one_seed_scores_as_with_all_and_every_episode_is_written(
+    trained, tmp_path, capsys
+):
+    folder, out = str(trained.folder), tmp_path / "new" / "scores.csv"
+    flags = ["--episodes", "3", "--stochastic"]
+    assert evaluate.main([folder, *flags, "--out", str(out)]) == 0
+    header, *lines, over_seeds, where = capsys.readouterr().out.splitlines()
+    assert header.split()[0] == "seed" and where == f"in {out}"
+    assert over_seeds.startswith("return ")
+    assert over_seeds.endswith("(interquartile mean over 3 seeds)")
+    with out.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["seed"], row["episode"]) for row in rows] == [
+        (seed, episode) for seed in "567" for episode in "012"
+    ]
+    for line, seed in zip(lines, "567", strict=True):
+        returns = [float(row["episode_return"]) for row in rows if row["seed"] == seed]
+        assert line.split()[:2] == [seed, "3"]
+        assert line.split()[2] == f"{np.mean(returns):.2f}"
+    assert {row["episode_length"] for row in rows} == {"50"}
+    assert evaluate.main([folder, *flags, "--seed", "6"]) == 0
+    assert capsys.readouterr().out.splitlines()[1] == lines[1]
+    # Nothing is written over.
+    assert evaluate.main([folder, "--out", str(out)]) == 2
+    assert "which exists: name a new file" in capsys.readouterr().err
+
+
+@on_trained
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "RUN is missing: see --help"),
+        ("RUN --checkpoint first", "checkpoint is 'first': it must be one of last, be"),
+        ("RUN --episodes 0", "episodes is 0: it must be from 1 to"),
+        ("RUN --episodes 1000000000000", "GB of memory"),
+        ("RUN --seed 8", "seed is 8: the run has 5, 6, 7"),
+        ("RUN --point 1", "point is 1: "),
+        ("RUN --key -1", "key is -1: it must be from 0 to 4294967295"),
+        ("RUN --gymnasium", "must be of a locomotion task of Gymnasium"),
+        ("RUN --out x.txt", "it must end in .csv"),
+        ("RUN --out /proc/scores.csv", "/proc/scores.csv, which can't be written"),
+        ("RUN/programs", "has no config.json: it must be the folder of a run or a swe"),
+        ("RUN/nowhere", "does not exist: it must be the folder of a run or a sweep"),
+        ("zoo:nothing", "nothing"),
+    ],
+)
+def test_what_can_not_be_scored_is_refused_in_a_line(
+    arguments, message, trained, capsys
+):
+    words = arguments.replace("RUN", str(trained.folder)).split()
+    assert evaluate.main(words) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error
+
+
+@on_trained
+def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
+    """A damaged one is not replaced by another, which has other numbers."""
+    out = shutil.copytree(trained.folder, tmp_path / "out")
+    assert evaluate.main([str(out), "--checkpoint", "best", "--episodes", "1"]) == 0
+    (root,) = out.glob("programs/*/checkpoints")
+    best = checkpoint.best(root).folder
+    (best / "state" / "_METADATA").write_text("{}")
+    capsys.readouterr()
+    assert evaluate.main([str(out), "--checkpoint", "best", "--episodes", "1"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{best} is damaged: state/_METADATA is not what was written" in line
+
+
+@on_trained
+def test_the_saved_policies_are_those_of_the_last_checkpoint(trained):
+    env, _, seeds, states = saved.load(trained.folder, seed=6)
+    assert seeds == [6]
+    expected = policy.weights(states, env)
+    for name, weight in numpy_policy.read(trained.folder, 6).items():
+        np.testing.assert_allclose(weight, np.squeeze(expected[name]), rtol=1e-6)
 
 
 def test_gymnasiums_episodes_have_the_runs_limit():
     rest = lambda observation: np.zeros(2)
     for limit, length in ((7, 7), (None, 1000)):
-        scores = evaluate.evaluate_in_gymnasium(
+        scores = evaluation.evaluate_in_gymnasium(
             "Swimmer-v5", rest, num_episodes=1, num_steps=limit
         )
         assert scores["episode_length"] == [length]
 
 
+@on_trained_point_mass
 def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
     _, _, states = trained_point_mass
     checkpoint.save(tmp_path / "state", states)
     other = jax.eval_shape(lambda: jax.tree.map(lambda x: x[:1], states))
-    with pytest.raises(ValueError, match="holds another state"):
-        checkpoint.restore(tmp_path / "state", other)
-    with pytest.raises(ValueError, match="holds another state"):
-        checkpoint.restore(tmp_path / "state", other.replace(agent=()))
+    for like in (other, other.replace(agent=())):
+        with pytest.raises(ValueError, match="holds another state"):
+            checkpoint.restore(tmp_path / "state", like)
 
 
+@on_trained_point_mass
 def test_scores_are_those_of_a_plain_loop(trained_point_mass):
     env, algorithm, states = trained_point_mass
     state = gasil_jax.member(states, 1)
@@ -56,6 +137,7 @@ def test_scores_are_those_of_a_plain_loop(trained_point_mass):
         assert int(scores["episode_length"][i]) == length == 50
 
 
+@on_trained_point_mass
 def test_stochastic_scores_vary_more(trained_point_mass):
     env, algorithm, states = trained_point_mass
 
@@ -73,52 +155,7 @@ def test_stochastic_scores_vary_more(trained_point_mass):
     assert np.std(score(states, False)) > np.std(score(states, True))
 
 
-def test_one_seed_scores_as_with_all_and_every_episode_is_written(tmp_path, capsys):
-    folder = str(tmp_path / "run")
-    arguments = (*FLAGS, "--agent", "ppo", "--seeds", "2", "--first-seed", "4")
-    assert run.main([*arguments, "--out", folder]) == 0
-    capsys.readouterr()
-    out = tmp_path / "new" / "scores.csv"
-    flags = ["--episodes", "3", "--stochastic"]
-    assert evaluate.main([folder, *flags, "--out", str(out)]) == 0
-    lines = capsys.readouterr().out.splitlines()
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
-    assert [(row["seed"], row["episode"]) for row in rows] == [
-        (seed, episode) for seed in ("4", "5") for episode in "012"
-    ]
-    for line, seed in zip(lines[1:3], "45", strict=True):
-        returns = [float(row["episode_return"]) for row in rows if row["seed"] == seed]
-        assert line.split()[2] == f"{np.mean(returns):.2f}"
-    assert {row["episode_length"] for row in rows} == {"50"}
-    assert evaluate.main([folder, *flags, "--seed", "5"]) == 0
-    assert capsys.readouterr().out.splitlines()[1] == lines[2]
-    # Nothing is written over, and what can't be scored is refused before it is.
-    for arguments, message in (
-        (("--out", str(out)), "which exists: name a new file"),
-        (("--out", str(out.with_suffix(".txt"))), "it must end in .csv"),
-        (("--out", str(out / "x.csv")), "can't be written"),
-        (("--out", "/proc/scores.csv"), "/proc/scores.csv, which can't be written"),
-        (("--seed", "6"), "seed is 6: the run has 4 to 5"),
-    ):
-        assert evaluate.main([folder, *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error and len(error.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ((), "PATH is missing: see --help"),
-        (("x", "--checkpoint", "first"), "checkpoint is 'first': it must be one of la"),
-    ],
-)
-def test_a_wrong_command_line_is_one_line(arguments, message, capsys):
-    assert evaluate.main(arguments) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error
-
-
+@on_trained_point_mass
 def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
     """As in training; `done` need not be set beside `truncation`."""
     env, algorithm, states = trained_point_mass

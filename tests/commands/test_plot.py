@@ -6,86 +6,103 @@ import shutil
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-from small_training import FLAGS
 
-from gasil_jax import plot, run
+from gasil_jax.cli import plot
 from gasil_jax.errors import InputError
 
+pytestmark = pytest.mark.xdist_group("commands")
 
-def test_runs_are_drawn(tmp_path, capsys):
-    small = (*FLAGS, "--seeds", "3", "--no-stagger-episodes")
-    small += ("--total-steps", "2048", "--batch-steps", "256")
-    folders = []
-    for name, first_seed in (("ppo", "0"), ("others", "3")):
-        folders.append(str(tmp_path / name))
-        more = ("--agent", "ppo", "--first-seed", first_seed, "--out", folders[-1])
-        assert run.main([*small, *more]) == 0
-    capsys.readouterr()
-    out = tmp_path / "figure.png"
-    assert plot.main([*folders, "--out", str(out)]) == 0
+
+def texts(legend):
+    return [text.get_text().strip() for text in legend.get_texts()]
+
+
+def test_runs_and_points_of_sweeps_are_drawn(trained, swept, tmp_path, capsys):
+    out = tmp_path / "new" / "figure.png"
+    assert plot.main([str(trained.folder), "--out", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert "point_mass, ppo" in printed and "95% interval" in printed
-    assert out.read_bytes().startswith(b"\x89PNG")
-    assert plot.main([*folders, "--out", "/proc/nowhere/figure.png"]) == 2
-    assert "error: out is /proc/nowhere/figure.png" in capsys.readouterr().err
-    assert plot.main([*folders, "--out", str(tmp_path / "new" / "er" / "x.svg")]) == 0
-    capsys.readouterr()
-    # A label is no formula.
-    label = ("--labels", r"$\frac$", "others")
-    assert plot.main([*folders, "--out", str(tmp_path / "label.svg"), *label]) == 0
-    assert r"$\frac$" in capsys.readouterr().out
-    curves = plot.read(tmp_path / "ppo")
-    assert curves.returns.shape == (3, 8) and curves.env_steps[-1] == 2048
+    assert out.read_bytes().startswith(b"\x89PNG") and f"in {out}" in printed
+    assert "95% interval" in printed and "point_mass, ppo+gasil   " in printed
+    curves = plot.read(trained.folder)
+    assert curves.returns.shape == (3, 4) and curves.env_steps[-1] == 1024
+    assert curves.evaluations["mean"].shape == (3, 3)
+    for point, folder in ((0, swept.folder), (None, swept.folder)):
+        assert plot.read(folder, point=point).returns.shape == (2, 4)
+    # The sweep's own rule chose one, and says so.
+    assert "the best by mean (learning_rate=0.0003" in capsys.readouterr().err
 
-    # Training may be writing a row, or an iteration, when the table is read.
-    path = tmp_path / "ppo" / "metrics.csv"
+
+def test_two_runs_of_one_agent_are_told_apart_by_their_folders(
+    trained, swept, tmp_path, capsys, monkeypatch
+):
+    figures = []
+
+    def kept(figure, path, **_):
+        figures.append(figure)
+        path.touch()
+
+    monkeypatch.setattr(Figure, "savefig", kept)
+    folders = [str(trained.folder), str(swept.folder)]
+    arguments = [*folders, "--point", "0", "--out"]
+    assert plot.main([*arguments, str(tmp_path / "1.png")]) == 0
+    _, *rows, _ = capsys.readouterr().out.splitlines()
+    for row, folder in zip(rows, folders, strict=True):
+        assert row.startswith(f"point_mass, ppo+gasil ({folder}) ")
+    (figure,) = figures
+    legends = [panel.get_legend() for panel in (figure.axes[0], figure.axes[2])]
+    names = [f"ppo+gasil ({folder})" for folder in folders]
+    assert [x for x in texts(legends[0]) if "evaluations" not in x] == names
+    assert texts(legends[1]) == names
+    # A label of one's own is no formula, and stays as it is.
+    labels = ["--labels", r"$\frac$", "_other"]
+    assert plot.main([*arguments, str(tmp_path / "2.png"), *labels]) == 0
+    printed = capsys.readouterr().out
+    assert r"$\frac$  " in printed and "_other  " in printed
+    assert texts(figures[-1].axes[2].get_legend()) == [r"\$\frac\$", "_other"]
+
+
+def test_a_table_that_is_being_written_is_read_up_to_its_last_whole_row(
+    trained, tmp_path
+):
+    out = shutil.copytree(trained.folder, tmp_path / "out")
+    (path,) = out.glob("programs/*/metrics.csv")
+    (path.parent / "training.json").unlink()
     whole = path.read_bytes()
     for cut in (10, len(whole.splitlines()[-1]) + 10):
         path.write_bytes(whole[:-cut])
-        assert plot.read(tmp_path / "ppo").returns.shape == (3, 7)
+        assert plot.read(out).returns.shape == (3, 3)
     for lines in (0, 1, 2):
         path.write_bytes(b"".join(whole.splitlines(keepends=True)[:lines]) + b"0,")
         with pytest.raises(InputError, match="has no curves to draw yet"):
-            plot.read(tmp_path / "ppo")
-    path.write_bytes(whole)
-    assert "metrics.csv lacks rows that its training has" in capsys.readouterr().err
-
-    # A checkpoint knows what was in the table.
-    shutil.rmtree(tmp_path / "ppo" / "checkpoints")
+            plot.read(out)
     # Where none ended in the last tenth, the last that did count, as in the summary.
-    with path.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = list(csv.DictReader(whole.decode().splitlines()))
     with path.open("w") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         for row in rows:
-            late = {"episode_return": "nan"} if float(row["env_steps"]) == 2048 else {}
+            late = {"episode_return": ""} if row["env_steps"] == "1024" else {}
             writer.writerow(row | late)
-    final = [float(x["episode_return"]) for x in rows if float(x["env_steps"]) == 1792]
-    np.testing.assert_allclose(plot.read(tmp_path / "ppo").final, final)
-
-    for arguments, message in (
-        ([*folders, "--out", str(out)], "which exists"),
-        ([str(tmp_path)], "must be the folder of a run"),
-        ([folders[0], "--out", "x.txt"], "must end in .png"),
-        (
-            [*folders, "--labels", "a"],
-            "labels has 1 names: it must have one for each of the 2 runs",
-        ),
-    ):
-        assert plot.main(arguments) == 2
-        error = capsys.readouterr().err
-        assert message in error and len(error.splitlines()) == 1
+    final = [float(x["episode_return"]) for x in rows if x["env_steps"] == "768"]
+    np.testing.assert_allclose(plot.read(out).final, final)
 
 
-def test_a_label_with_an_underscore_is_in_the_legends():
-    finals = np.arange(3.0)
-    curves = [
-        plot.Curves("hopper", label, np.arange(4.0), np.ones((3, 4)), finals, None)
-        for label in ("_first", "second")
-    ]
-    panels = Figure().subplots(1, 3)
-    plot._draw_row(panels, curves)
-    for panel in (panels[0], panels[2]):
-        texts = [text.get_text() for text in panel.get_legend().get_texts()]
-        assert [text.strip() for text in texts] == ["_first", "second"]
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("", "runs is empty: name one folder or more"),
+        ("RUN --out x.txt", "must end in .png, .pdf, .svg"),
+        ("RUN --out RUN/learning_curve.png", "which exists: name a new file"),
+        ("RUN --out /proc/nowhere/x.png", "out is /proc/nowhere/x.png"),
+        ("RUN --out RUN/summary.png --point 1", "point is 1: "),
+        ("RUN/programs --out /proc/x.png", "must be the folder of a run"),
+        ("RUN RUN --labels a", "labels has 1 names: it must have one for each of the"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(
+    arguments, message, trained, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    assert plot.main(arguments.replace("RUN", str(trained.folder)).split()) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error

@@ -1,36 +1,20 @@
 """Films of a run's policy."""
 
-import base64
 import itertools
-import json
 import os
-import pathlib
-import re
 import subprocess
 import sys
-import types
-import zlib
 
-import gymnasium
 import jax
-import mujoco
 import numpy as np
 import pytest
 from PIL import Image
-from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
-from gasil_envs import locomotion
-from gasil_jax import policy, render, run
-from gasil_jax.host.members import member
-from gasil_jax.sweeps import saved_states
+from gasil_jax import policy
+from gasil_jax.cli import render
+from gasil_jax.host import saved
 
-
-@pytest.fixture(scope="module")
-def point_mass(tmp_path_factory):
-    out = tmp_path_factory.mktemp("render") / "run"
-    small = (*FLAGS, *DISCRIMINATOR_FLAGS, "--seeds", "2")
-    assert run.main([*small, "--out", str(out)]) == 0
-    return out
+pytestmark = pytest.mark.xdist_group("commands")
 
 
 def check_strip(image, width, height):
@@ -55,10 +39,10 @@ def check_strip(image, width, height):
 
 
 @pytest.mark.parametrize("suffix", [".gif", ".png", ".mp4"])
-def test_the_point_mass_is_drawn(point_mass, suffix, tmp_path, capsys):
+def test_the_point_mass_is_drawn(trained, suffix, tmp_path, capsys):
     path = tmp_path / f"film{suffix}"
     size = ("--width", "161", "--height", "120")
-    assert render.main([str(point_mass), "--out", str(path), *size]) == 0
+    assert render.main([str(trained.folder), "--out", str(path), *size]) == 0
     count = "8 frames" if suffix == ".png" else "51 frames"
     assert count in capsys.readouterr().out
     if suffix == ".mp4":
@@ -91,83 +75,37 @@ def test_locomotion_is_drawn(untrained_hopper, tmp_path):
     assert sky_and_floor.std() > 10
 
 
-def system_in(page):
-    """The model and states that a page for Brax's viewer holds."""
-    encoded = re.search(r'"([A-Za-z0-9+/=]{300,})"', page).group(1)
-    return json.loads(zlib.decompress(base64.b64decode(encoded)))
-
-
-def test_a_page_has_the_simulations_bodies(untrained_hopper, tmp_path, capsys):
-    path = tmp_path / "walk.html"
-    arguments = [str(untrained_hopper), "--out", str(path), "--steps", "3"]
-    assert render.main(arguments) == 0
-    assert "4 frames" in capsys.readouterr().out
-    shown = system_in(path.read_text())
-    env, _, _, states = saved_states.load(untrained_hopper)
-    act = policy.from_state(member(states, 0), env)
-    mean = lambda observation, key: act(observation)
-    frames, _ = render.episode(env, mean, jax.random.key(0), num_steps=3)
-    model = env.unwrapped.model
-    assert shown["opt"]["timestep"] == pytest.approx(env.unwrapped.dt)
-    assert set(shown["geoms"]) == {"torso", "thigh", "leg", "foot", "world"}
-    assert len(shown["states"]["x"]) == len(frames) == 4
-    data = mujoco.MjData(model)
-    for placed, state in zip(shown["states"]["x"], frames, strict=True):
-        data.qpos[:] = state.physics.qpos
-        mujoco.mj_forward(model, data)
-        np.testing.assert_allclose(placed["pos"], data.xpos[1:], atol=1e-6)
-        np.testing.assert_allclose(placed["rot"], data.xquat[1:], atol=1e-6)
-    # The model that simulates is as it was: Brax opens limits of what it is given.
-    assert np.isfinite(model.jnt_range).all()
-
-
-@pytest.mark.parametrize("name", locomotion.TASKS)
-def test_every_model_makes_a_page(name):
-    assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-    path = assets / locomotion.TASKS[name].xml
-    model = mujoco.MjModel.from_xml_path(str(path))
-    env = types.SimpleNamespace(model=model, dt=0.02)
-    env.unwrapped = env
-    start = types.SimpleNamespace(qpos=model.qpos0)
-    page = render.locomotion_page(env, [types.SimpleNamespace(physics=start)])
-    assert len(system_in(page)["states"]["x"][0]["pos"]) == model.nbody - 1
-
-
-def test_bad_input_is_one_line_and_status_2(point_mass, tmp_path, capsys):
+def test_bad_input_is_one_line_and_status_2(trained, tmp_path, capsys):
     (tmp_path / "there.gif").touch()
     for arguments, message in (
-        (["--out", "film.avi"], "must end in .mp4, .gif, .png, .html"),
-        (
-            ["--out", "film.html"],
-            "other environments it must end in .mp4, .gif, .png",
-        ),
+        (["--out", "film.avi"], "must end in .mp4, .gif, .png"),
         (["--out", str(tmp_path / "there.gif")], "which exists"),
-        (["--seed", "9"], "seed is 9: the run has 0 to 1"),
+        (["--seed", "9"], "seed is 9: the run has 5, 6, 7"),
         (["--steps", "0"], "steps is 0"),
         (["--width", "99999999"], "width is 99999999: it must be from 1 to 4096"),
         (["--key", "-1"], "key is -1: it must be from 0 to 4294967295"),
         (["--out", "/proc/nowhere/film.gif"], "out is /proc/nowhere/film.gif"),
         (["--out", "/proc/film.png"], "out is /proc/film.png, which can't be written"),
     ):
-        assert render.main([str(point_mass), *arguments]) == 2
+        assert render.main([str(trained.folder), *arguments]) == 2
         error = capsys.readouterr().err
         assert message in error and len(error.splitlines()) == 1
 
 
-def test_a_film_is_whole_or_not_there(point_mass, tmp_path, monkeypatch, capsys):
+def test_a_film_is_whole_or_not_there(trained, tmp_path, monkeypatch, capsys):
     def half(frames, fps, path):
         path.write_bytes(b"x")
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(render, "write_film", half)
     path = tmp_path / "film.gif"
-    assert render.main([str(point_mass), "--out", str(path), "--steps", "2"]) == 1
+    assert render.main([str(trained.folder), "--out", str(path), "--steps", "2"]) == 1
     assert "No space left on device" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
 
-def test_an_episode_ends_before_the_physics_fails(point_mass):
-    policies = saved_states.load_policies(point_mass)
+def test_an_episode_ends_before_the_physics_fails(trained):
+    policies = saved.load_policies(trained.folder)
     act = policy.make(policies.weights[0])
     env = policies.env
 
@@ -208,8 +146,8 @@ except ImportError:
     assert done.stdout.split() == ["disable"], done.stderr
 
 
-def test_a_missing_package_is_named(point_mass, tmp_path, monkeypatch, capsys):
+def test_a_missing_package_is_named(trained, tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     path = tmp_path / "film.mp4"
-    assert render.main([str(point_mass), "--out", str(path)]) == 2
+    assert render.main([str(trained.folder), "--out", str(path)]) == 2
     assert "needs the package imageio-ffmpeg" in capsys.readouterr().err

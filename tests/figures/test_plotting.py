@@ -1,11 +1,13 @@
 """The parts that curves are drawn of, and what the figures say and show."""
 
+from unittest import mock
+
 import matplotlib.figure
 import numpy as np
 
-from gasil_jax import plot, statistics
-from gasil_jax.figures import plotting
-from gasil_jax.sweeps import tables
+from gasil_jax import statistics
+from gasil_jax.cli import plot
+from gasil_jax.host import plotting, results
 
 
 def test_parts_are_means_where_every_seed_has_ended_an_episode():
@@ -77,14 +79,10 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     values = dict(zip(("alpha", "imitation_rule"), zip(*points)))
     values["gamma"] = tuple(np.linspace(0.9, 0.99, 9))
     returns = np.arange(9.0)
-    shares = {name: statistics.importance(x, returns) for name, x in values.items()}
-    plotting.marginals(
-        tmp_path / "x.png", values, returns, importance=shares, best=8, left_out=2
-    )
+    plotting.marginals(tmp_path / "x.png", values, returns, best=8, left_out=2)
     (figure,) = figures
     alpha, rule, gamma = figure.axes
     assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
-    assert alpha.get_title() == f"importance {shares['alpha']:.0%}"
     assert rule.get_xlabel() == "imitation rule" and gamma.get_xscale() == "linear"
     assert [x.get_text() for x in alpha.get_xticklabels()] == ["0.02", "0.1", "1"]
     assert [x.get_text() for x in rule.get_xticklabels()] == ["gap", "both", "True"]
@@ -97,29 +95,28 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), [1.0, 4.0, 7.0])
     caption = figure.get_supxlabel().replace("\n", " ")
     assert "2 of 11 points are left out, because a seed has no return" in caption
-    assert "(uncertain with 9 points: shares may add up" in caption
-    assert "neighbouring values" in caption and "share of the points' var" in caption
+    assert "neighbouring values" in caption
 
 
-def test_too_few_points_have_no_importance(figures, tmp_path):
+def test_values_that_begin_at_zero_have_a_scale(figures, tmp_path):
+    values = {"alpha": (0.0, 0.02, 1.0)}
     plotting.marginals(
-        tmp_path / "x.png",
-        {"alpha": (0.0, 0.02, 1.0)},
-        np.arange(3.0),
-        importance={"alpha": None},
-        best=None,
-        left_out=0,
+        tmp_path / "x.png", values, np.arange(3.0), best=None, left_out=0
     )
     (axes,) = figures[0].axes
-    assert axes.get_title() == "" and axes.get_xscale() == "symlog"
+    assert axes.get_xscale() == "symlog"
     assert figures[0].get_supxlabel() == (
         "point: mean over its seeds; mean: over the points of each\nvalue"
     )
 
 
+def labels_of(points):
+    return results._labels(mock.Mock(sweep=mock.Mock(points=points)))
+
+
 def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
     points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0)]
-    names, returns = tables._labels(points), np.array([[1.0, 2.0], [3.0, 4.0]])
+    names, returns = labels_of(points), np.array([[1.0, 2.0], [3.0, 4.0]])
     plotting.final_returns(tmp_path / "x.png", names, returns, best=1)
     labels = figures[0].axes[0].get_yticklabels()
     assert [label.get_text() for label in labels] == ["0: alpha=0.1", "1: alpha=1"]
@@ -131,7 +128,7 @@ def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
     point |= {"discriminator_learning_rate": 2e-5, "buffer_steps": 10_000}
     points = [point, {name: 2 * value for name, value in point.items()}]
     plotting.final_returns(
-        tmp_path / "x.png", tables._labels(points), np.ones((2, 5)), best=1
+        tmp_path / "x.png", labels_of(points), np.ones((2, 5)), best=1
     )
     (figure,) = figures
     figure.draw_without_rendering()
@@ -140,7 +137,7 @@ def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
     low, high = [label.get_window_extent() for label in axes.get_yticklabels()]
     assert not low.overlaps(high) and min(low.x0, high.x0) >= 0.0
     text = axes.get_yticklabels()[0].get_text()
-    assert text.replace("\n", " ") == f"0: {tables._labels(points)[0]}"
+    assert text.replace("\n", " ") == f"0: {labels_of(points)[0]}"
 
 
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):

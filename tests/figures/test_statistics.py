@@ -1,12 +1,10 @@
-"""Statistics against plain twins, and how much a hyperparameter explains."""
+"""Statistics against plain twins."""
 
 import numpy as np
 import pytest
 import scipy.stats
 
 from gasil_jax import statistics
-
-ALPHA, RATE = map(np.ravel, np.meshgrid([0.02, 0.1, 0.2, 1.0], [1e-5, 1e-4, 1e-3]))
 
 
 @pytest.mark.parametrize("count", [4, 8, 20])
@@ -63,45 +61,6 @@ def test_the_profile_counts():
     scores, levels = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 2.0, 3.5, 9.0])
     profile = statistics.performance_profile(scores, levels)
     np.testing.assert_array_equal(profile, [1.0, 0.5, 0.25, 0.0])
-
-
-def test_only_what_decides_the_return_is_important():
-    noise = np.random.default_rng(0).normal(scale=0.01, size=len(ALPHA))
-    returns = np.log(ALPHA) ** 2 + noise
-    assert statistics.importance(ALPHA.tolist(), returns) > 0.99
-    assert statistics.importance(RATE.tolist(), returns) < 0.0
-    # Epsilon squared: a one-way analysis of variance.
-    returns = ALPHA + np.arange(12.0) % 5
-    within = sum(((x - x.mean()) ** 2).sum() for x in returns.reshape(3, 4).T)
-    total = ((returns - returns.mean()) ** 2).sum()
-    assert statistics.importance(ALPHA.tolist(), returns) == pytest.approx(
-        1 - within / 8 / (total / 11)
-    )
-
-
-def test_random_values_are_compared_with_their_neighbours():
-    draw = np.random.default_rng(0)
-    first, second = 10.0 ** draw.uniform(-5, -3, size=(2, 60))
-    returns = np.log(first)
-    assert statistics.importance(first.tolist(), returns) > 0.9
-    assert statistics.importance(second.tolist(), returns) < 0.15
-
-
-def test_it_is_zero_on_average_where_there_is_no_effect():
-    draw = np.random.default_rng(0)
-    values = [x % 8 for x in range(16)]
-    shares = [statistics.importance(values, draw.normal(size=16)) for _ in range(300)]
-    # The share without the correction is (8 - 1) / (16 - 1) on average.
-    assert abs(np.mean(shares)) < 0.05
-
-
-def test_what_can_not_be_told():
-    constant = np.full(12, 0.1)
-    assert statistics.importance(ALPHA.tolist(), constant) == 0.0
-    assert statistics.importance([1.0] * 12, np.arange(12.0)) == 0.0
-    assert statistics.importance([0.1, 1.0] * 3, np.arange(6.0)) is None
-    # Each text has one point: there is nothing to compare it with.
-    assert statistics.importance(list("abcdefghi"), np.arange(9.0)) is None
 
 
 def test_groups():

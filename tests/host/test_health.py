@@ -1,5 +1,8 @@
 """Numbers that are not finite affect one step or update of one member alone."""
 
+import csv
+import json
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -94,7 +97,7 @@ def test_an_update_that_is_not_finite_is_skipped_and_flagged():
     assert_others_are_equal(after.actor_critic, expected.actor_critic)
 
 
-def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
+def test_an_unhealthy_seed_is_in_the_results_with_a_warning(tmp_path, capsys):
     out = tmp_path / "out"
     wild = ("--agent", "ppo", "--seeds", "2", "--learning-rate", "1e38")
     assert run.main([*FLAGS, *wild, "--out", str(out)]) == 0
@@ -102,9 +105,10 @@ def test_an_unhealthy_seed_is_in_the_summary_with_a_warning(tmp_path, capsys):
     assert "warning: numbers that were not finite in seeds [0, 1]" in told
     # While it trains, once.
     assert told.count("warning: an update was undone because a number in it") == 1
-    assert (
-        '"unhealthy_seeds": [\n    0,\n    1\n  ]' in (out / "summary.json").read_text()
-    )
+    (point,) = json.loads((out / "summary.json").read_text())["points"]
+    assert point["diverged_seeds"] == 2
+    with (out / "results.csv").open() as file:
+        assert [row["skipped_updates"] for row in csv.DictReader(file)] == ["2", "2"]
 
 
 class Fragile:

@@ -12,7 +12,7 @@ from small_training import FLAGS
 from test_progress import wait_for_text
 
 from gasil_jax import run
-from gasil_jax.host import checkpoint, driver, interruption, run_folder
+from gasil_jax.host import checkpoint, driver, folders, interruption
 
 
 @pytest.fixture(autouse=True)
@@ -34,8 +34,7 @@ except BaseException:
     pass
 raise ImportError
 """
-    for name in ("numpy", "tyro"):
-        (tmp_path / f"{name}.py").write_text(numpy)
+    (tmp_path / "numpy.py").write_text(numpy)
     path = os.pathsep.join([str(tmp_path), *sys.path])
     ended = subprocess.run(
         [sys.executable, "-m", module],
@@ -90,8 +89,9 @@ def test_ctrl_c_while_compiling_is_answered_at_once(
     assert run.main(arguments) == 130
     ended.set()
     last = capsys.readouterr().err.splitlines()
-    with run_folder.lock(tmp_path):
-        newest, _ = checkpoint.latest(tmp_path / "checkpoints")
+    (program,) = (tmp_path / "programs").iterdir()
+    with folders.lock(program):
+        newest, _ = checkpoint.latest(program / "checkpoints")
     if twice:
         assert last == ["interrupted"] and newest is None
     else:

@@ -5,7 +5,7 @@ import re
 import jax
 import numpy as np
 import pytest
-from test_resume import SMALL
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import run
@@ -21,8 +21,11 @@ from gasil_jax.host.members import make_members
             marks=pytest.mark.compiled_as_for_users,
         ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
-        ("ppo+sil", {"sil_minibatch_size": 50_000}),
-        ("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
+        pytest.param("ppo+sil", {"sil_minibatch_size": 50_000}, marks=pytest.mark.slow),
+        pytest.param(
+            *("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
+            marks=pytest.mark.slow,
+        ),
         ("ppo", {"hidden_sizes": (1500, 1500)}),
     ],
 )
@@ -37,7 +40,7 @@ def test_the_estimate_is_within_a_factor_of_two(agent, changes):
 
 
 def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
-    arguments = [*SMALL, "--out", str(tmp_path / "out")]
+    arguments = [*FLAGS, "--seeds", "3", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
     assert run.main(arguments) == 2
     error = capsys.readouterr().err
@@ -141,19 +144,6 @@ def test_a_container_has_what_others_in_it_leave(tmp_path):
     own.write_text("0::/\n")
     assert resources._free_in_control_groups(root, own) == [8350]
     assert resources._free_in_control_groups(root, tmp_path / "none") == []
-
-
-def test_control_groups_of_the_first_version_have_limits_too(tmp_path):
-    own, root = tmp_path / "own", tmp_path / "groups"
-    own.write_text("5:cpu,cpuacct:/a\n4:memory:/a/b\n0::/\n")
-    (root / "memory" / "a").mkdir(parents=True)
-    for name, text in (
-        ("limit_in_bytes", "1000"),
-        ("usage_in_bytes", "800"),
-        ("stat", "inactive_file 1\ntotal_inactive_file 100\n"),
-    ):
-        (root / "memory" / "a" / f"memory.{name}").write_text(text)
-    assert resources._free_in_control_groups(root, own) == [300]
 
 
 class Device:

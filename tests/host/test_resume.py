@@ -1,7 +1,5 @@
 """A run that is stopped early loses nothing, and continues bit for bit."""
 
-import errno
-import fcntl
 import itertools
 import json
 import os
@@ -13,7 +11,6 @@ import signal
 import subprocess
 import sys
 import time
-from unittest import mock
 
 import jax
 import numpy as np
@@ -22,8 +19,9 @@ import test_members
 from small_training import FLAGS
 
 from gasil_jax import run
+from gasil_jax.cli import reporting
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, command_line, devices, run_folder, run_options
+from gasil_jax.host import checkpoint, devices, folders
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.members import Members
 
@@ -67,13 +65,23 @@ def finish(child, seconds=200):
     return child.returncode, out, err
 
 
+def program_of(out):
+    """Return the folder of the only program of a run; it may not be made yet."""
+    return next((out / "programs").glob("*"), out / "programs" / "none")
+
+
 def checkpoints(out):
-    return sorted(p.name for p in (out / "checkpoints").glob("*[0-9]"))
+    root = program_of(out) / "checkpoints"
+    return sorted(path.name for path in root.glob("*[0-9]"))
 
 
 def rows(out):
-    path = out / "metrics.csv"
+    path = program_of(out) / "metrics.csv"
     return path.read_text().count("\n") if path.exists() else 0
+
+
+def metrics(out):
+    return (program_of(out) / "metrics.csv").read_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -136,12 +144,12 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(
     new = lambda: checkpoints(out)
     wait_for(lambda: new() and rows(out) > 1 + 3 * (int(max(new())) + 5), child)
     child.send_signal(signal.SIGSTOP)
-    # While it runs, its folder is locked.
+    # While it runs, another process can't train the same program.
     assert run.main(["--resume", "--out", str(out)]) == 2
     assert f"process {child.pid}" in capsys.readouterr().err
     child.kill()
     _, _, err = finish(child)
-    with run_folder.lock(out):
+    with folders.lock(program_of(out)):
         pass
     # It loaded what the undisturbed run had compiled, and XLA told nothing of it.
     again = {x.name: x.stat().st_mtime_ns for x in cache.rglob("*-cache")}
@@ -161,17 +169,17 @@ def test_killed_again_and_again_it_ends_as_if_undisturbed(
         done = int(max(checkpoints(out)))
         assert done < ITERATIONS and rows(out) == 1 + 3 * done
     assert run.main(resumed) == 0
-    assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
-    assert list(out.glob("metrics-cut-*.csv"))  # no row is thrown away
+    assert metrics(out) == metrics(whole)
     # The newest two and the best.
     assert len(checkpoints(out)) in (2, 3)
-    final = [checkpoint.latest(x / "checkpoints")[0].folder for x in (whole, out)]
-    assert {x.name for x in final} == {f"{ITERATIONS:08d}"}
-    results = [json.loads((x / "summary.json").read_text()) for x in (whole, out)]
-    assert results[0]["final_return"] == results[1]["final_return"]
+    assert {max(checkpoints(x)) for x in (whole, out)} == {f"{ITERATIONS:08d}"}
+    for name in ("results.csv", "policy.npz"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes()
 
 
+@pytest.fixture
 def copy(whole, tmp_path):
+    """A copy of the undisturbed run's folder."""
     return pathlib.Path(shutil.copytree(whole, tmp_path / "copy"))
 
 
@@ -180,50 +188,27 @@ def copy(whole, tmp_path):
     [
         ("--behavior-cloning-coefficient 0.7", "coefficient was 0.1, is 0.7"),
         ("--obs-noise 0.2 --num-epochs 3", "num_epochs was 1, is 3"),
-        ("--seeds 4", "seeds was 3, is 4"),
-        ("--total-steps 100", "total_steps was 51200, is 100"),
+        ("--seeds 2", "seeds were [0, 1, 2]"),
+        ("--total-steps 100", "total_steps was 51200"),
+        ("--agent ppo", "agent is 'ppo': "),
+        ("--preset paper", "preset is 'paper': "),
     ],
 )
 def test_changed_settings_are_refused(arguments, message, whole, capsys):
-    before = {p.name: p.stat().st_mtime_ns for p in whole.iterdir()}
+    before = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file()}
     assert run.main(["--resume", "--out", str(whole), *arguments.split()]) == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
-    assert {p.name: p.stat().st_mtime_ns for p in whole.iterdir()} == before
-
-
-def test_settings_that_changed_before_the_lock_are_refused(whole, tmp_path):
-    """Another process may have trained in the folder since they were read."""
-    out = copy(whole, tmp_path)
-    arguments = ["--resume", "--out", str(out)]
-    begun = run_options.resumed_run(arguments)
-    options = run_options.parse(run.Options, arguments, "gasil_jax.run", begun)
-    path = out / "config.json"
-    changed = json.loads(path.read_text())
-    changed["algorithm"]["total_steps"] *= 2
-    del changed["sha256"]
-    path.write_text(json.dumps(changed))
-    with pytest.raises(InputError, match="total_steps was 102400, is 51200"):
-        with run_options.open_folder(options, "gasil_jax.run"):
-            pass
-
-
-def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):
-    def flock(file, operation):
-        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with run_folder.lock(tmp_path):
-        assert "can't be locked (No locks available): make" in capsys.readouterr().err
-    with run_folder.lock(tmp_path):
-        assert capsys.readouterr().err == ""
+    after = {p: p.stat().st_mtime_ns for p in whole.rglob("*") if p.is_file()}
+    # The lock may have been taken for a moment.
+    assert {p for p in before if before[p] != after[p]} <= {whole / ".lock"}
 
 
 def test_ctrl_c_before_training_is_one_line(capsys):
     def work():
         raise KeyboardInterrupt
 
-    assert command_line.reports_errors(work)() == 130
+    assert reporting.reports_errors(work)() == 130
     assert capsys.readouterr().err == "interrupted\n"
 
 
@@ -238,15 +223,13 @@ def test_devices_without_effect_are_told(capsys):
 
 def test_a_new_folder_has_a_name_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    made = [run_folder.create_new("hopper").name for _ in range(3)]
+    made = [folders.create_new("hopper").name for _ in range(3)]
     assert made == ["hopper", "hopper-2", "hopper-3"]
-
-
-def test_a_disk_that_is_not_mounted_is_told(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+    # A disk that is not mounted is told.
+    (tmp_path / "runs").rename(tmp_path / "other")
     (tmp_path / "runs").symlink_to(tmp_path / "unmounted")
     with pytest.raises(InputError, match="out is runs"):
-        run_folder.create_new("hopper")
+        folders.create_new("hopper")
 
 
 def test_resume_needs_a_folder(capsys):
@@ -257,149 +240,86 @@ def test_resume_needs_a_folder(capsys):
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda path: path.unlink(), "lacks rows that were in it at the last"),
+        (lambda path: path.unlink(), "metrics.csv is damaged: it is missing"),
+        (
+            lambda path: os.truncate(path, path.stat().st_size // 2),
+            "metrics.csv is damaged: it lacks iterations",
+        ),
         (
             lambda path: path.write_text(path.read_text().replace(",", "", 9)),
-            "metrics.csv",
+            "metrics.csv is damaged: row 1 has",
         ),
         (
             lambda path: path.write_text(path.read_text().replace(",0.", ",z.")),
-            "metrics.csv",
+            "metrics.csv is damaged: could not convert",
         ),
-        (
-            lambda path: path.write_bytes(
-                path.read_bytes().replace(b",0.", b",00.", 3)
-            ),
-            "metrics.csv is damaged: it has changed since the checkpoint",
-        ),
+        (lambda path: path.write_bytes(b"\xff" + path.read_bytes()), "damaged"),
     ],
 )
-def test_a_damaged_table_is_reported_in_a_line(
-    damage, message, whole, tmp_path, capsys
-):
-    out = copy(whole, tmp_path)
-    damage(out / "metrics.csv")
-    assert run.main(["--resume", "--out", str(out)]) == 2
-    assert message in capsys.readouterr().err.splitlines()[-1]
+def test_a_damaged_table_is_told_in_a_line(damage, message, copy, capsys):
+    damage(program_of(copy) / "metrics.csv")
+    assert run.main(["--resume", "--out", str(copy)]) == 2
+    (line,) = [x for x in capsys.readouterr().err.splitlines() if "error" in x]
+    assert message in line
 
 
-def test_resuming_a_finished_run_changes_nothing(whole, tmp_path, capsys):
-    out = copy(whole, tmp_path)
-    assert run.main(["--resume", "--out", str(out)]) == 0
-    assert "compiling" not in capsys.readouterr().err
-    for name in ("summary.json", "metrics.csv"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
-    with np.load(out / "policy.npz") as ours, np.load(whole / "policy.npz") as theirs:
-        for name in theirs:
-            np.testing.assert_array_equal(ours[name], theirs[name])
-    assert checkpoints(out) == checkpoints(whole)
+def test_rows_that_training_needs_to_continue_are_missed(copy, capsys):
+    """It is told before anything is trained; what is left of the table is kept."""
+    more = ("--total-steps", str((ITERATIONS + 5) * 128))
+    path = program_of(copy) / "metrics.csv"
+    kept = path.read_text().splitlines(keepends=True)[:-1]
+    path.write_text("".join(kept))
+    assert run.main(["--resume", "--out", str(copy), *more]) == 2
+    assert "lacks rows that were in it at the last" in capsys.readouterr().err
+    assert path.read_text().splitlines() == [x.strip() for x in kept]
 
 
-def test_a_run_that_was_killed_before_its_summary_has_no_speed(whole, tmp_path, capsys):
-    out = copy(whole, tmp_path)
-    (out / "summary.json").unlink()
-    assert run.main(["--resume", "--out", str(out)]) == 0
+def test_resuming_a_finished_run_changes_nothing(whole, copy):
+    """In a process of its own, in which JAX begins with nothing to train."""
+    for name in ("results.csv", "summary.json", "policy.npz"):
+        (copy / name).unlink()
+    status, out, err = finish(start(copy, "--resume"))
+    assert status == 0, err
+    assert "compiling" not in err and "steps/s" in out
+    for name in ("results.csv", "summary.json", "policy.npz"):
+        assert (copy / name).read_bytes() == (whole / name).read_bytes()
+    assert metrics(copy) == metrics(whole)
+    assert checkpoints(copy) == checkpoints(whole)
+
+
+def test_a_run_that_was_killed_before_it_said_so_has_no_speed(whole, copy, capsys):
+    (program_of(copy) / "training.json").unlink()
+    assert run.main(["--resume", "--out", str(copy)]) == 0
     assert "steps/s" not in capsys.readouterr().out
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["env_steps_per_second"] is None
+    summaries = [json.loads((x / "summary.json").read_text()) for x in (copy, whole)]
+    assert summaries[0]["env_steps_per_second"] is None
+    assert summaries[0]["points"] == summaries[1]["points"]
 
 
-def test_results_without_checkpoints_are_not_replaced(whole, tmp_path, capsys):
-    out = copy(whole, tmp_path)
-    shutil.rmtree(out / "checkpoints")
-    kinds = (".csv", ".npz", ".json")
-    before = {x: x.read_bytes() for x in out.iterdir() if x.suffix in kinds}
+def test_results_without_checkpoints_are_not_replaced(copy, capsys):
+    root = program_of(copy) / "checkpoints"
+    before = {x: x.read_bytes() for x in copy.rglob("*.csv")}
     more = str((ITERATIONS + 5) * 128)
-    arguments = ["--resume", "--out", str(out), "--total-steps", more]
+    arguments = ["--resume", "--out", str(copy), "--total-steps", more]
+    for name in checkpoints(copy):
+        (root / name / "manifest.json").unlink()
+    damaged = checkpoints(copy)
     assert run.main(arguments) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert "has ended and its checkpoints are gone" in error
-    assert all(path.read_bytes() == content for path, content in before.items())
-    # Nor if there are some, but all are damaged.
-    shutil.copytree(whole / "checkpoints", out / "checkpoints")
-    for name in checkpoints(out):
-        delete_the_manifest(out / "checkpoints" / name)
-    damaged = checkpoints(out)
+    assert "no undamaged checkpoint to con" in capsys.readouterr().err.splitlines()[-1]
+    assert checkpoints(copy) == damaged
+    shutil.rmtree(root)
     assert run.main(arguments) == 2
-    assert (
-        "no undamaged checkpoint to continue from ("
-        in capsys.readouterr().err.splitlines()[-1]
-    )
+    assert "no undamaged checkpoint to con" in capsys.readouterr().err.splitlines()[-1]
     assert all(path.read_bytes() == content for path, content in before.items())
-    assert checkpoints(out) == damaged
-    # Where it has not ended, its table is kept under another name.
-    shutil.rmtree(out / "checkpoints")
-    (out / "summary.json").unlink()
-    (out / "policy.npz").unlink()
-    assert run.main(["--resume", "--out", str(out)]) == 0
-    assert (
-        "has no checkpoint: training starts from the beginning"
-        in capsys.readouterr().err
-    )
-    assert (out / "metrics.csv").read_bytes() == before[out / "metrics.csv"]
-    assert (out / "metrics-cut-1.csv").exists()
 
 
-def truncate(folder):
-    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
-    os.truncate(path, path.stat().st_size // 2)
-
-
-def flip_a_bit(folder):
-    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
-    content = bytearray(path.read_bytes())
-    content[len(content) // 2] ^= 4
-    path.write_bytes(content)
-
-
-def delete_a_file(folder):
-    next(p for p in sorted((folder / "state").rglob("*")) if p.is_file()).unlink()
-
-
-def delete_the_manifest(folder):
-    (folder / "manifest.json").unlink()
-
-
-def edit_the_manifest(**changes):
-    def damage(folder):
-        path = folder / "manifest.json"
-        manifest = json.loads(path.read_text())
-        record = manifest["record"] | changes.pop("record", {})
-        path.write_text(json.dumps(manifest | {"record": record} | changes))
-
-    return damage
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        truncate,
-        flip_a_bit,
-        delete_a_file,
-        delete_the_manifest,
-        edit_the_manifest(files=[]),
-        edit_the_manifest(files={"state": 3}),
-        edit_the_manifest(record={"score": "high"}),
-        edit_the_manifest(record={"metrics_size": "12"}),
-        edit_the_manifest(record={"metrics_size": -1}),
-        lambda folder: (folder / "manifest.json").write_text("[" * 100_000),
-        lambda folder: (folder / "manifest.json").write_text("3"),
-    ],
-)
-def test_a_damaged_checkpoint_is_reported_and_the_one_before_is_used(damage, tmp_path):
-    root = tmp_path / "checkpoints"
-    states = [{"x": np.full(1000, float(i), np.float32)} for i in range(3)]
-    for i, state in enumerate(states):
-        checkpoint.write(root, i, state, {"score": float(i), "metrics_size": 5})
-    damage(root / "00000002")
-    assert checkpoint.best(root).iteration == 1
-    newest, errors = checkpoint.latest(root)
-    assert newest.iteration == 1
-    assert len(errors) == 1 and "00000002 is damaged" in errors[0]
-    np.testing.assert_array_equal(newest.restore(states[1])["x"], states[1]["x"])
-    # Written again, it is whole.
-    checkpoint.write(root, 2, states[2], {"score": None})
-    assert checkpoint.latest(root)[0].iteration == 2
+def test_training_without_a_checkpoint_begins_anew(whole, copy, capsys):
+    shutil.rmtree(program_of(copy) / "checkpoints")
+    (program_of(copy) / "training.json").unlink()
+    assert run.main(["--resume", "--out", str(copy)]) == 0
+    told = capsys.readouterr().err
+    assert "has no checkpoint: training starts from the beginning" in told
+    assert metrics(copy) == metrics(whole)
 
 
 def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
@@ -410,84 +330,20 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     assert run.main([*SMALL, *twice, "--out", str(out)]) == 0
     *_, last = checkpoints(out)
     assert len(checkpoints(out)) == 2
-    flip_a_bit(out / "checkpoints" / last)
+    root = program_of(out) / "checkpoints"
+    (root / last / "manifest.json").write_text("3")
+    # As if it had been killed just before the end.
+    (program_of(out) / "training.json").unlink()
     assert run.main(["--resume", "--out", str(out)]) == 0
     told = capsys.readouterr().err
     assert f"{last} is damaged" in told and "starts from 00000200" in told
-    assert (out / "metrics.csv").read_bytes() == (whole / "metrics.csv").read_bytes()
-    assert checkpoint.latest(out / "checkpoints")[0].folder.name == last
-    assert (out / "checkpoints" / f"{last}.damaged").is_dir()
-
-
-def test_a_damaged_checkpoint_does_not_count_as_the_newest(tmp_path):
-    root = tmp_path / "checkpoints"
-    for iteration in (1, 5):
-        checkpoint.write(root, iteration, {"x": np.zeros(1000)}, {"score": None})
-    flip_a_bit(root / "00000005")
-    assert checkpoint.latest(root)[0].iteration == 1
-    checkpoint.set_aside(root, newer_than=1)
-    checkpoint.write(root, 2, {"x": np.zeros(1000)}, {"score": None})
-    checkpoint.prune(root, 1)
-    assert checkpoint.latest(root) == (checkpoint.read(root / "00000002"), [])
-
-
-def test_a_checkpoint_that_cannot_be_read_now_is_not_taken_for_damaged(
-    tmp_path, monkeypatch, capsys
-):
-    out = tmp_path / "out"
-    checkpoint.write(out / "checkpoints", 1, {"x": np.zeros(3)}, {"score": None})
-
-    def fail(folder):
-        raise OSError(errno.ESTALE, os.strerror(errno.ESTALE))
-
-    with monkeypatch.context() as patched:
-        patched.setattr(checkpoint, "_hashes", fail)
-        with pytest.raises(OSError, match="Stale"):
-            checkpoint.latest(out / "checkpoints")
-        with pytest.raises(checkpoint.WriteError, match="Stale"):
-            checkpoint.write(out / "checkpoints", 1, {"x": np.ones(3)}, {})
-    assert checkpoint.latest(out / "checkpoints")[0].iteration == 1
-
-
-def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
-    for i in range(3):
-        checkpoint.write(tmp_path, i, {"x": np.zeros(3)}, {"score": None})
-    names = lambda: sorted(path.name for path in tmp_path.iterdir())
-    rename = pathlib.Path.rename
-
-    def fail(path, other):
-        if path.name == "00000001":
-            raise PermissionError
-        return rename(path, other)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(pathlib.Path, "rename", fail)
-        checkpoint.prune(tmp_path, 1)
-    assert names() == ["00000001", "00000002"]
-    with monkeypatch.context() as patched:
-        patched.setattr(os, "unlink", mock.Mock(side_effect=PermissionError))
-        checkpoint.prune(tmp_path, 1)
-    assert names() == ["00000001.partial", "00000002"]
-    assert checkpoint.latest(tmp_path)[0].iteration == 2
-    checkpoint.delete_partial(tmp_path)
-    assert names() == ["00000002"]
-
-
-def test_the_best_and_the_newest_are_kept(tmp_path):
-    root = tmp_path / "checkpoints"
-    for i, score in enumerate([None, 3.0, 9.0, 1.0, 2.0, None]):
-        checkpoint.write(root, i, {"x": np.zeros(3)}, {"score": score})
-        checkpoint.prune(root, 2)
-    assert sorted(p.name for p in root.iterdir()) == [
-        "00000002",
-        "00000004",
-        "00000005",
-    ]
-    assert checkpoint.best(root).iteration == 2
+    assert metrics(out) == metrics(whole)
+    assert checkpoint.latest(root)[0].folder.name == last
+    assert (root / f"{last}.damaged").is_dir()
 
 
 # States with a discriminator and a buffer, and with a replay and a model of rewards;
-# what others have is arrays too, and test_disks.py writes those of any kind.
+# what others have is arrays too, and test_checkpoints.py writes those of any kind.
 @pytest.mark.parametrize(
     "agent",
     [
@@ -500,7 +356,8 @@ def test_an_agent_continues_bit_for_bit(agent, tmp_path):
     rest = []
     states, _ = members.train(advance, members.to_devices(first), 0, 1)
     states, _ = members.train(advance, states, 1, 1)
-    checkpoint.write(tmp_path, 2, members.trim(states), {})
+    record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
+    checkpoint.write(tmp_path, 2, members.trim(states), record)
     newest, _ = checkpoint.latest(tmp_path)
     like = jax.eval_shape(lambda: first)
     for before in (states, members.to_devices(newest.restore(like))):
@@ -526,12 +383,3 @@ def test_an_agent_continues_bit_for_bit(agent, tmp_path):
     if "buffer_steps" in members.algorithm.settings:
         assert (metrics["good_steps"] == 100).all()
     assert len(leaves) > 20
-
-
-def test_of_another_agent_the_agent_is_the_only_difference():
-    before = {"agent": "ppo+gasil", "buffer_steps": 1000, "gamma": 0.9}
-    now = {"agent": "ppo", "gamma": 0.99}
-    assert run_folder.differences(before, now) == ["agent was ppo+gasil, is ppo"]
-    assert run_folder.differences(now, now | {"gamma": 1.0}) == [
-        "gamma was 0.99, is 1.0"
-    ]

@@ -10,9 +10,9 @@ import pytest
 from small_training import FLAGS
 
 from gasil_jax import run, sweep
+from gasil_jax.cli import train
 from gasil_jax.errors import InputError
-from gasil_jax.host import progress, run_options, trackers
-from gasil_jax.sweeps import assembly
+from gasil_jax.host import progress, trackers, training
 
 SMALL = (
     *(*FLAGS, "--agent", "ppo", "--seeds", "2", "--first-seed", "3"),
@@ -78,7 +78,7 @@ def test_a_run_in_tensorboard(tmp_path, monkeypatch):
         phases.append(name)
         return contextlib.nullcontext()
 
-    for module in (run, run_options, assembly, progress):
+    for module in (train, training, progress):
         monkeypatch.setattr(module, "announced", announced)
     assert (
         run.main(
@@ -86,21 +86,22 @@ def test_a_run_in_tensorboard(tmp_path, monkeypatch):
         )
         == 0
     )
-    (path,) = (out / "tensorboard").iterdir()
+    (path,) = out.glob("programs/*/tensorboard/*")
     content = path.read_bytes()
     assert content.count(b"mean/policy_loss") == 4
     # Episodes of 50 steps end in every second iteration.
-    for name in (b"mean/episode_return", b"episode_return/3", b"episode_return/4"):
+    for name in (b"mean/episode_return", b"episode_return/0-3", b"episode_return/0-4"):
         assert content.count(name) == 2
     # The phases before, during and after training are shown.
     assert phases == [
         "building the environment",
         "starting the devices",
+        "tracing the first state",
         "starting the trackers",
         "reading the checkpoints",
         "saving a checkpoint",
         "closing the trackers",
-        "writing the curve, the policies and the summary",
+        "writing the results",
     ]
 
 
@@ -143,7 +144,9 @@ def first_made(monkeypatch, program, *arguments):
         raise InputError("enough")
 
     monkeypatch.setattr(trackers, "make", make)
-    assert program.main([*SMALL, *map(str, arguments)]) == 2
+    monkeypatch.setattr(trackers, "check", lambda names: None)
+    log = ("--log", "tensorboard")
+    assert program.main([*SMALL, *log, *map(str, arguments)]) == 2
     (first,) = told
     return first
 
@@ -152,9 +155,7 @@ def test_runs_have_the_names_of_their_folders(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert first_made(monkeypatch, run, "--out", "programs/7")[0] == "7"
     grid = ("--grid", "num_epochs=2,3", "--out", "beta")
-    name = first_made(monkeypatch, sweep, *grid, "--shard", "2/2")[0]
-    (program,) = (tmp_path / "beta" / "programs").iterdir()
-    assert name == f"beta-{program.name}"
+    assert first_made(monkeypatch, sweep, *grid)[0] == "beta"
 
 
 def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, capsys):

@@ -1,0 +1,386 @@
+"""A sweep is a store of runs: in shards, copied or grown, each run is trained once."""
+
+import json
+import shutil
+import signal
+import sys
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from matplotlib.figure import Figure
+
+import gasil_jax
+from gasil_jax import sweep
+from gasil_jax.cli import options as options_
+from gasil_jax.cli import train as training_of_commands
+from gasil_jax.cli.options import SweepOptions
+from gasil_jax.errors import InputError
+from gasil_jax.host import programs, ray_launcher
+from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.programs import Training
+from gasil_jax.host.sweep import Sweep, parse_shard
+from gasil_jax.host.tables import TableWriter
+
+
+def sweep_of(points, seeds, algorithm=None):
+    algorithm = algorithm or gasil_jax.algorithm()
+    return Sweep("point_mass", algorithm, seeds).grown(points)
+
+
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(
+    updates=st.lists(st.integers(1, 9), min_size=1, max_size=6, unique=True),
+    num_seeds=st.integers(1, 4),
+    count=st.integers(1, 24),
+)
+def test_shards_hold_each_run_once(updates, num_seeds, count):
+    points = [{"discriminator_updates": 1 + n // 3, "alpha": n / 9} for n in updates]
+    requested = Sweep("point_mass", gasil_jax.algorithm(), range(num_seeds), points)
+    runs = list(requested.runs.values())
+    every = [(number, count) for number in range(1, count + 1)]
+    if count > len(runs):
+        with pytest.raises(InputError, match=f"{len(runs)} runs"):
+            requested.part(*every[0])
+        return
+    parts = [requested.part(*shard) for shard in every]
+    sizes = [len(part) for part in parts]
+    assert max(sizes) - min(sizes) <= 1
+    whole = programs.group(runs)
+    assert [run for part in parts for run in part] == [r for p in whole for r in p.runs]
+    # No more is compiled than cutting must cost.
+    seen = [program for part in parts for program in programs.group(part)]
+    assert len(seen) <= len(whole) + count - 1
+
+
+def test_points_that_differ_in_traced_numbers_alone_share_a_program(tmp_path):
+    points = [
+        {"discriminator_updates": 20, "alpha": 0.1},
+        {"gamma": 0.9},
+        {"num_epochs": 3},
+        # The same run as the sweep's own.
+        {"alpha": 0.3},
+    ]
+    algorithm = gasil_jax.algorithm(alpha=0.3)
+    requested = sweep_of(points, [7, 8], algorithm)
+    assert len(requested.points) == 4
+    first, *others = requested.unfinished(tmp_path)
+    assert first.labels == {"point": (0, 0, 2, 2), "seed": (7, 8, 7, 8)}
+    numbers = [(x["alpha"], x["gamma"]) for x in first.hyperparameters]
+    assert numbers == [(0.3, 0.99)] * 2 + [(0.3, 0.9)] * 2
+    assert [x.labels["point"] for x in others] == [(1, 1), (3, 3)]
+    assert [x.algorithm for x in others] == [
+        algorithm.replace(discriminator_updates=20, alpha=0.1),
+        algorithm.replace(num_epochs=3),
+    ]
+
+
+def test_a_program_of_a_version_with_fewer_settings_is_read(tmp_path):
+    """What it lacks has its default, so that its runs are those of this version."""
+    requested = Sweep("point_mass", gasil_jax.algorithm("ppo"), (3, 4))
+    (program,) = requested.unfinished(tmp_path)
+    with program.opened():
+        pass
+    listed = json.loads((program.path / "program.json").read_text())
+    (experiment,) = listed["experiments"]
+    assert not experiment.keys() & {"observe_phase", "action_noise"}
+    (stored,) = requested.stored(tmp_path)
+    assert stored.runs == program.runs
+
+
+GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
+SMALL = (
+    *("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100"),
+    *("--num-envs", "4", "--minibatch-size", "50", "--seeds", "3", "--gamma", "0.99"),
+)
+
+
+def trained_for(seconds, num_members):
+    """What is stored of how a program was trained, for so many seconds a member."""
+    return Training(
+        iterations=3,
+        env_steps=300 * num_members,
+        compile_seconds=1.0,
+        train_seconds=seconds * num_members,
+        evaluation_seconds=None,
+        device="1 x cpu",
+        device_count=1,
+        versions={},
+    )
+
+
+def train(folder, shard=None, *arguments, grid=GRID):
+    """Write the files of a trained sweep, with metrics that tell members apart."""
+    words = [*SMALL, "--grid", *grid, *arguments]
+    requested = options_.read(SweepOptions, words, "x")[1]
+    runs = requested.part(*parse_shard(shard or "1/1"))
+    folder.mkdir(parents=True, exist_ok=True)
+    requested.write(folder)
+    for program in requested.unfinished(folder, runs):
+        write(program)
+    return requested
+
+
+def write(program):
+    with program.opened():
+        write_metrics(program)
+        program.finish(trained_for(0.5, len(program.runs)))
+
+
+def write_metrics(program):
+    writer = TableWriter(program.path / "metrics.csv", program.labels)
+    steps = np.array([100.0, 200.0, 300.0])
+    agents = [run.algorithm.agent for run in program.runs]
+    value = [200.0 * x.alpha + 20 * x.discriminator_updates for x in agents]
+    value = (np.array(value) + program.seeds)[:, None] + steps
+    zero = np.zeros_like(value)
+    writer.write(
+        {
+            "env_steps": zero + steps,
+            "episode_return": np.where(value % 100 == 61, np.nan, value),
+            "episode_length": zero + 7.0,
+            "skipped_updates": np.where(value == 342.0, 1.0, 0.0),
+            "faulty_steps": zero,
+        }
+    )
+    writer.close()
+
+
+TABLES = ("results.csv", "curves.npz", "sweep.png", "hyperparameters.png")
+
+
+def continued(folder, *arguments):
+    return sweep.main(["--resume", "--out", str(folder), *arguments])
+
+
+def refused(capsys, folder, *arguments):
+    """Return the one line with which a sweep is not continued."""
+    assert continued(folder, *arguments) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+@pytest.mark.parametrize("count", [5, 12])
+def test_tables_of_shards_are_those_of_the_whole_sweep(
+    count, tmp_path, capsys, monkeypatch
+):
+    """Five shards of twelve members divide points and programs."""
+    if count != 5:  # The pictures, most of the time, are rendered once.
+        monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.touch())
+    whole, shared, apart = (tmp_path / x for x in ("whole", "shared", "apart"))
+    train(whole)
+    assert continued(whole) == 0
+    expected = json.loads((whole / "summary.json").read_text())
+    assert expected["points"][1]["mean"] is None  # never ended
+    assert [point["diverged_seeds"] for point in expected["points"]] == [1, 0, 0, 1]
+    assert expected["env_steps_per_second"] == pytest.approx(600)
+    for number in range(1, count + 1):
+        train(shared, f"{number}/{count}")
+        train(tmp_path / f"{number}", f"{number}/{count}")
+        # Where each host has its own disk, the programs are copied into one folder.
+        shutil.copytree(tmp_path / f"{number}", apart, dirs_exist_ok=True)
+    capsys.readouterr()
+    for out in (shared, apart):
+        assert continued(out) == 0
+        assert "600 steps/s on 1 x cpu" in capsys.readouterr().out
+        for name in TABLES:
+            assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["points"] == expected["points"]
+
+
+def test_missing_and_damaged_and_doubled_runs(tmp_path, capsys, jobs_to_train):
+    requested = train(tmp_path / "a")
+    train(tmp_path / "b", "1/5")
+    # Equal results of a run are one.
+    shutil.copytree(tmp_path / "b", tmp_path / "a", dirs_exist_ok=True)
+    assert continued(tmp_path / "a") == 0
+    (other,) = requested.stored(tmp_path / "b")[:1]
+    path = tmp_path / "a" / "programs" / other.path.name / "metrics.csv"
+    kept = path.read_text()
+    path.write_text(kept.replace(",7,", ",8,"))
+    capsys.readouterr()
+    message = refused(capsys, tmp_path / "a")
+    assert "another program have different results for seed" in message
+    # Two seeds' rows are exchanged; a table has a column more than the others.
+    rows = kept.splitlines()
+    for changed, message in (
+        ([rows[0], rows[2], rows[1], *rows[3:]], "its rows are not in order"),
+        ([f"{rows[0]},mine", *(f"{x},1" for x in rows[1:])], "different results"),
+    ):
+        path.write_text("\n".join([*changed, ""]))
+        assert message in refused(capsys, tmp_path / "a")
+    shutil.rmtree(path.parent)
+    assert continued(tmp_path / "a") == 0 and not jobs_to_train
+
+
+def test_sweeps_of_other_points_and_seeds_become_one(tmp_path, capsys):
+    folders = [tmp_path / name for name in ("a", "b", "c")]
+    train(folders[0], grid=("alpha=0.1,1",))
+    train(folders[1], grid=("alpha=0.5",))
+    train(folders[2], None, "--first-seed", "3", grid=("alpha=0.5,0.1,1",))
+    out = folders[0]
+    for other in folders[1:]:
+        for program in (other / "programs").iterdir():
+            shutil.copytree(program, out / "programs" / program.name)
+    assert continued(out, "--grid", "alpha=0.5", "--seeds", "6") == 0
+    rows = [x.split(",")[:3] for x in (out / "results.csv").read_text().splitlines()]
+    assert rows[1:] == [
+        [str(point), str(seed), alpha]
+        for point, alpha in enumerate(("0.1", "1.0", "0.5"))
+        for seed in range(6)
+    ]
+
+
+def test_shards_with_different_experts_are_refused(tmp_path, capsys):
+    """On each host the expert's file may be another one."""
+    path, out = tmp_path / "expert.npz", tmp_path / "out"
+    more = ["--agent", "gail", "--expert", str(path)]
+    for steps in (5, 6):
+        np.savez(path, observation=np.ones((steps, 4)), action=np.ones((steps, 2)))
+        if steps == 5:
+            train(out, "1/2", *more)
+    message = refused(capsys, out, "--shard", "2/2")
+    assert "the trajectories of the expert were others" in message
+
+
+@pytest.fixture
+def jobs_to_train(monkeypatch):
+    """The programs that are trained in a test, where that is interrupted at once."""
+    jobs_to_train = []
+
+    def interrupted_at_once(env, needed, *_, **__):
+        if needed:
+            jobs_to_train.extend(needed)
+            raise Interrupted(signal.SIGTERM)
+        return []
+
+    monkeypatch.setattr(
+        training_of_commands.training, "train_programs", interrupted_at_once
+    )
+    return jobs_to_train
+
+
+STOPPED = 128 + signal.SIGTERM
+
+
+def test_a_sweep_grows_by_points_and_by_seeds(tmp_path, capsys, jobs_to_train):
+    requested = train(tmp_path)
+    assert continued(tmp_path) == 0
+    rows = (tmp_path / "results.csv").read_text().splitlines()
+    assert len(rows) == 1 + 12 and not jobs_to_train
+    # Only what is missing is trained.
+    more = ["--grid", "alpha=0.1,0.5", "--seeds", "4"]
+    assert continued(tmp_path, *more) == STOPPED
+    members = [(p, s) for j in jobs_to_train for p, s in zip(*j.labels.values())]
+    # alpha=0.1 has the sweep's own discriminator_updates, which are no point yet.
+    assert sorted(members) == [
+        *((point, 3) for point in range(4)),
+        *((point, seed) for point in (4, 5) for seed in range(4)),
+    ]
+    assert requested.algorithm.agent.discriminator_updates not in (1, 2)
+    for job in jobs_to_train:
+        write(job)
+    for arguments in (more, []):
+        assert continued(tmp_path, *arguments) == 0
+        rows = (tmp_path / "results.csv").read_text().splitlines()
+        assert len(rows) == 1 + 24
+    capsys.readouterr()
+    assert "seeds were [0, 1, 2, 3]" in refused(capsys, tmp_path, "--seeds", "3")
+
+
+def test_a_shard_continues(tmp_path, capsys, jobs_to_train):
+    requested = train(tmp_path, "1/2")
+    more = ["--env", "point_mass", "--grid", *GRID, "--out", str(tmp_path)]
+    same = [*SMALL, *more, "--shard", "1/2"]
+    assert sweep.main([*same, "--gamma", "0.9"]) == 2
+    assert "gamma was 0.99, is 0.9" in capsys.readouterr().err
+    # Nothing is left to do. With --resume the sweep's own settings are used.
+    resumed = ["--resume", "--out", str(tmp_path), "--shard", "1/2"]
+    for command in (same, resumed):
+        assert sweep.main(command) == 0
+        told = capsys.readouterr().out
+        assert "shard 1/2 is done" in told and "6 of 12 runs" in told
+    # An unfinished program is trained with the shard's members alone.
+    (begun,) = requested.trained(tmp_path)
+    (begun.path / "training.json").unlink()
+    for command in (same, resumed):
+        assert sweep.main(command) == STOPPED
+        assert jobs_to_train.pop() == begun and not jobs_to_train
+        # The command that is printed when it is interrupted.
+        how = f"gasil_jax.sweep --shard 1/2 --resume --out {tmp_path}"
+        assert how in capsys.readouterr().err
+    # With other settings than those of the first it is no part of the same sweep.
+    begin = [*more, "--shard", "2/2", "--seeds", "3"]
+    assert sweep.main(begin) == 2
+    assert "num_envs was 4" in capsys.readouterr().err
+    # A cluster that runs a job again may do so before the job has begun.
+    assert sweep.main([*begin, "--out", str(tmp_path / "other"), "--resume"]) == STOPPED
+    assert sum(len(job.runs) for job in jobs_to_train) == 6
+
+
+def test_a_shard_keeps_out_of_other_folders(tmp_path, capsys, jobs_to_train):
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "text.tex").touch()
+    words = [*SMALL, "--grid", *GRID, "--shard", "1/2"]
+    assert sweep.main([*words, "--out", str(tmp_path / "thesis")]) == 2
+    assert "is not empty" in capsys.readouterr().err
+    assert not jobs_to_train
+
+
+def test_two_processes_do_not_train_the_same_program(tmp_path, capsys):
+    begun = train(tmp_path).trained(tmp_path)[0]
+    (begun.path / "training.json").unlink()
+    with begun.opened():
+        assert continued(tmp_path) == 2
+    assert f"{begun.path}, which process" in capsys.readouterr().err
+
+
+def test_shards_need_no_file_of_points_once_one_has_begun(
+    tmp_path, capsys, jobs_to_train
+):
+    path, out = tmp_path / "points.json", tmp_path / "out"
+    path.write_text('[{"alpha": 0.1}, {"num_epochs": 3}]')
+    more = [*SMALL, "--out", str(out), "--points-file", str(path), "--shard"]
+    members = lambda: jobs_to_train.pop().labels
+    assert sweep.main([*more, "1/2"]) == STOPPED
+    assert members() == {"point": (0, 0, 0), "seed": (0, 1, 2)}
+    path.unlink()
+    assert sweep.main([*more, "2/2"]) == 2
+    assert "points.json, which can't be read" in capsys.readouterr().err
+    assert continued(out, "--shard", "2/2") == STOPPED
+    assert members() == {"point": (1, 1, 1), "seed": (0, 1, 2)}
+
+
+def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):
+    launched = []
+    monkeypatch.setattr(
+        ray_launcher, "run_on_ray", lambda program, jobs, devices: launched.append(jobs)
+    )
+    out = tmp_path / "out"
+    train(out)
+    more = [*SMALL, "--grid", *GRID, "--launcher", "ray", "--shards", "2"]
+    assert sweep.main([*more, "--out", str(out)]) == 2
+    assert "what is in it with --resume" in capsys.readouterr().err
+    assert not launched
+    resumed = ["--resume", "--launcher", "ray", "--shards", "2", "--out", str(out)]
+    for command in ([*more, "--resume", "--out", str(out)], resumed):
+        assert sweep.main(command) == 0
+        jobs = launched.pop()
+        assert list(jobs) == ["shard 1/2", "shard 2/2"]
+        for name, arguments in jobs.items():
+            assert arguments.count("--resume") == 1
+            assert sweep.main(arguments) == 0
+            assert f"{name} is done" in capsys.readouterr().out
+    # A job continues when it is run again, even if the launch was the first.
+    (tmp_path / "new").mkdir()
+    assert sweep.main([*more, "--out", str(tmp_path / "new")]) == 2
+    assert "12 of 12 runs are missing" in capsys.readouterr().err
+    assert all("--resume" in arguments for arguments in launched[-1].values())
+
+
+def test_a_launcher_that_is_not_installed_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(InputError, match=r"gasil_jax\[ray\]"):
+        ray_launcher.run_on_ray("x", {}, None)

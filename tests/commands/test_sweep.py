@@ -1,0 +1,333 @@
+"""Sweeps run, grow or are refused; a point's results are those of a single run."""
+
+import csv
+import json
+import os
+import re
+import signal
+
+import jax
+import numpy as np
+import pytest
+from small_training import FLAGS
+
+from gasil_jax import evaluate, sweep
+from gasil_jax.cli import options as options_
+from gasil_jax.cli.options import SweepOptions
+from gasil_jax.errors import InputError
+from gasil_jax.host import points, saved, training
+from gasil_jax.host.members import Members
+from gasil_jax.host.points import PAPER_RANGES
+
+pytestmark = pytest.mark.xdist_group("commands")
+
+
+def points_of(*arguments):
+    words = ["--env", "point_mass", *arguments]
+    return list(options_.read(SweepOptions, words, "x")[1].points)
+
+
+def test_a_grid_is_every_combination():
+    assert points_of("--grid", "buffer_steps=1e3") == [{"buffer_steps": 1000}]
+    assert points_of("--grid", "alpha=0.1,1", "discriminator-updates=1,5,1") == [
+        {"alpha": 0.1, "discriminator_updates": 1},
+        {"alpha": 0.1, "discriminator_updates": 5},
+        {"alpha": 1.0, "discriminator_updates": 1},
+        {"alpha": 1.0, "discriminator_updates": 5},
+    ]
+
+
+def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
+    names = "learning_rate learning_rate_decay gamma gae_lambda clip_epsilon alpha"
+    many = [f"{name}=0.1,0.2,0.3,0.4,0.5,0.6" for name in names.split()]
+    # Combinations are drawn, not listed: there may be too many.
+    with monkeypatch.context() as patch:
+        patch.setattr(points, "itertools", None)
+        drawn = points_of("--random", "20", "--grid", *many)
+    assert len({tuple(point.items()) for point in drawn}) == 20
+    drawn = points_of("--random", "16")
+    assert len({tuple(point.items()) for point in drawn}) == 16
+    for point in drawn:
+        assert set(point) == set(PAPER_RANGES)
+        assert all(value in PAPER_RANGES[name] for name, value in point.items())
+    # So a sweep can grow by more of them.
+    assert points_of("--random", "4") == drawn[:4]
+
+
+def test_points_from_a_file(tmp_path):
+    path = tmp_path / "points.json"
+    path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
+    own = options_.read(SweepOptions, ["--env", "point_mass", "--random", "1"], "x")[1]
+    default = own.algorithm.settings
+    # A point that does not name a value has the sweep's own.
+    assert points_of("--points-file", str(path)) == [
+        {"alpha": 1.0, "buffer_steps": 500, "learning_rate": default["learning_rate"]},
+        {
+            "alpha": default["alpha"],
+            "buffer_steps": default["buffer_steps"],
+            "learning_rate": 1e-4,
+        },
+    ]
+    for text, message in (
+        ("[", "can't be read"),
+        ("[" * 100_000, "can't be read"),
+        (f'[{{"alpha": 1{"0" * 400}}}]', "it must be 0 or more and finite"),
+        ("{}", "a list of points"),
+        ("[3]", "each point must be an object"),
+        ('[{"alhpa": 1}]', "did you mean 'alpha'"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            points_of("--points-file", str(path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ("--grid alhpa=1", "did you mean 'alpha'"),
+        ("--agent ppo --grid alpha=1", "gail, not of ppo. What can vary: batch_steps"),
+        (
+            "--agent ppo+sil --grid buffer_steps=9",
+            "buffer_steps is a setting of ppo+bc, ppo+bc+novelty, gasil, "
+            "ppo+gasil, ppo+gasil-adaptive, not of ppo+sil",
+        ),
+        (
+            "--grid decomposition_learning_rate=1e-3,1e-4",
+            "decomposition_learning_rate has no effect: decompose_rewards is off",
+        ),
+        ("--grid num_envs=1,2", "'num_envs' can't vary: it must be one of batch_steps"),
+        ("--grid foo=1", "'foo' can't vary: it must be one of batch_steps"),
+        ("--grid alpha=1,big", "it must be numbers, like alpha=0.1,0.2"),
+        ("--grid buffer_steps=1.5", "whole numbers, like buffer_steps=10,20"),
+        ("--grid alpha=0.1,-1", "alpha is -1.0"),
+        ("--grid minibatch_size=64,60", "minibatch_size is 60"),
+        ("--grid alpha=0.02,0.1 alpha=0.2", "grid has alpha twice"),
+        ("--grid alpha=1 --points-file x", "points_file can't be combined with grid"),
+        ("--agent ppo --random 5", "random is 5: it must be from 1 to 4, of 4 points"),
+        ("--random 0", "random is 0"),
+        ("--random 3 --grid alpha=0.1,0.2,0.1", "it must be from 1 to 2, of 2 points"),
+        ("", "grid is empty"),
+        ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
+        ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
+        ("--grid alpha=1 --shard 1/2 --out x", "1 runs (points x seeds) make 1"),
+        ("--grid alpha=1 --shard 1/1", "shard needs --out"),
+        ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
+        ("--grid alpha=1 --launcher rya", "launcher is 'rya': it must be one of"),
+        ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
+        ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
+        ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
+    assert sweep.main(["--env", "point_mass", *arguments.split()]) == 2
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error
+
+
+def table(folder):
+    with (folder / "results.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_sweep_from_end_to_end(swept):
+    out, told, printed = swept
+    assert "x 8 runs" in told
+    best, worst, speed, following = printed.splitlines()
+    value = r"-?\d+\.\d"
+    sentence = (
+        rf"point (0|1), learning_rate=0.0003, discriminator_updates=(3|1): "
+        rf"mean {value}, interquartile mean {value}, worst seed {value}$"
+    )
+    assert re.match(f"best mean: {sentence}", best), best
+    assert re.match(f"best worst seed: {sentence}", worst), worst
+    assert re.match(r"[\d,]+ steps/s on .*, in out$", speed), speed
+    commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out"
+    assert following == f"next: {commands}"
+
+    rows = table(out)
+    assert [(row["point"], row["seed"]) for row in rows] == [
+        (str(point), seed) for point in range(4) for seed in "56"
+    ]
+    assert [row["discriminator_updates"] for row in rows[::2]] == ["3", "1", "3", "1"]
+    # The points beyond float32 did not harm the others.
+    diverged = [int(row["skipped_updates"]) > 0 for row in rows]
+    assert diverged == [False] * 4 + [True] * 4
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["best_by_mean"] in (0, 1)
+    assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
+    assert summary["device_count"] == jax.local_device_count()
+    for name in ("learning_curve.png", "sweep.png", "hyperparameters.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+    curves = np.load(out / "curves.npz")
+    assert {"env_steps", "approx_kl", "bonus"} < set(curves)
+    assert all(curves[name].shape == (4, 2, 4) for name in curves)
+
+
+def test_points_equal_single_runs(trained, swept):
+    single, curves = (np.load(x.folder / "curves.npz") for x in (trained, swept))
+    for name in curves:
+        expected = single[name][0, :2]
+        np.testing.assert_allclose(curves[name][0], expected, rtol=1e-3, atol=1e-3)
+    _, algorithm, seeds, states = saved.load(swept.folder, point=0)
+    assert seeds == [5, 6] and algorithm.agent.discriminator_updates == 3
+    _, _, _, expected = saved.load(trained.folder)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b[:2], rtol=1e-3, atol=1e-3),
+        states.actor_critic.params,
+        expected.actor_critic.params,
+    )
+
+
+def test_the_commands_take_a_point_or_the_best_one_and_say_so(swept, capsys):
+    folder = str(swept.folder)
+    best = json.loads((swept.folder / "summary.json").read_text())["best_by_mean"]
+    assert evaluate.main([folder, "--episodes", "1"]) == 0
+    told = capsys.readouterr()
+    assert f"point {best}, the best by mean (learning_rate=0.0003" in told.err
+    assert evaluate.main([folder, "--episodes", "1", "--point", str(best)]) == 0
+    assert capsys.readouterr().out == told.out
+    for arguments, message in (
+        (["--point", "4"], f"point is 4: {folder} has points 0 to 3"),
+        (["--point", "1", "--checkpoint", "best"], "it must be 'last'"),
+    ):
+        assert evaluate.main([folder, *arguments]) == 2
+        assert message in capsys.readouterr().err
+
+
+@pytest.fixture
+def planned(monkeypatch):
+    """What sweeps would train in a test, where they end before it."""
+    every = []
+
+    def prepare(requested, programs, *_, **__):
+        every.append((requested, programs))
+        raise InputError("enough")
+
+    monkeypatch.setattr(training, "prepare", prepare)
+    return every
+
+
+def begun(folder, *arguments):
+    """Write what a sweep has written when it is killed at once."""
+    folder.mkdir()
+    words = [*FLAGS, *arguments]
+    options_.read(SweepOptions, words, "x")[1].write(folder)
+    return ["--resume", "--out", str(folder)]
+
+
+OWN_GAMMA = {"gamma": 0.98}  # of the tuned preset
+
+
+@pytest.mark.parametrize(
+    ("before", "more", "expected"),
+    [
+        (["--grid", "alpha=0.5"], [], [{"alpha": 0.5}]),
+        (
+            ["--grid", "alpha=0.5"],
+            ["--grid", "alpha=0.1"],
+            [{"alpha": 0.5}, {"alpha": 0.1}],
+        ),
+        # A grid that lacks an axis has the sweep's own value; equal runs are one.
+        (
+            ["--grid", "alpha=0.5", "gamma=0.9,0.98"],
+            ["--grid", "alpha=0.5,2"],
+            [
+                {"alpha": 0.5, "gamma": 0.9},
+                {"alpha": 0.5, **OWN_GAMMA},
+                {"alpha": 2.0, **OWN_GAMMA},
+            ],
+        ),
+        (
+            ["--grid", "alpha=0.5"],
+            ["--grid", "gamma=0.9,0.98", "alpha=0.5"],
+            [{"alpha": 0.5, **OWN_GAMMA}, {"alpha": 0.5, "gamma": 0.9}],
+        ),
+        (
+            ["--points-file", "a.json"],
+            ["--grid", "alpha=0.5"],
+            [{"alpha": 0.7}, {"alpha": 0.5}],
+        ),
+    ],
+)
+def test_a_sweep_continues_and_grows(
+    before, more, expected, tmp_path, monkeypatch, planned
+):
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "a.json"
+    file.write_text('[{"alpha": 0.7}]')
+    again = begun(tmp_path / "s", *before)
+    # Its config.json has the points as well.
+    file.unlink()
+    assert sweep.main([*again, *more]) == 2
+    ((requested, programs),) = planned
+    assert list(requested.points) == expected
+    assert sum(len(each.runs) for each in programs) == len(expected)
+
+
+def test_random_points_grow_by_more(tmp_path, planned):
+    again = begun(tmp_path / "s", "--random", "2", "--seeds", "3")
+    assert sweep.main([*again, "--random", "5"]) == 2
+    ((requested, programs),) = planned
+    assert list(requested.points) == points_of("--random", "5")
+    assert sum(len(each.runs) for each in programs) == 15
+
+
+def test_other_settings_and_a_folder_of_something_else_are_refused(
+    tmp_path, capsys, planned
+):
+    again = begun(tmp_path / "s", "--grid", "alpha=1")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "text.tex").touch()
+    grid = [*FLAGS, "--grid", "alpha=1"]
+    for words, message in (
+        ([*again, "--gamma", "0.9"], "gamma was 0.98, is 0.9"),
+        ([*again, "--reward-delay", "3"], "reward_delay was 1, is 3"),
+        ([*grid, "--out", str(tmp_path / "s")], "is not empty"),
+        ([*grid, "--out", str(tmp_path / "thesis")], "is not empty"),
+        ([*again, "--points-file", "no.json"], "no.json, which can't be read"),
+    ):
+        assert sweep.main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+    assert not planned
+    # A sweep without a name does not look into the folder that it starts in.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path / "s")
+        assert sweep.main(grid) == 2
+    assert len(planned) == 1
+
+
+def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
+    long = (*FLAGS, "--agent", "ppo", "--total-steps", str(60 * 128), "--seeds", "2")
+    grid = ("--grid", "gamma=0.9,0.99", "num_epochs=1,2")
+    whole, out = tmp_path / "whole", tmp_path / "interrupted"
+    assert sweep.main([*long, *grid, "--out", str(whole)]) == 0
+    train = Members.train
+
+    def interrupt(program, at_least, arguments):
+        """Send SIGTERM in a program's chunk that ends there or later."""
+
+        def interrupted(self, advance, states, first, count):
+            number = self.config.num_epochs - 1
+            if number == program and first + count >= at_least:
+                os.kill(os.getpid(), signal.SIGTERM)
+            return train(self, advance, states, first, count)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(Members, "train", interrupted)
+            assert sweep.main(arguments) == 128 + signal.SIGTERM
+        assert f"gasil_jax.sweep --resume --out {out}" in capsys.readouterr().err
+        assert not (out / "results.csv").exists()
+
+    # In the last chunk of a program, and so before the next one has begun.
+    interrupt(0, 60, [*long, *grid, "--out", str(out)])
+    (first,) = (out / "programs").iterdir()
+    # In the second program, after some chunks.
+    interrupt(1, 30, ["--resume", "--out", str(out)])
+    seconds = (first / "training.json").read_bytes()
+    assert sweep.main(["--resume", "--out", str(out)]) == 0
+    for name in ("results.csv", "policy.npz"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
+    # The first program was finished, and is left as it was.
+    assert (first / "training.json").read_bytes() == seconds
