@@ -21,11 +21,11 @@ from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
+from gasil_jax.host import programs
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.evaluations import evaluation_key
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
-from gasil_jax.host.evaluations import evaluation_key
-from gasil_jax.host import programs
 from gasil_jax.host.runs import Run
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}

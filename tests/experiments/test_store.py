@@ -22,9 +22,9 @@ from experiments.store import (
 )
 from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize, npz
 from gasil_jax.errors import InputError
+from gasil_jax.host import programs
 from gasil_jax.host.descriptions import find_agent
 from gasil_jax.host.environments import Settings
-from gasil_jax.host import programs
 from gasil_jax.host.runs import NEWER, STORED_NAMES, Run
 
 
