@@ -21,12 +21,12 @@ from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
+from gasil_jax.host import programs
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.evaluations import evaluation_key
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
-from gasil_jax.host.periodic_evaluation import evaluation_key
-from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.runs import Run
+from gasil_jax.host.runs import Run
 
 SMALL = {"batch_steps": 256, "num_envs": 4, "num_epochs": 1, "hidden_sizes": (8,)}
 SMALL |= {"total_steps": 12 * 256}
@@ -169,9 +169,8 @@ def test_training_is_continued_when_other_runs_are_missing(
     resumed = dataclasses.replace(setup, resume=True)
     requested = []
     monkeypatch.setattr(engine, "train", lambda x, _: requested.append(x) or {})
-    # Of the two that it trains one was stored, and a third is requested.
     another = dataclasses.replace(RUNS[0], seed=99)
-    missing = [another, RUNS[1]]
+    missing = [another, *RUNS]
     with pytest.raises(InputError, match=f"in {program.path.name}: continue it"):
         engine.train_missing(missing, Store(tmp_path), setup)
     engine.train_missing(missing, Store(tmp_path), resumed)

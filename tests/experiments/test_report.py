@@ -25,7 +25,7 @@ from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
-from gasil_jax.figures import plotting
+from gasil_jax.host import plotting
 from gasil_jax.statistics import interquartile_mean
 
 STORE = Store(RESULTS / "runs")

@@ -22,10 +22,10 @@ from experiments.store import (
 )
 from gasil_jax import PPOGASIL, Algorithm, Config, Decompose, Normalize, npz
 from gasil_jax.errors import InputError
+from gasil_jax.host import programs
 from gasil_jax.host.descriptions import find_agent
 from gasil_jax.host.environments import Settings
-from gasil_jax.sweeps import programs
-from gasil_jax.sweeps.runs import NEWER, STORED_NAMES, Run
+from gasil_jax.host.runs import NEWER, STORED_NAMES, Run
 
 
 def run(seed=0, env="hopper", **changes):
@@ -101,11 +101,6 @@ def test_a_newer_setting_is_in_the_key_unless_it_is_what_stored_runs_had():
         assert every[name] == value and f'"{name}"' not in one.experiment
     limited = dataclasses.replace(run(), settings=Settings(max_episode_steps=50))
     assert '"max_episode_steps": 50' in limited.experiment
-
-
-def test_a_schedule_without_points_has_no_place():
-    with pytest.raises(InputError, match="alpha_schedule is a function"):
-        _ = run(alpha_schedule=lambda steps: 1.0).experiment
 
 
 def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
