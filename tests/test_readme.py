@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax import evaluate, merge, plot, render, run, sweep
-from gasil_jax import export_minari as export
-from gasil_jax.host import command_line, metrics_files, policy_file, run_options
-from gasil_jax.sweeps import saved_states, shards
+from gasil_jax.cli import evaluate, options, parsing, plot, render, run, sweep
+from gasil_jax.host import environments, policy_file, saved
+from gasil_jax.host.sweep import parse_shard
 
 README = pathlib.Path(__file__).parent.parent / "README.md"
 TEXT = README.read_text()
@@ -25,7 +24,12 @@ DOCUMENTS = (README, *sorted(DOCS.glob("*.md")))
 
 PROGRAMS = {
     f"gasil_jax.{module.__name__.split('.')[-1]}": module
-    for module in (run, sweep, merge, evaluate, plot, render, export)
+    for module in (run, sweep, evaluate, plot, render)
+}
+#: The options of those that train.
+TRAINING = {
+    "gasil_jax.run": options.Options,
+    "gasil_jax.sweep": options.SweepOptions,
 }
 SMALL = (
     *("--total-steps", "256", "--batch-steps", "128", "--num-envs", "2"),
@@ -42,15 +46,15 @@ TOY = {
     "--evaluate-every": "128",
 }
 #: In a command that needs a run of a locomotion task.
-LOCOMOTION = ("--gymnasium", ".html")
+LOCOMOTION = "--gymnasium"
 #: How commands begin that are not run here, and why.
 NOT_RUN = {
     "python -m pip install": "it changes the environment; .ci/run does it",
     "python -m pytest": "it runs this",
     "python -m experiments benchmark": "it measures for minutes",
     "python -m experiments profile": "it measures for minutes",
-    "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/sweeps/"
-    "test_shards.py and tests/sweeps/test_ray.py train shards",
+    "python -m gasil_jax.sweep --env hopper --seeds 10 --random": "tests/commands/"
+    "test_shards.py and tests/commands/test_ray.py train shards",
     "python -m gasil_jax.run --env my_tasks:Line": "a test below trains it",
     "python -m gasil_jax.run --env gymnax:Breakout-MinAtar --agent my_tasks": "a test "
     "below trains it",
@@ -106,11 +110,10 @@ def my_tasks(tmp_path_factory):
 @pytest.mark.parametrize("line", OURS)
 def test_a_command_is_understood(line, my_tasks):
     _, _, program, *arguments = shlex.split(line)
-    kind = PROGRAMS[program].Options
-    if issubclass(kind, run_options.Options):
-        run_options.parse(kind, arguments, program)
+    if program in TRAINING:
+        options.read(TRAINING[program], arguments, program)
     else:
-        command_line.parse(kind, arguments, program)
+        parsing.read(PROGRAMS[program].Options, arguments, program)
 
 
 def test_other_commands_are_named_with_a_reason():
@@ -157,7 +160,7 @@ def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
     started = calls_of(BASH[0], tmp_path)
     assert all(call[:2] == ["-m", "gasil_jax.run"] for call in started)
     agents = [
-        run_options.parse(run_options.Options, call[2:], "gasil_jax.run").agent
+        options.read(options.Options, call[2:], "gasil_jax.run")[0].agent
         for call in started
     ]
     assert sorted(agents) == ["ppo", "ppo+bc", "ppo+gasil", "ppo+sil"]
@@ -165,9 +168,11 @@ def test_the_script_that_shares_a_gpu_starts_every_agent(tmp_path):
 
 def shard_of(call):
     assert call[:2] == ["-m", "gasil_jax.sweep"]
-    arguments = call[2:]
-    options = run_options.parse(sweep.Options, arguments, "gasil_jax.sweep")
-    return *shards.parse(options.shard), str(options.out), options.resume
+    words = call[2:]
+    at = words.index("--out") + 1
+    out, words[at] = words[at], "nowhere"
+    given, _ = options.read(options.SweepOptions, words, "gasil_jax.sweep")
+    return *parse_shard(given.shard), out, given.resume
 
 
 def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
@@ -198,7 +203,7 @@ def test_the_scripts_of_schedulers_start_every_shard_once(tmp_path):
 def as_toy(line, finished, locomotion, folder):
     """Return a command's program and arguments, made small, with output in `folder`."""
     _, _, program, *arguments = shlex.split(line)
-    needs_locomotion = any(mark in line for mark in LOCOMOTION)
+    needs_locomotion = LOCOMOTION in line
     for i, (option, value) in enumerate(zip(["", *arguments], arguments)):
         if option in TOY:
             arguments[i] = TOY[option]
@@ -223,16 +228,13 @@ def parts_of(line):
     return {program, *options, *read, *written}
 
 
-@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
-def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_tasks):
+def test_the_commands_run(tmp_path, capsys, untrained_hopper, my_tasks):
     """On the point mass and for some hundred steps; each kind of command once.
 
     The settings of the other runs are understood, by the test above, and are trained
     with in the tests of agents.
     """
-    pytest.importorskip("minari")
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
     lines = [line for line in OURS if not line.startswith(tuple(NOT_RUN))]
     # The first command's run is what the others take.
     is_run = lambda line: line.startswith("python -m gasil_jax.run")
@@ -257,9 +259,7 @@ def test_the_commands_run(tmp_path, monkeypatch, capsys, untrained_hopper, my_ta
         for option, value in itertools.pairwise(shlex.split(line)):
             if option == "--out":
                 assert (folder / value).stat().st_size > 0, line
-    assert {program for parts in ran for program in parts} >= PROGRAMS.keys() - {
-        "gasil_jax.merge"
-    }
+    assert {program for parts in ran for program in parts} >= PROGRAMS.keys()
 
 
 def test_options_in_the_table_exist():
@@ -267,8 +267,8 @@ def test_options_in_the_table_exist():
     rows = re.findall(r"^\| (`--.*?) \|", table, re.MULTILINE)
     fields = [field for row in rows for field in re.findall(r"--[a-z-]+", row)]
     assert len(fields) > 18
-    options = run_options.parse(run_options.Options, ["--env", "hopper"], "x")
-    names = {*vars(options), *vars(options.settings)}
+    given, requested = options.read(options.Options, ["--env", "hopper"], "x")
+    names = {*vars(given), *vars(requested.settings)}
     for agent in gasil_jax.agents.AGENTS:
         models = {"decompose_rewards": True, "normalize_rewards": True}
         names |= gasil_jax.algorithm(agent, **models).settings.keys()
@@ -345,7 +345,8 @@ def test_the_python_of_the_documentation_runs(finished_hopper):
     assert result.metrics["episode_return"].shape == (10, 2)
     # The untrained policy and the last one.
     assert result.evaluations["mean"].shape == (10, 2)
-    assert pathlib.Path("runs/walker2d/checkpoints").is_dir()
+    (folder,) = pathlib.Path("runs/walker2d/programs").iterdir()
+    assert (folder / "checkpoints").is_dir()
 
 
 def test_the_search_with_optuna_runs():
@@ -382,7 +383,7 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     both = ["--env", "my_tasks:Line", "--agent", "my_tasks:Scaled", *small.split()]
     arguments = ["--reward-factor", "0.3", "--first-seed", "5", "--out", str(out)]
     assert run.main([*both, *arguments]) == 0
-    metrics = metrics_files.read_metrics(out / "metrics.csv", {"seed": [5]})
+    metrics = np.load(out / "curves.npz")
     assert (metrics["scaled_reward"] < 0).all()
     # At most 20 steps of at most 0.1.
     assert (metrics["episode_length"] <= 20).all()
@@ -398,11 +399,8 @@ def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
     env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
     out = tmp_path / "run"
     assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
-    metrics = metrics_files.read_metrics(out / "metrics.csv", {"seed": [0]})
-    assert (metrics["faulty_steps"] == 0).all()
-    page = tmp_path / "walk.html"
-    assert render.main([str(out), "--steps", "2", "--out", str(page)]) == 0
-    assert page.stat().st_size > 1000
+    assert (np.load(out / "curves.npz")["faulty_steps"] == 0).all()
+    assert environments.can_be_drawn(saved.load(out)[0])
 
 
 def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
@@ -414,7 +412,7 @@ def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
     assert "policy.npz is not written: the policy's network is a F" in (
         capsys.readouterr().err
     )
-    *_, states = saved_states.load(out)
+    *_, states = saved.load(out)
     params = states.actor_critic.policy.params
     assert params["params"]["own"]["Conv_0"]["kernel"].shape == (2, 3, 3, 4, 16)
     assert evaluate.main([str(out), "--episodes", "2"]) == 0
