@@ -92,6 +92,17 @@ def total(x: jax.Array, axis: int = 0) -> jax.Array:
     return add(jax.lax.index_in_dim(x, i, axis, False) for i in range(x.shape[axis]))
 
 
+def constant_times(matrix: np.ndarray, x: jax.Array) -> jax.Array:
+    """Return a constant matrix (n, m) times (m, ..., B), without its zeros."""
+    rows = [
+        add([float(row[i]) * x[i] for i in np.flatnonzero(row)])
+        if row.any()
+        else jnp.zeros_like(x[0])
+        for row in matrix
+    ]
+    return stacked(rows) if rows else x[:0]
+
+
 def fold(function: Any, rows: jax.Array) -> jax.Array:
     """Combine rows by one of jax.numpy's ufuncs: (N, ..., B) -> (..., B).
 

@@ -1,8 +1,9 @@
-"""Contacts of spheres and capsules with each other and with planes that do not move.
+"""Contacts of geoms with planes that do not move, and of spheres and capsules.
 
 A sphere is a capsule of length 0, and each end of a capsule meets a plane as a sphere.
-The formulas are MJX's, and every array has the batch as its last axis. Two things
-differ from MJX:
+Boxes, cylinders and ellipsoids meet planes in points, and a box a sphere. The formulas
+are C MuJoCo's, and every array has the batch as its last axis. Two things differ from
+MJX:
 
 - The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
   C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
@@ -23,13 +24,21 @@ import mujoco
 import numpy as np
 
 from gasil_envs.physics import tree
-from gasil_envs.physics.batching import materialize, stacked, take, total
-
-_PLANE, _SPHERE, _CAPSULE = (
-    int(mujoco.mjtGeom.mjGEOM_PLANE),
-    int(mujoco.mjtGeom.mjGEOM_SPHERE),
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE),
+from gasil_envs.physics.batching import (
+    add,
+    constant_times,
+    materialize,
+    stacked,
+    take,
+    total,
 )
+
+_PLANE, _SPHERE, _CAPSULE, _ELLIPSOID, _CYLINDER, _BOX = (
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
+    for name in ("PLANE", "SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER", "BOX")
+)
+#: How many points of a geom can touch a plane.
+_POINTS = {_ELLIPSOID: 1, _CYLINDER: 4, _BOX: 8}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -37,23 +46,28 @@ class Pairs:
     """The pairs of geoms of one group of contacts.
 
     Attributes:
-      on_plane: (2, n), the plane's and the other geom.
+      on_plane: (2, n), planes and spheres or capsules.
       end: (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
-      between: (2, m), the geoms of contacts without a plane; these follow the others.
+      points: (2, k), planes and other geoms; all points of a pair follow each other.
+      between: (2, m), spheres and capsules.
+      boxes: (2, l), spheres and boxes. Contacts are in the order of these four.
       num_tangents: number of tangents of a contact.
       motion_normal: (3,), the normal of the plane that all motion is in, or None.
     """
 
     on_plane: np.ndarray
     end: np.ndarray
+    points: np.ndarray
     between: np.ndarray
+    boxes: np.ndarray
     num_tangents: int
     motion_normal: np.ndarray | None
 
     @property
     def geoms(self) -> np.ndarray:
         """The two geoms of each contact, (C, 2)."""
-        return np.concatenate([self.on_plane, self.between], axis=1).T
+        every = [self.on_plane, self.points, self.between, self.boxes]
+        return np.concatenate(every, axis=1).T
 
 
 class Touch(NamedTuple):
@@ -76,28 +90,63 @@ def pairs(
     num_tangents: int,
     *,
     motion_normal: np.ndarray | None,
-) -> Pairs:
-    """Divide contacts, by their geoms (C, 2), into those with a plane and others."""
-    plane = model.geom_type[geoms[:, 0]] == _PLANE
-    on_plane, between = geoms[plane], geoms[~plane]
-    # The two ends of a capsule follow each other.
-    again = np.zeros(len(on_plane), bool)
-    again[1:] = (on_plane[1:] == on_plane[:-1]).all(axis=1)
-    capsule = model.geom_type[on_plane[:, 1]] == _CAPSULE
-    end = np.where(capsule, np.where(again, -1.0, 1.0), 0.0)
-    return Pairs(on_plane.T, end, between.T, num_tangents, motion_normal)
+) -> tuple[Pairs, np.ndarray]:
+    """Return the contacts of pairs (P, 2), and which pair each contact is of, (C,)."""
+    first, second = model.geom_type[geoms].T
+    plane, rounded = first == _PLANE, second <= _CAPSULE
+    count = np.array([_POINTS.get(kind, 0) for kind in second], int)
+    number = np.arange(len(geoms))
+    ends = np.where(second == _CAPSULE, 2, 1) * (plane & rounded)
+    on_plane = np.repeat(number, ends)
+    is_second = np.diff(on_plane, prepend=-1) == 0
+    end = np.where(second[on_plane] == _CAPSULE, np.where(is_second, -1.0, 1.0), 0.0)
+    points = np.repeat(number, count * (plane & ~rounded))
+    between, boxes = number[~plane & rounded], number[~plane & ~rounded]
+    index = np.concatenate([on_plane, points, between, boxes])
+    every = Pairs(
+        on_plane=geoms[on_plane].T,
+        end=end,
+        points=geoms[points].T,
+        between=geoms[between].T,
+        boxes=geoms[boxes].T,
+        num_tangents=num_tangents,
+        motion_normal=motion_normal,
+    )
+    return every, index
 
 
-def unsupported(model: mujoco.MjModel) -> str | None:
-    """Return why `touch` does not describe this model, or None if it does."""
-    collides = (model.geom_contype | model.geom_conaffinity).astype(bool)
-    kinds = model.geom_type[collides]
-    if not np.isin(kinds, [_PLANE, _SPHERE, _CAPSULE]).all():
-        return "it has contacts of geoms other than planes, spheres and capsules"
-    planes = collides & (model.geom_type == _PLANE)
-    if model.body_weldid[model.geom_bodyid[planes]].any():
+def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
+    """Return why `touch` does not describe these pairs (P, 2), or None if it does."""
+    kinds = model.geom_type[geoms]
+    on_plane = kinds[:, 0] == _PLANE
+    round_geoms = [_SPHERE, _CAPSULE]
+    for (first, second), plane in zip(kinds, on_plane, strict=True):
+        allowed = [*round_geoms, *_POINTS] if plane else round_geoms
+        allowed = [*allowed, _BOX] if first == _SPHERE else allowed
+        if second not in allowed or first > _CAPSULE:
+            names = " and ".join(
+                mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
+                for kind in (first, second)
+            )
+            return f"it has contacts of {names}"
+    if model.body_weldid[model.geom_bodyid[geoms[on_plane, 0]]].any():
         return "it has planes that move"
+    if stay_parallel(model, geoms[(kinds == _CAPSULE).all(axis=1)]):
+        return "it has contacts of capsules that stay parallel"
     return None
+
+
+def stay_parallel(model: mujoco.MjModel, geoms: np.ndarray) -> bool:
+    """Whether two capsules are parallel in any state: they touch in two points then."""
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    parallel = np.ones(len(geoms), bool)
+    for _ in range(2 if len(geoms) else 0):
+        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
+        mujoco.mj_kinematics(model, data)
+        axes = data.geom_xmat.reshape(-1, 3, 3)[geoms, :, 2]
+        sine = np.linalg.norm(np.cross(axes[:, 0], axes[:, 1]), axis=1)
+        parallel &= sine < 1e-7
+    return bool(parallel.any())
 
 
 class Segments(NamedTuple):
@@ -106,27 +155,33 @@ class Segments(NamedTuple):
     Attributes:
       middle: (geom, 3, B), their centres.
       half: (geom, 3, B), from there to one end.
+      columns: rotations of the geoms that are no capsules, spheres or planes.
     """
 
     middle: jax.Array
     half: jax.Array
+    columns: dict[int, list[jax.Array]]
 
 
 @jax.named_scope("collision")
 def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
     """Return the line of each geom; that of a sphere or a plane is a point."""
-    middle, half = [], []
+    middle, half, rotations = [], [], {}
     for geom in range(model.ngeom):
         columns = at.columns[model.geom_bodyid[geom]]
         origin = at.xpos[model.geom_bodyid[geom]]
         middle.append(origin + tree.rotate(columns, model.geom_pos[geom]))
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
+        if model.geom_type[geom] in _POINTS:
+            local = matrix.reshape(3, 3).T
+            rotations[geom] = materialize([tree.rotate(columns, x) for x in local])
         if model.geom_type[geom] == _CAPSULE:
-            matrix = np.zeros(9)
-            mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
             half.append(tree.rotate(columns, matrix[2::3] * model.geom_size[geom, 1]))
         else:
             half.append(jnp.zeros_like(origin))
-    return Segments(*materialize((stacked(middle), stacked(half))))
+    places = materialize((stacked(middle), stacked(half)))
+    return Segments(places[0], places[1], rotations)
 
 
 @jax.named_scope("collision")
@@ -135,8 +190,12 @@ def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     parts = []
     if pairs.on_plane.size:
         parts.append(_touch_planes(model, pairs, lines))
+    if pairs.points.size:
+        parts.append(_touch_planes_in_points(model, pairs, lines))
     if pairs.between.size:
         parts.append(_touch_each_other(model, pairs, lines))
+    if pairs.boxes.size:
+        parts.append(_touch_boxes(model, pairs, lines))
     if len(parts) == 1:
         return parts[0]
     distance = jnp.concatenate([part.distance for part in parts])
@@ -151,14 +210,12 @@ def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
 
 def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     plane, geom = pairs.on_plane
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    normal = data.geom_xmat[plane].reshape(-1, 3, 3)[:, :, 2]
+    normal, height = _planes(model, plane)
 
     def constant(x: Any) -> Any:
         return x.astype(np.float32)[..., None]
 
-    height = constant(np.sum(normal * data.geom_xpos[plane], axis=1))
+    height = constant(height)
     radius = constant(model.geom_size[geom, 0])
     axis = take(lines.half, geom)
     centre = take(lines.middle, geom) + constant(pairs.end[:, None]) * axis
@@ -175,11 +232,136 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     up = constant(normal)
     across = axis - up * total(axis * up, 1)[:, None]
     length = jnp.sqrt(total(across**2, 1)[:, None])
-    along = across / jnp.maximum(length, 1e-15)
-    along = jnp.where(length > 1e-15, along, _orthogonal(up))
+    # The axis of an upright capsule is the normal but for rounding.
+    along = across / jnp.maximum(length, 1e-6)
+    along = jnp.where(length > 1e-6, along, _orthogonal(up))
     up = jnp.broadcast_to(up, along.shape)
     axes = [up, along, tree.cross(up, along)]
     return Touch(distance, position, jnp.stack(axes, axis=1))
+
+
+def _planes(model: mujoco.MjModel, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return normals (n, 3) of planes, and their distances (n,) from the origin."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    normal = data.geom_xmat[plane].reshape(-1, 3, 3)[:, :, 2]
+    return normal, np.sum(normal * data.geom_xpos[plane], axis=1)
+
+
+def _touch_planes_in_points(
+    model: mujoco.MjModel, pairs: Pairs, lines: Segments
+) -> Touch:
+    distances, positions, axes = [], [], []
+    for plane, geom in np.unique(pairs.points, axis=1).T:
+        (normal,), (height,) = _planes(model, np.array([plane]))
+        size, columns = model.geom_size[geom], lines.columns[geom]
+        # Each axis of the geom, as it is and as long as the geom is, along the normal.
+        up = [_dot(column, normal) for column in columns]
+        distance = _dot(lines.middle[geom], normal) - float(height)
+        if model.geom_type[geom] == _BOX:
+            points = _corners(size, columns, up)
+        elif model.geom_type[geom] == _CYLINDER:
+            points = _rim(size, columns, up)
+        else:
+            length = jnp.sqrt(total(jnp.stack(up) ** 2 * _squares(size)))
+            lowest = -total(
+                jnp.stack(columns) * jnp.stack(up)[:, None] * _squares(size)[..., None]
+            )
+            points = [(lowest / length, -length)]
+        for away, lower in points:
+            distances.append(distance + lower)
+            centre = lines.middle[geom] + away
+            down = 0.5 * jnp.where(jnp.isfinite(distances[-1]), distances[-1], 0.0)
+            positions.append(centre - normal.astype(np.float32)[:, None] * down)
+            axes.append(normal)
+    normals = jnp.asarray(np.stack(axes).astype(np.float32)[..., None])
+    frame = [normals]
+    if pairs.num_tangents:
+        frame.append(_orthogonal(normals))
+        frame.append(tree.cross(frame[0], frame[1]))
+    return Touch(stacked(distances), stacked(positions), jnp.stack(frame, axis=1))
+
+
+def _squares(size: np.ndarray) -> np.ndarray:
+    return (size**2).astype(np.float32)[:, None]
+
+
+def _dot(vector: jax.Array, constant: np.ndarray) -> jax.Array:
+    """Return the dot product of (3, B) and a constant (3,), (B,)."""
+    return constant_times(constant[None], vector)[0]
+
+
+# Points are from a geom's middle, and their heights are along the plane's normal.
+_Points = list[tuple[jax.Array, jax.Array]]
+
+
+def _corners(
+    size: np.ndarray, columns: list[jax.Array], up: list[jax.Array]
+) -> _Points:
+    corners = []
+    for i in range(8):
+        signs = [1.0 if i & bit else -1.0 for bit in (1, 2, 4)]
+        scale = [float(sign * x) for sign, x in zip(signs, size, strict=True)]
+        away = add(x * column for x, column in zip(scale, columns, strict=True))
+        height = add(x * y for x, y in zip(scale, up, strict=True))
+        # The upper corners never touch.
+        corners.append((away, jnp.where(height > 0.0, jnp.inf, height)))
+    return corners
+
+
+def _rim(size: np.ndarray, columns: list[jax.Array], up: list[jax.Array]) -> _Points:
+    """The lowest point of each disk of a cylinder, and two more of the lower one."""
+    radius, half = map(float, size[:2])
+    down = jnp.where(up[2] > 0.0, -1.0, 1.0)
+    axis, along = columns[2] * (half * down), up[2] * down
+    # The lowest direction in the plane of the disk, which is the axes' x and y.
+    flat = jnp.sqrt(up[0] ** 2 + up[1] ** 2)
+    is_flat = flat < 1e-7
+    x, y = (-a / jnp.maximum(flat, 1e-7) for a in up[:2])
+    x, y = jnp.where(is_flat, 1.0, x), jnp.where(is_flat, 0.0, y)
+    low = radius * (x * columns[0] + y * columns[1])
+    side = radius * (x * columns[1] - y * columns[0]) * float(np.sqrt(0.75))
+    height, base = -radius * flat, half * along
+    corner = base - 0.5 * height
+    points = [(low + axis, base + height), (low - axis, height - base)]
+    return points + [(axis - 0.5 * low + s * side, corner) for s in (1.0, -1.0)]
+
+
+def _touch_boxes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
+    distances: list[jax.Array] = []
+    positions: list[jax.Array] = []
+    normals: list[jax.Array] = []
+    for sphere, box in pairs.boxes.T:
+        radius, columns = float(model.geom_size[sphere, 0]), lines.columns[box]
+        size = model.geom_size[box].astype(np.float32)[:, None]
+        offset = lines.middle[sphere] - lines.middle[box]
+        centre = stacked([total(column * offset) for column in columns])
+        clamped = jnp.clip(centre, -size, size)
+        away = clamped - centre
+        apart = jnp.sqrt(total(away**2))
+        # Where the sphere's centre is inside, the nearest side.
+        depth = size - jnp.abs(centre)
+        first, second, third = (
+            (depth[i] <= jnp.minimum(depth[i - 1], depth[i - 2])).astype(jnp.float32)
+            for i in range(3)
+        )
+        second = second * (1 - first)
+        side = jnp.stack([first, second, third * (1 - first) * (1 - second)])
+        inside = apart <= 1e-7
+        inwards = jnp.where(centre > 0.0, -1.0, 1.0) * side
+        distance = jnp.where(inside, -total(side * depth), apart)
+        normal = jnp.where(inside, inwards, away / jnp.maximum(apart, 1e-7))
+        position = centre + normal * (0.5 * (radius + distance))
+        distances.append(distance - radius)
+        for local, results in ((position, positions), (normal, normals)):
+            results.append(add(local[i] * columns[i] for i in range(3)))
+        positions[-1] = positions[-1] + lines.middle[box]
+    normal = stacked(normals)
+    axes = [normal]
+    if pairs.num_tangents:
+        axes.append(_orthogonal(normal))
+        axes.append(tree.cross(normal, axes[1]))
+    return Touch(stacked(distances), stacked(positions), jnp.stack(axes, axis=1))
 
 
 def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
@@ -192,7 +374,9 @@ def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
 
 def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     first, second = pairs.between
-    a, b = (Segments(take(lines.middle, i), take(lines.half, i)) for i in pairs.between)
+    a, b = (
+        Segments(take(lines.middle, i), take(lines.half, i), {}) for i in pairs.between
+    )
 
     def length(i: np.ndarray) -> np.ndarray:
         return np.where(

@@ -1,14 +1,15 @@
-"""Joint limits and contacts as one-sided constraints for `newton`.
+"""The constraints of joints, tendons and contacts as rows for `newton`.
 
-The numbers are those of MJX's rows (``mjx.make_constraint``), which are C MuJoCo's.
-Everything that does not depend on the state is computed once, in NumPy. Every array has
-the batch as its last axis; of a NumPy array it is 1.
+The numbers are C MuJoCo's (``engine_core_constraint.c``). Everything that does not
+depend on the state is computed once, in NumPy. Every array has the batch as its last
+axis; of a NumPy array it is 1.
 
 Shape letters: C contacts, A axes (normal and tangents), V degrees of freedom, N bodies,
 B batch.
 """
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -16,12 +17,21 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from flax import struct
-from mujoco import mjx
 
-from gasil_envs.physics import collision, newton, tree
-from gasil_envs.physics.batching import add, fold, materialize, take, total
+from gasil_envs.physics import candidates, collision, newton, tendons, tree
+from gasil_envs.physics.batching import (
+    add,
+    constant_times,
+    fold,
+    materialize,
+    stacked,
+    take,
+    total,
+)
 
-_PYRAMID = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1))
+#: The largest weight of an edge, in units of the inertia that it moves. Float32 does
+#: not resolve more. A contact is off by a share of 1 / this.
+_MOST_STIFFNESS = 1e5
 # The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1, 1), (1, -1), (1, 0))
 
@@ -54,6 +64,7 @@ class Impedance(struct.PyTreeNode):
             return np.clip(x, mujoco.mjMINIMP, mujoco.mjMAXIMP)
 
         lowest, highest, midpoint = within(lowest), within(highest), within(midpoint)
+        is_flat = (width <= mujoco.mjMINVAL) | (lowest == highest)
         safe = time
         if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_REFSAFE:
             safe = np.maximum(time, 2 * model.opt.timestep)
@@ -64,12 +75,13 @@ class Impedance(struct.PyTreeNode):
             damping = np.where(
                 damping_ratio > 0, 2 / (highest * safe), -damping_ratio / highest
             )
+        mean = 0.5 * (lowest + highest)
         arrays = (
             stiffness,
             damping,
-            lowest,
-            highest,
-            np.maximum(width, mujoco.mjMINVAL),
+            np.where(is_flat, mean, lowest),
+            np.where(is_flat, mean, highest),
+            np.where(is_flat, 1.0, width),
             midpoint,
             np.maximum(power, 1.0),
         )
@@ -135,9 +147,10 @@ class Constants(struct.PyTreeNode):
         moves the first and 0 where it moves both or none.
       body: (C, N, 1), 1 at the second body and -1 at the first, unless that is the
         world; 0 elsewhere.
-      friction: of sliding.
+      friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes.
       margin: distance from which a contact is in play.
       inverse_weight: of an edge of the pyramid.
+      least_resistance: of an edge, the inverse of its greatest weight.
       impedance: of an edge.
     """
 
@@ -146,6 +159,7 @@ class Constants(struct.PyTreeNode):
     friction: np.ndarray
     margin: np.ndarray
     inverse_weight: np.ndarray
+    least_resistance: np.ndarray
     impedance: Impedance
 
 
@@ -157,11 +171,84 @@ class Group(NamedTuple):
     constants: Constants
 
 
+class Rows(NamedTuple):
+    """The constants of n rows, none of them of contacts.
+
+    Attributes:
+      inverse_weight: (n or 1, 1).
+      impedance: the coefficients.
+      bound: (n, 1), largest force of rows that push and pull; None if they only push.
+      of_qpos: (n, nq), what is constrained is this times qpos.
+      of_qvel: (n, V), its Jacobian.
+    """
+
+    inverse_weight: np.ndarray
+    impedance: Impedance
+    bound: np.ndarray | None
+    of_qpos: np.ndarray
+    of_qvel: np.ndarray
+
+
+class Equalities(NamedTuple):
+    """Joints and tendons whose positions are polynomials of others'.
+
+    Attributes:
+      rows: of the positions.
+      start: (n, 1), positions at qpos0.
+      others: of_qpos and of_qvel of the other joints and tendons.
+      other_start: (n, 1), their positions at qpos0.
+      polynomial: (n, 5), coefficients from the constant on.
+    """
+
+    rows: Rows
+    start: np.ndarray
+    others: tendons.Tendons
+    other_start: np.ndarray
+    polynomial: np.ndarray
+
+
+class Others(NamedTuple):
+    """The rows that are neither of contacts nor of the limits of slides and hinges.
+
+    Attributes:
+      friction: dry friction of all degrees of freedom, or None.
+      equalities: joints and tendons that follow others, or None.
+      tendon_friction: dry friction of tendons, or None.
+      tendon_limits: their limits, low and high (2, n, 1), and margin (n, 1), or None.
+      ball_limits: joint numbers, largest angles and margins (n, 1), or None.
+    """
+
+    friction: Rows | None
+    equalities: Equalities | None
+    tendon_friction: Rows | None
+    tendon_limits: tuple[Rows, np.ndarray, np.ndarray] | None
+    ball_limits: tuple[Rows, np.ndarray, np.ndarray, np.ndarray] | None
+
+
 class Layout(NamedTuple):
     """The parts of a model's constraint rows that do not depend on the state."""
 
     limits: Limits
     groups: tuple[Group, ...]
+    others: Others
+    impratio: float
+
+    @property
+    def stiffness(self) -> float:
+        """How much stiffer the stiffest contact is than the inertia that it moves."""
+        most = 0.0
+        for group in self.groups:
+            x = group.constants
+            softness = 1.0 - x.impedance.highest.astype(np.float64)
+            if len(group.edges) > 1:
+                softness = (
+                    softness
+                    * 2
+                    * x.friction[:, 0].astype(np.float64) ** 2
+                    / self.impratio
+                )
+            most = max(most, float(np.max(1.0 / softness)))
+        return min(most, _MOST_STIFFNESS)
 
 
 class Contacts(NamedTuple):
@@ -175,23 +262,33 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `layout` can't describe this model, or None if it can."""
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return "its friction cones are elliptic"
-    if model.neq:
-        return "it has equality constraints"
-    if model.dof_frictionloss.any() or model.tendon_frictionloss.any():
-        return "it has friction loss"
-    if model.tendon_limited.any():
-        return "it has limited tendons"
-    if not np.isin(model.geom_condim, [1, 3]).all() or model.npair:
-        return "it has contacts with torsional or rolling friction, or named pairs"
-    flags = mujoco.mjtDisableBit.mjDSBL_CONSTRAINT | mujoco.mjtDisableBit.mjDSBL_CONTACT
-    if model.opt.disableflags & (flags | mujoco.mjtDisableBit.mjDSBL_LIMIT):
+    joints = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
+    if not (joints | (model.eq_type == mujoco.mjtEq.mjEQ_TENDON)).all():
+        return "it has equality constraints of bodies"
+    span = model.jnt_range[:, 1] - model.jnt_range[:, 0]
+    scalar = model.jnt_limited.astype(bool) & (model.jnt_type != tree.BALL)
+    both = [scalar & (span <= 2 * model.jnt_margin)]
+    span = model.tendon_range[:, 1] - model.tendon_range[:, 0]
+    both.append(model.tendon_limited.astype(bool) & (span <= 2 * model.tendon_margin))
+    if np.concatenate(both).any():
+        return "it has joints or tendons whose two limits act at once"
+    flags = mujoco.mjtDisableBit
+    if model.opt.disableflags & (
+        flags.mjDSBL_CONSTRAINT
+        | flags.mjDSBL_CONTACT
+        | flags.mjDSBL_LIMIT
+        | flags.mjDSBL_EQUALITY
+        | flags.mjDSBL_FRICTIONLOSS
+    ):
         return "its constraints are disabled"
-    return collision.unsupported(model)
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
+        return "its contact parameters are overridden"
+    return collision.unsupported(model, candidates.candidates(model).geoms)
 
 
 def layout(model: mujoco.MjModel) -> Layout:
     """Compute everything that does not depend on the state."""
-    limited = np.flatnonzero(model.jnt_limited)
+    limited = np.flatnonzero(model.jnt_limited & (model.jnt_type != tree.BALL))
     dof = model.jnt_dofadr[limited]
     limits = Limits(
         qpos=model.jnt_qposadr[limited],
@@ -204,29 +301,29 @@ def layout(model: mujoco.MjModel) -> Layout:
             model, model.jnt_solref[limited], model.jnt_solimp[limited]
         ),
     )
-    # Which geoms collide, and with which parameters, is for MJX to say. The model is an
-    # argument: MJX would compile each operation on a constant by itself.
-    with jax.ensure_compile_time_eval():
-        contact = jax.tree.map(
-            np.asarray, _contact(mjx.put_model(model), mjx.make_data(model))
-        )
-    motion_normal = _motion_normal(model, contact.geom.reshape(-1, 2))
-    pyramid = _PYRAMID if motion_normal is None else _FLAT_PYRAMID
+    contact = candidates.candidates(model)
+    normal = motion_normal(model, contact.geoms)
+    round_geoms = model.geom_type[contact.geoms] <= int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    if (contact.dim > 3).any() or not round_geoms.all():
+        normal = None
     groups = [
-        _group(model, contact, dim, edges=edges, motion_normal=motion_normal)
-        for dim, edges in ((1, ((1,),)), (3, pyramid))
+        _group(model, contact, dim, motion_normal=normal)
+        for dim in (1, 3, 4, 6)
+        if (contact.dim == dim).any()
     ]
-    return Layout(limits, tuple(x for x in groups if len(x.pairs.geoms)))
+    return Layout(limits, tuple(groups), _others(model), model.opt.impratio)
 
 
-@jax.jit
-def _contact(model: mjx.Model, data: mjx.Data) -> mjx.Contact:
-    """Return MJX's possible contacts, without their present positions."""
-    contact = mjx.collision(model, data)._impl.contact
-    return contact.replace(dist=None, pos=None, frame=None)
+def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
+    """Return the edges normal +- tangent, for each direction of friction."""
+    if condim == 1:
+        return ((1,),)
+    tangents = np.eye(condim, dtype=int)[1:]
+    edges = [[1, *(sign * x[1:])] for x in tangents for sign in (1, -1)]
+    return tuple(tuple(map(int, edge)) for edge in edges)
 
 
-def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
+def motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
     """Return the normal of the plane that contains all motion, or None if none does.
 
     It is also None if a contact's tangents may be neither in the plane nor across it:
@@ -266,47 +363,60 @@ def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | Non
 
 def _group(
     model: mujoco.MjModel,
-    contact: mjx.Contact,
+    contact: candidates.Candidates,
     condim: int,
     *,
-    edges: tuple[tuple[int, ...], ...],
     motion_normal: np.ndarray | None,
 ) -> Group:
-    index = np.flatnonzero(contact.dim.reshape(-1) == condim)
-    geom = contact.geom.reshape(-1, 2)
-    on_plane = model.geom_type[geom[index, 0]] == mujoco.mjtGeom.mjGEOM_PLANE
-    index = np.concatenate([index[on_plane], index[~on_plane]])
-    body = model.geom_bodyid[geom[index]]
+    flat = motion_normal is not None and condim == 3
+    edges = _FLAT_PYRAMID if flat else _pyramid(condim)
+    chosen = np.flatnonzero(contact.dim == condim)
+    pairs, index = collision.pairs(
+        model,
+        contact.geoms[chosen],
+        min(len(edges[0]) - 1, 2),
+        motion_normal=motion_normal,
+    )
+    index = chosen[index]
+    body = model.geom_bodyid[contact.geoms[index]]
     moves = np.zeros((model.nbody, model.nv))
     for i in range(1, model.nbody):
         moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
     is_body = np.eye(model.nbody) * (np.arange(model.nbody) > 0)
-    friction = contact.friction.reshape(-1, 5)[index, 0]
+    friction = contact.friction[index, : max(1, condim - 1)].astype(np.float32)
+    if flat or (friction == friction[:, :1]).all():
+        friction = friction[:, :1]
+    sliding = friction[:, 0]
     inverse_weight = model.body_invweight0[body, 0].sum(axis=1)
+    floor = np.full(len(index), mujoco.mjMINVAL)
+    moved = inverse_weight
     if condim > 1:
-        inverse_weight = inverse_weight * (1 + friction**2)
-        inverse_weight = inverse_weight * 2 * friction**2 / model.opt.impratio
+        moved = inverse_weight = inverse_weight * (1 + sliding**2)
+        inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
+        floor = floor * 2 * sliding**2 / model.opt.impratio
+    # Without friction an edge would weigh 1e10 times as much as what it moves.
+    floor = np.maximum(floor, moved / _MOST_STIFFNESS)
 
-    def at(x: np.ndarray, width: int) -> np.ndarray:
-        return x.reshape(-1, width)[index]
+    def at(x: np.ndarray) -> np.ndarray:
+        return x[index].astype(np.float32)
 
     constants = Constants(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
         body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),
         friction=_constant(friction),
-        margin=_constant(contact.includemargin.reshape(-1)[index]),
+        margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
-        impedance=Impedance.of(model, at(contact.solref, 2), at(contact.solimp, 5)),
-    )
-    pairs = collision.pairs(
-        model, geom[index], len(edges[0]) - 1, motion_normal=motion_normal
+        least_resistance=_constant(floor),
+        impedance=Impedance.of(model, at(contact.solref), at(contact.solimp)),
     )
     return Group(edges, pairs, constants)
 
 
-def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
+def _weight(
+    impedance: jax.Array, inverse_weight: np.ndarray, least: Any = mujoco.mjMINVAL
+) -> jax.Array:
     resistance = inverse_weight * (1.0 - impedance) / impedance
-    return 1.0 / jnp.maximum(resistance, mujoco.mjMINVAL)
+    return 1.0 / jnp.maximum(resistance, least)
 
 
 @jax.named_scope("constraint_rows")
@@ -331,37 +441,225 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     )
 
 
+def _others(model: mujoco.MjModel) -> Others:
+    fixed = tendons.fixed(model)
+    of_joint = tendons.Tendons(
+        np.eye(model.nq)[model.jnt_qposadr], np.eye(model.nv)[model.jnt_dofadr]
+    )
+
+    def rows(
+        own: tendons.Tendons, inverse_weight: Any, solver: Any, bound: Any = None
+    ) -> Rows:
+        bound = None if bound is None else bound[:, None].astype(np.float32)
+        impedance = Impedance.of(model, *solver)
+        return Rows(_constant(inverse_weight), impedance, bound, *own)
+
+    def at(x: tendons.Tendons, index: np.ndarray) -> tendons.Tendons:
+        return tendons.Tendons(
+            *(np.where(index[:, None] < 0, 0.0, y[index]) for y in x)
+        )
+
+    friction = tendon_friction = tendon_limits = ball_limits = equalities = None
+    if model.dof_frictionloss.any():
+        own = tendons.Tendons(np.zeros((model.nv, model.nq)), np.eye(model.nv))
+        solver = model.dof_solref, model.dof_solimp
+        loss = model.dof_frictionloss
+        friction = rows(own, model.dof_invweight0, solver, loss)
+    index = np.flatnonzero(model.tendon_frictionloss)
+    if index.size:
+        solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
+        weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
+        tendon_friction = rows(at(fixed, index), weight, solver, loss)
+    index = np.flatnonzero(model.tendon_limited)
+    if index.size:
+        solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
+        tendon_limits = (
+            rows(at(fixed, index), model.tendon_invweight0[index], solver),
+            model.tendon_range[index].T[..., None].astype(np.float32),
+            model.tendon_margin[index][:, None].astype(np.float32),
+        )
+    index = np.flatnonzero(model.jnt_limited & (model.jnt_type == tree.BALL))
+    if index.size:
+        weight = model.dof_invweight0[model.jnt_dofadr[index]]
+        solver = model.jnt_solref[index], model.jnt_solimp[index]
+        ball_limits = (
+            rows(at(of_joint, index), weight, solver),
+            index,
+            model.jnt_range[index].max(axis=1)[:, None].astype(np.float32),
+            model.jnt_margin[index][:, None].astype(np.float32),
+        )
+    index = np.flatnonzero(model.eq_active0)
+    if index.size:
+        is_joint = model.eq_type[index] == mujoco.mjtEq.mjEQ_JOINT
+        first, second = model.eq_obj1id[index], model.eq_obj2id[index]
+
+        def pick(of_joints: np.ndarray, of_tendons: np.ndarray, i: np.ndarray) -> Any:
+            """Return a row of either, 0 where there is no second joint or tendon."""
+            of_tendons = of_tendons if len(of_tendons) else np.zeros_like(of_joints[:1])
+            chosen = [
+                (of_joints if joint else of_tendons)[j]
+                for joint, j in zip(is_joint, np.maximum(i, 0), strict=True)
+            ]
+            return np.stack(chosen) * (i >= 0).reshape(-1, *(1,) * (of_joints.ndim - 1))
+
+        def both(i: np.ndarray) -> tendons.Tendons:
+            return tendons.Tendons(
+                *(pick(*x, i) for x in zip(of_joint, fixed, strict=True))
+            )
+
+        def start(i: np.ndarray) -> np.ndarray:
+            at_start = model.qpos0[model.jnt_qposadr], model.tendon_length0
+            return pick(*at_start, i)[:, None].astype(np.float32)
+
+        def weight(i: np.ndarray) -> np.ndarray:
+            of_joints = model.dof_invweight0[model.jnt_dofadr]
+            return pick(of_joints, model.tendon_invweight0, i)
+
+        solver = model.eq_solref[index], model.eq_solimp[index]
+        unbounded = np.full(index.size, np.inf)
+        equalities = Equalities(
+            rows(both(first), weight(first) + weight(second), solver, unbounded),
+            start(first),
+            both(second),
+            start(second),
+            model.eq_data[index, :5],
+        )
+    return Others(friction, equalities, tendon_friction, tendon_limits, ball_limits)
+
+
+def friction_rows(others: Others, qvel: jax.Array) -> newton.FrictionRows | None:
+    """Return the dry friction of the degrees of freedom at qvel (V, B)."""
+    rows = others.friction
+    if rows is None or rows.bound is None:
+        return None
+    weight = _weight(rows.impedance(jnp.zeros_like(qvel)), rows.inverse_weight)
+    return newton.FrictionRows(
+        reference=jnp.asarray(-rows.impedance.damping) * qvel,
+        weight=jnp.where(rows.bound > 0, weight, 0.0),
+        bound=jnp.broadcast_to(rows.bound, qvel.shape),
+    )
+
+
+@jax.named_scope("constraint_rows")
+def other_rows(
+    model: mujoco.MjModel, others: Others, qpos: jax.Array, qvel: jax.Array
+) -> list[newton.ContactRows]:
+    """Return the rows of joints and tendons but for friction and scalar limits."""
+    result = []
+
+    def add_rows(
+        rows: Rows, jacobian: jax.Array, distance: jax.Array, acts: Any = True
+    ) -> None:
+        jacobian = jnp.where(acts, jnp.swapaxes(jacobian, 0, 1), 0.0)
+        jacobian = materialize(jnp.swapaxes(jacobian, 0, 1))
+        distance = jnp.where(acts, distance, 0.0)
+        impedance = rows.impedance(distance)
+        speed = total(jacobian * qvel, 1)
+        pull = rows.impedance.stiffness * impedance * distance
+        weight = jnp.where(acts, _weight(impedance, rows.inverse_weight), 0.0)
+        result.append(
+            newton.ContactRows(
+                basis=jacobian[:, None],
+                reference=(-rows.impedance.damping * speed - pull)[:, None],
+                weight=weight[:, None],
+                edges=((1,),),
+                bound=None
+                if rows.bound is None
+                else jnp.broadcast_to(rows.bound, weight.shape)[:, None],
+            )
+        )
+
+    def constant(x: np.ndarray) -> jax.Array:
+        x = x.astype(np.float32)[..., None]
+        return jnp.broadcast_to(x, (*x.shape[:-1], qpos.shape[-1]))
+
+    if others.equalities is not None:
+        rows, start, other, other_start, polynomial = others.equalities
+        x = constant_times(other.of_qpos, qpos) - other_start
+        coefficients = polynomial.T[..., None].astype(np.float32)
+        value, slope = jnp.zeros_like(x), jnp.zeros_like(x)
+        for c in coefficients[::-1]:
+            slope = slope * x + value
+            value = value * x + c
+        distance = constant_times(rows.of_qpos, qpos) - start - value
+        jacobian = constant(rows.of_qvel) - slope[:, None] * constant(other.of_qvel)
+        add_rows(rows, jacobian, distance)
+    if others.tendon_friction is not None:
+        rows = others.tendon_friction
+        none = jnp.zeros((len(rows.of_qvel), qpos.shape[-1]), jnp.float32)
+        add_rows(rows, constant(rows.of_qvel), none)
+    if others.tendon_limits is not None:
+        rows, (low, high), margin = others.tendon_limits
+        length = constant_times(rows.of_qpos, qpos)
+        at_low = length - low < high - length
+        distance = jnp.minimum(length - low, high - length) - margin
+        sign = jnp.where(at_low, 1.0, -1.0)
+        jacobian = sign[:, None] * constant(rows.of_qvel)
+        add_rows(rows, jacobian, distance, distance < 0.0)
+    if others.ball_limits is not None:
+        rows, joints, most, margin = others.ball_limits
+        angles, jacobians = [], []
+        for joint in joints:
+            first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            axis, angle = tree.axis_angle(qpos[first : first + 4])
+            angles.append(angle)
+            before = jnp.zeros((dof, angle.shape[-1]), jnp.float32)
+            after = jnp.zeros((model.nv - dof - 3, angle.shape[-1]), jnp.float32)
+            jacobians.append(jnp.concatenate([before, -axis, after]))
+        distance = most - stacked(angles) - margin
+        add_rows(rows, stacked(jacobians), distance, distance < 0.0)
+    return result
+
+
 @jax.named_scope("constraint_rows")
 def contact_rows(
     edges: tuple[tuple[int, ...], ...],
     contacts: Contacts,
     at: tree.Kinematics,
     *,
+    trees: Sequence[tuple[int, slice]],
     qvel: jax.Array,
 ) -> newton.ContactRows:
-    """Return the rows of a group of contacts at qvel (V, B)."""
+    """Return the rows of a group of contacts at qvel (V, B); `trees` as in `tree`."""
     (distance, position, axes), constants = contacts
     gap = distance - constants.margin
     active = gap < 0.0
-    arm = (position - at.com)[:, None]
     axes = jnp.asarray(axes)
-    torque = materialize(tree.cross(arm, axes))
-    # cdof is (rotation, translation) of the point at the centre of mass.
-    along = add(
-        x[:, :, k, None] * at.cdof[:, first + k]
-        for x, first in ((torque, 0), (axes, 3))
-        for k in range(3)
-    )
+
+    def jacobian(com: jax.Array, cdof: jax.Array) -> jax.Array:
+        torque = materialize(tree.cross((position - com)[:, None], axes))
+        # cdof is (rotation, translation) of the point at the centre of mass.
+        return add(
+            x[:, :, k, None] * cdof[:, first + k]
+            for x, first in ((torque, 0), (axes, 3))
+            for k in range(3)
+        )
+
+    if at.com.ndim == 2:
+        along = jacobian(at.com, at.cdof)
+    else:
+        along = jnp.concatenate(
+            [jacobian(at.com[body], at.cdof[dofs]) for body, dofs in trees], axis=2
+        )
+    turning = len(edges[0]) - axes.shape[1]
+    if turning > 0:
+        turns = add(axes[:, :turning, k, None] * at.cdof[:, k] for k in range(3))
+        turns = jnp.broadcast_to(turns, (along.shape[0], *turns.shape[1:]))
+        along = jnp.concatenate([along, turns], axis=1)
     along = along * jnp.where(active[:, None], constants.chain, 0.0)[:, None]
     is_normal = np.arange(along.shape[1])[:, None, None] == 0
-    scale = jnp.where(is_normal, 1.0, constants.friction[:, None, None])
+    friction = jnp.asarray(constants.friction)
+    if friction.shape[1] > 1:
+        friction = jnp.concatenate([jnp.ones_like(friction[:, :1]), friction], axis=1)
+    scale = jnp.where(is_normal, 1.0, friction[:, :, None])
     along = materialize(along * scale)  # (C, A, V, B)
     speed = materialize(total(along * qvel, 2))
     signs = np.array(edges, np.float32)[..., None]
     speed = total(speed[:, None] * signs, 2)  # (C, edges, B)
     impedance = constants.impedance(gap)
     pull = constants.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
-    weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)
+    weight = _weight(impedance, constants.inverse_weight, constants.least_resistance)
+    weight = jnp.where(active, weight, 0.0)
     # A normal that stands for two edges weighs as both.
     count = [
         2.0 if edges == _FLAT_PYRAMID and signs == (1, 0) else 1.0 for signs in edges
@@ -387,17 +685,33 @@ def body_forces(
     Args:
       edges: the group's edges.
       contacts: the group's contacts.
-      com: (3, B), centre of mass of the tree, metres.
+      com: (3, B), centre of mass of the tree, metres; (N, 3, B) of several trees.
       edge_forces: (C, E, B), force along each edge.
     """
     (_, position, axes), constants = contacts
     force = total(edge_forces, 1)[:, None] * axes[:, 0]
+    turn = None
     for t, signs in enumerate(np.array(edges, np.float32).T[1:], 1):
-        along = total(edge_forces * signs[:, None], 1) * constants.friction
-        force = force + along[:, None] * axes[:, t]
-    wrench = jnp.concatenate([tree.cross(position - com, force), force], axis=1)
-    wrench = materialize(wrench)
-    return total(constants.body[:, :, None] * wrench[:, None])
+        friction = constants.friction[
+            :, 0 if constants.friction.shape[1] == 1 else t - 1
+        ]
+        along = (total(edge_forces * signs[:, None], 1) * friction)[:, None]
+        if t < axes.shape[1]:
+            force = force + along * axes[:, t]
+        else:
+            turn = along * axes[:, t - axes.shape[1]] + (0.0 if turn is None else turn)
+
+    def wrenches(com: jax.Array, body: Any) -> jax.Array:
+        torque = tree.cross(position - com, force)
+        torque = torque if turn is None else torque + turn
+        wrench = materialize(jnp.concatenate([torque, force], axis=1))
+        return total(body[:, :, None] * wrench[:, None])
+
+    if com.ndim == 2:
+        return wrenches(com, constants.body)
+    return jnp.concatenate(
+        [wrenches(x, constants.body[:, i : i + 1]) for i, x in enumerate(com)]
+    )
 
 
 # Few of the possible contacts are in play at once: humanoid has 138 possible contacts,

@@ -16,14 +16,10 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics import constraints, newton, solver, tree
+from gasil_envs.physics import actuators, constraints, newton, solver, tendons, tree
 from gasil_envs.physics.batching import materialize, on_cpu, total
 from gasil_envs.physics.interface import Fields, PhysicsState
 
-_JOINT_TRANSMISSION = [
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-]
 #: The arrays of ``mjData`` that `step` can return.
 FIELDS = (
     *("xpos", "xipos", "cinert", "cvel"),
@@ -37,21 +33,23 @@ class Dynamics(NamedTuple):
     Attributes:
       model: the model.
       layout: layout of the constraints.
-      motor: (V, nu), generalized force of one unit of control.
-      control_range: (2, nu, 1), lowest and highest control.
-      iterations: number of iterations of the solver.
+      actuators: the actuators' constants.
+      tendons: the fixed tendons.
+      iterations: largest numbers of iterations of the solver and of a line search.
       fields: names of the fields to return, of `FIELDS`.
     """
 
     model: mujoco.MjModel
     layout: constraints.Layout
-    motor: np.ndarray
-    control_range: np.ndarray
-    iterations: int
+    actuators: actuators.Actuators
+    tendons: tendons.Tendons
+    iterations: tuple[int, int]
     fields: tuple[str, ...]
 
 
-#: Fields that are about the centre of mass of each body's own tree.
+# From this stiffness of contacts on float32 loses digits of their forces.
+_STIFF = 300.0
+#: Fields that are about the centre of mass of each body's own tree, with its base.
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
 
@@ -60,39 +58,36 @@ def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
     if model.opt.integrator not in integrators:
         return "its integrator is neither Euler nor RK4"
-    if (
-        model.na
-        or not np.isin(model.actuator_trntype, _JOINT_TRANSMISSION).all()
-        or (model.actuator_gaintype != int(mujoco.mjtGain.mjGAIN_FIXED)).any()
-        or (model.actuator_biastype != int(mujoco.mjtBias.mjBIAS_NONE)).any()
-        or model.actuator_forcelimited.any()
-        or model.jnt_actfrclimited.any()
-        or (model.jnt_type[model.actuator_trnid[:, 0]] == tree.FREE).any()
-    ):
-        return "it has actuators other than plain motors on slides and hinges"
     of_one_tree = [x for x in fields if x in _OF_ONE_TREE]
-    if of_one_tree and np.unique(model.body_rootid[1:]).size > 1:
-        return f"it has more than one kinematic tree, and {of_one_tree[0]} is returned"
-    return tree.unsupported(model) or constraints.unsupported(model)
+    fixed = (model.body_weldid == 0) & (model.body_mass > 0)
+    if (
+        of_one_tree
+        and np.isin(model.body_rootid[fixed], model.body_rootid[model.dof_bodyid]).any()
+    ):
+        return (
+            f"its base has a mass and does not move, and {of_one_tree[0]} is returned"
+        )
+    return (
+        actuators.unsupported(model)
+        or tendons.unsupported(model)
+        or tree.unsupported(model)
+        or constraints.unsupported(model)
+    )
 
 
 def make(
-    model: mujoco.MjModel, fields: Sequence[str] = (), iterations: int = 4
+    model: mujoco.MjModel,
+    fields: Sequence[str] = (),
+    iterations: int = 4,
+    ls_iterations: int = 4,
 ) -> Dynamics:
     """Compute what does not depend on the state, for a supported model."""
-    motor = np.zeros((model.nv, model.nu), np.float32)
-    dof = model.jnt_dofadr[model.actuator_trnid[:, 0]]
-    motor[dof, np.arange(model.nu)] = (
-        model.actuator_gear[:, 0] * model.actuator_gainprm[:, 0]
-    )
-    limited = model.actuator_ctrllimited[:, None].astype(bool)
-    control_range = np.where(limited, model.actuator_ctrlrange, [-np.inf, np.inf])
     return Dynamics(
         model,
         constraints.layout(model),
-        motor,
-        control_range.T[..., None].astype(np.float32),
-        iterations,
+        actuators.make(model),
+        tendons.fixed(model),
+        (iterations, ls_iterations),
         tuple(fields),
     )
 
@@ -113,30 +108,47 @@ class _Evaluation(NamedTuple):
     fields: Fields
 
 
-def _fields(dynamics: Dynamics, at: tree.Kinematics, *others: jax.Array) -> Fields:
-    """Return the fields to return; `others` are those from "cvel" on, in order."""
+def _fields(names: Sequence[str], at: tree.Kinematics, *others: jax.Array) -> Fields:
+    """Return the named fields; `others` are those from "cvel" on, in order."""
     every = zip(FIELDS, (at.xpos, at.xipos, at.cinert, *others), strict=True)
-    return {name: x for name, x in every if name in dynamics.fields}
+    return {name: x for name, x in every if name in names}
 
 
-def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
-    """Return the fields at `state`, with all forces 0."""
-    model, size = dynamics.model, state.qpos.shape[-1]
-    at = tree.kinematics(model, state.qpos)
+def kinematics(
+    model: mujoco.MjModel,
+    names: Sequence[str],
+    state: PhysicsState,
+    *,
+    with_bases: bool = False,
+) -> Fields:
+    """Return the named fields at `state`, with all forces 0.
+
+    With `with_bases` those about a tree's centre of mass count its parts that do not
+    move, as C MuJoCo does.
+    """
+    size = state.qpos.shape[-1]
+    at = tree.kinematics(model, state.qpos, with_bases=with_bases)
     cvel = tree.velocity(model, at.cdof, state.qvel)
     no_force = jnp.zeros((model.nv, size), jnp.float32)
     of_bodies = jnp.zeros((model.nbody, 6, size), jnp.float32)
-    return _fields(dynamics, at, cvel, no_force, no_force, of_bodies)
+    return _fields(names, at, cvel, no_force, no_force, of_bodies)
 
 
 def forward(
     dynamics: Dynamics, state: PhysicsState, actuation: jax.Array
 ) -> _Evaluation:
-    """Compute accelerations and fields; `actuation` are the motors' forces (V, B)."""
+    """Compute accelerations and fields.
+
+    `actuation` are the forces (V, B) of motors, or the controls (nu, B) of others.
+    """
     model, (qpos, qvel) = dynamics.model, (state.qpos, state.qvel)
     at = tree.kinematics(model, qpos)
     smooth = tree.smooth(model, at, qpos, qvel)
-    force = materialize(smooth.force + actuation)
+    if not dynamics.actuators.are_motors:
+        actuation = actuators.forces(dynamics.actuators, actuation, qpos, qvel)
+    force = smooth.force + actuation
+    of_tendons = tendons.forces(model, dynamics.tendons, qpos, qvel)
+    force = materialize(force if of_tendons is None else force + of_tendons)
     lines = constraints.collision.segments(model, at)
     groups = dynamics.layout.groups
     contacts = [
@@ -146,30 +158,39 @@ def forward(
         for x in groups
     ]
     limits = constraints.limit_rows(dynamics.layout.limits, qpos, qvel)
+    others = constraints.other_rows(model, dynamics.layout.others, qpos, qvel)
+    trees = tree.trees(model)
 
     def constrain(contacts: Sequence[constraints.Contacts], for_speed: bool) -> Any:
         rows = [
-            constraints.contact_rows(group.edges, x, at, qvel=qvel)
+            constraints.contact_rows(group.edges, x, at, trees=trees, qvel=qvel)
             for group, x in zip(groups, contacts, strict=True)
         ]
         problem = newton.Problem(
-            smooth.inertia, force, state.qacc_warmstart, limits, tuple(rows)
+            smooth.inertia,
+            force,
+            state.qacc_warmstart,
+            limits,
+            (*rows, *others),
+            constraints.friction_rows(dynamics.layout.others, qvel),
         )
-        solution = solver.solve_many(
-            dynamics.iterations, 4, problem, for_speed=for_speed
-        )
+        solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
         if "cfrc_ext" in dynamics.fields:
-            for group, x, edge in zip(
-                groups, contacts, solution.edge_forces, strict=True
-            ):
+            forces = solution.edge_forces[: len(groups)]
+            for group, x, edge in zip(groups, contacts, forces, strict=True):
                 of_bodies = of_bodies + constraints.body_forces(
                     group.edges, x, at.com, edge_forces=edge
                 )
         return solution.qacc, solution.constraint_force, of_bodies
 
     qacc, constraint_force, of_bodies = _with_contacts_in_play(constrain, contacts)
-    fields = _fields(dynamics, at, smooth.cvel, actuation, constraint_force, of_bodies)
+    if dynamics.layout.stiffness > _STIFF:
+        # The rows' forces are differences of large numbers; their sum need not be.
+        held = total(smooth.inertia * qacc, 1)
+        constraint_force = held - force
+    of_forces = actuation, constraint_force, of_bodies
+    fields = _fields(dynamics.fields, at, smooth.cvel, *of_forces)
     return _Evaluation(smooth.inertia, force + constraint_force, qacc, fields)
 
 
@@ -204,12 +225,17 @@ def step(
     dynamics: Dynamics, state: PhysicsState, control: jax.Array, frame_skip: int
 ) -> tuple[PhysicsState, Fields]:
     """Advance `frame_skip` time steps; the fields are of the last evaluation."""
-    control = jnp.clip(control, *dynamics.control_range)
-    actuation = total(jnp.asarray(dynamics.motor)[..., None] * control, 1)
+    own = dynamics.actuators
+    control = actuation = jnp.clip(control, *own.control_range)
+    if own.are_motors:
+        motor = (own.transmission.of_qvel.T * own.gain[:, 0]).astype(np.float32)
+        actuation = jnp.zeros_like(state.qvel)
+        if dynamics.model.nu:
+            actuation = total(jnp.asarray(motor)[..., None] * control, 1)
     is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     integrate = _euler if is_euler else _runge_kutta
     one = functools.partial(integrate, dynamics, actuation)
-    carry = (state, kinematics(dynamics, state))
+    carry = (state, kinematics(dynamics.model, dynamics.fields, state))
     return jax.lax.scan(lambda x, _: (one(*x), None), carry, length=frame_skip)[0]
 
 
@@ -224,6 +250,9 @@ def _integrate_positions(
             parts.append(qpos[q : q + 3] + dt * qvel[v : v + 3])
             parts.append(_rotate(qpos[q + 3 : q + 7], qvel[v + 3 : v + 6], dt))
             q, v = q + 7, v + 6
+        elif kind == tree.BALL:
+            parts.append(_rotate(qpos[q : q + 4], qvel[v : v + 3], dt))
+            q, v = q + 4, v + 3
         else:
             parts.append(qpos[q : q + 1] + dt * qvel[v : v + 1])
             q, v = q + 1, v + 1

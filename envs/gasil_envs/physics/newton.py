@@ -5,9 +5,11 @@ MuJoCo's constrained acceleration minimizes, over qacc,
     1/2 (qacc - qacc_smooth)' M (qacc - qacc_smooth)
       + 1/2 sum_r D_r min(0, J_r qacc - aref_r)^2
 
-(MuJoCo documentation, "Computation", pyramidal cones: every row is one-sided). The
-cost is convex and piecewise quadratic, so Newton's method with an exact line search
-ends as soon as it has found the active rows.
+(MuJoCo documentation, "Computation", pyramidal cones). The cost is convex and piecewise
+quadratic, so Newton's method with an exact line search ends as soon as it has found the
+active rows. Most rows are one-sided, as here: they only push. Those of dry friction and
+of equalities pull as well, with a force D_r (J_r qacc - aref_r) up to a bound, which is
+infinite for an equality; beyond it the cost is linear.
 
 Rows are not stored one by one. A joint's limit is one entry of a diagonal. The rows
 of a contact are the edges of its friction pyramid, normal +- friction * tangent: with
@@ -47,12 +49,14 @@ class ContactRows(struct.PyTreeNode):
       reference: (C, E), aref of the edges.
       weight: (C, E), D of the edges; 0 where out of play and above 0 elsewhere.
       edges: E rows of A signs: an edge is their product with the axes.
+      bound: (C, E), largest force of rows that push and pull; None if they only push.
     """
 
     basis: jax.Array
     reference: jax.Array
     weight: jax.Array
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
+    bound: jax.Array | None = None
 
 
 class LimitRows(struct.PyTreeNode):
@@ -69,6 +73,20 @@ class LimitRows(struct.PyTreeNode):
     weight: jax.Array
 
 
+class FrictionRows(struct.PyTreeNode):
+    """The rows of dry friction in the degrees of freedom; float32.
+
+    Attributes:
+      reference: (V,), aref.
+      weight: (V,), D; 0 where there is no friction.
+      bound: (V,), largest force.
+    """
+
+    reference: jax.Array
+    weight: jax.Array
+    bound: jax.Array
+
+
 class Problem(struct.PyTreeNode):
     """The constrained dynamics of one instant; float32.
 
@@ -77,7 +95,8 @@ class Problem(struct.PyTreeNode):
       force: (V,), all forces but the constraints': M qacc_smooth.
       warmstart: (V,), initial guess, used if it is better than qacc_smooth.
       limits: the limits of the joints.
-      contacts: groups of contacts.
+      contacts: groups of contacts, and of other rows as contacts with one axis.
+      friction: dry friction, if there is any.
     """
 
     inertia: jax.Array
@@ -85,6 +104,7 @@ class Problem(struct.PyTreeNode):
     warmstart: jax.Array
     limits: LimitRows
     contacts: tuple[ContactRows, ...] = ()
+    friction: FrictionRows | None = None
 
 
 class Solution(struct.PyTreeNode):
@@ -112,12 +132,15 @@ class System(Protocol):
       warmstart: a vector, the problem's.
       reference: rows, aref.
       weight: rows, D.
+      bound: for each entry of the list of rows, None if these only push, or the largest
+        force of each.
     """
 
     force: Any
     warmstart: Any
     reference: Any
     weight: Any
+    bound: list[Any]
 
     def inertia_times(self, vector: Any) -> Any:
         """M vector."""
@@ -177,8 +200,9 @@ def weighted_axes(
         yield add(terms)
 
 
-def _is_pushing(jaref: Any) -> Any:
-    return jax.tree.map(lambda d: d < 0.0, jaref)
+def _where(marks: list[bool], rows: Any, mark: bool = True) -> list[Any]:
+    """Return the entries of a list of rows that have a mark."""
+    return [x for x, y in zip(rows, marks, strict=True) if y is mark]
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
@@ -190,6 +214,52 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
       line_search: largest number of steps of each line search.
     """
     each, weight = jax.tree.map, system.weight
+    pulls = [bound is not None for bound in system.bound]
+    bound = _where(pulls, system.bound)
+    pull_weight = _where(pulls, weight)
+
+    def held(jaref: Any) -> Any:
+        """Return the force, with the opposite sign, of the rows that also pull."""
+        return each(
+            lambda d, w, most: jnp.clip(w * d, -most, most),
+            _where(pulls, jaref),
+            pull_weight,
+            bound,
+        )
+
+    # A row's piece of its cost: whether it pushes, or which of its bounds it is at.
+    def piece(jaref: Any) -> Any:
+        pushing = each(lambda d: d < 0.0, _where(pulls, jaref, False))
+        return pushing, each(
+            lambda f, most: jnp.sign(f) * (jnp.abs(f) >= most), held(jaref), bound
+        )
+
+    def inner_weight(jaref: Any) -> Any:
+        """Return the second derivative of each row's cost."""
+        rows = []
+        for d, w, most in zip(jaref, weight, system.bound, strict=True):
+            if most is None:
+                rows.append(each(lambda d, w: jnp.where(d < 0.0, w, 0.0), d, w))
+            else:
+                rows.append(
+                    each(
+                        lambda d, w, x: jnp.where(jnp.abs(w * d) < x, w, 0.0),
+                        d,
+                        w,
+                        most,
+                    )
+                )
+        return rows
+
+    def derivative(active: Any, jaref: Any) -> Any:
+        """Return the first derivative of each row's cost."""
+        pushing = iter(
+            each(
+                jnp.multiply, _where(pulls, active, False), _where(pulls, jaref, False)
+            )
+        )
+        pulling = iter(held(jaref))
+        return [next(pulling if both else pushing) for both in pulls]
 
     # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
     def jaref_at(qacc: Any) -> Any:
@@ -199,8 +269,22 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         return system.total(each(jnp.multiply, a, b))
 
     def row_cost(jaref: Any) -> jax.Array:
-        return system.total(
-            each(lambda d, w: w * jnp.minimum(d, 0.0) ** 2, jaref, weight)
+        cost = system.total(
+            each(
+                lambda d, w: w * jnp.minimum(d, 0.0) ** 2,
+                _where(pulls, jaref, False),
+                _where(pulls, weight, False),
+            )
+        )
+        if not any(pulls):
+            return cost
+        return cost + system.total(
+            each(
+                lambda f, d, w: f * (2.0 * d - f / jnp.maximum(w, 1e-30)),
+                held(jaref),
+                _where(pulls, jaref),
+                pull_weight,
+            )
         )
 
     warmstart, smooth = system.warmstart, system.solve(None, system.force)
@@ -214,9 +298,9 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
 
     def iterate(carry: Any) -> Any:
         qacc, jaref = carry
-        active = each(lambda d, w: jnp.where(d < 0.0, w, 0.0), jaref, weight)
+        active = inner_weight(jaref)
         residual = each(jnp.subtract, system.inertia_times(qacc), system.force)
-        pull = system.transposed_times(each(jnp.multiply, active, jaref))
+        pull = system.transposed_times(derivative(active, jaref))
         active, gradient = system.store((active, each(jnp.add, residual, pull)))
         direction = each(jnp.negative, system.solve(active, gradient))
 
@@ -226,33 +310,45 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         quadratic = dot(direction, system.inertia_times(direction))
 
         def search_step(search: Any) -> Any:
-            step, low, high, pushing = search
+            step, low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
-            pushed = each(
-                lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), there, slope, weight
-            )
-            second = quadratic + dot(pushed, slope)
-            first = linear + step * quadratic + dot(pushed, there)
+            one_sided = (_where(pulls, x, False) for x in (there, slope, weight))
+            pushed = each(lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), *one_sided)
+            second = quadratic + dot(pushed, _where(pulls, slope, False))
+            first = linear + step * quadratic + dot(pushed, _where(pulls, there, False))
+            if any(pulls):
+                along = _where(pulls, slope)
+                inner = _where(pulls, inner_weight(there))
+                second = second + dot(each(jnp.multiply, inner, along), along)
+                first = first + dot(held(there), along)
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
             following = jnp.where(inside, following, 0.5 * (low + high))
-            now = _is_pushing(there)
-            return (following, low, high, now), system.differ(pushing, now)
+            now = piece(there)
+            return (following, low, high, now), system.differ(before, now)
 
-        step, pushing = jnp.ones_like(linear), _is_pushing(jaref)
-        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), pushing)
+        step, before = jnp.ones_like(linear), piece(jaref)
+        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), before)
         step = system.repeat(
             search_step, search, least=1, most=line_search, is_short=True
         )[0]
         qacc, moved = each(
             lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
         )
-        return (qacc, moved), system.differ(pushing, _is_pushing(moved))
+        return (qacc, moved), system.differ(before, piece(moved))
 
     start = each(choose, (warmstart, at_warmstart), (smooth, at_smooth))
     qacc, jaref = system.repeat(
         iterate, start, least=2, most=iterations, is_short=False
     )
-    return qacc, each(lambda d, w: w * jnp.maximum(-d, 0.0), jaref, weight)
+    pushes = iter(
+        each(
+            lambda d, w: w * jnp.maximum(-d, 0.0),
+            _where(pulls, jaref, False),
+            _where(pulls, weight, False),
+        )
+    )
+    both_ways = iter(each(jnp.negative, held(jaref)))
+    return qacc, [next(both_ways if both else pushes) for both in pulls]

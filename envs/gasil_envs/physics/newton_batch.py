@@ -97,8 +97,8 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 class _Batch:
     """A batch of problems, a `newton.System`.
 
-    A vector is (V, B). Rows are a list: (V, B) for the limits, and (E, C, B) for each
-    group of contacts.
+    A vector is (V, B). Rows are a list: (V, B) for the limits, (E, C, B) for each group
+    of contacts, and (V, B) for dry friction if there is any.
     """
 
     def __init__(self, problem: newton.Problem, for_speed: bool):
@@ -115,6 +115,16 @@ class _Batch:
         self.reference += [edges_first(group.reference) for group in contacts]
         self.weight = [limits.weight]
         self.weight += [edges_first(group.weight) for group in contacts]
+        self.bound: list[Any] = [None]
+        self.bound += [
+            None if group.bound is None else edges_first(group.bound)
+            for group in contacts
+        ]
+        self._has_friction = problem.friction is not None
+        if problem.friction is not None:
+            self.reference.append(problem.friction.reference)
+            self.weight.append(problem.friction.weight)
+            self.bound.append(problem.friction.bound)
         self._inertia, self._sign = problem.inertia, limits.sign
         self._edges = [group.edges for group in contacts]
         self._shapes = [group.basis.shape[:2] for group in contacts]
@@ -138,16 +148,20 @@ class _Batch:
 
     def times(self, vector: jax.Array) -> list[jax.Array]:
         result = [self._sign * vector]
-        if self._basis is None:
-            return result
-        along = self._split(_matvec(self._basis, vector, self._spell_out))
-        for edges, axes in zip(self._edges, along, strict=True):
-            result.append(jnp.stack([sum_signed(axes, signs) for signs in edges]))
-        return result
+        if self._basis is not None:
+            along = self._split(_matvec(self._basis, vector, self._spell_out))
+            for edges, axes in zip(self._edges, along, strict=True):
+                result.append(jnp.stack([sum_signed(axes, signs) for signs in edges]))
+        return [*result, vector] if self._has_friction else result
+
+    def _parts(self, rows: list[jax.Array]) -> tuple[Any, list[Any], list[Any]]:
+        """Return the rows of the limits, of the groups and of friction."""
+        last = len(self._edges) + 1
+        return rows[0], rows[1:last], rows[last:]
 
     def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
-        of_limits, *of_groups = rows
-        result = self._sign * of_limits
+        of_limits, of_groups, friction = self._parts(rows)
+        result = add([self._sign * of_limits, *friction])
         if self._basis is None:
             return result
         along = [
@@ -165,8 +179,8 @@ class _Batch:
 
     def _gram(self, weights: list[jax.Array]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""
-        of_limits, *of_groups = weights
-        diagonal = self._sign**2 * of_limits
+        of_limits, of_groups, friction = self._parts(weights)
+        diagonal = add([self._sign**2 * of_limits, *friction])
         result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
         if self._basis is None:
             return result
@@ -228,6 +242,8 @@ def solve_many(
     qacc, forces = newton.minimize(batch, iterations, line_search)
     return newton.Solution(
         qacc=qacc,
-        edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in forces[1:]),
+        edge_forces=tuple(
+            jnp.swapaxes(x, 0, 1) for x in forces[1 : len(problem.contacts) + 1]
+        ),
         constraint_force=batch.transposed_times(forces),
     )

@@ -140,32 +140,38 @@ def _store_vector(ref: Any, vector: list[jax.Array]) -> None:
 class _Block:
     """One problem, a `newton.System`.
 
-    Rows are a list: a vector for the limits, and a list of E arrays (C,) for each group
-    of contacts.
+    Rows are a list: a vector for the limits, a list of E arrays (C,) for each group of
+    contacts, and a vector for dry friction if there is any.
     """
 
     def __init__(self, refs: Any, size: int, edges: Sequence[Any], counts: Any) -> None:
         """Load a problem.
 
         Args:
-          refs: references to the inertia, the five vectors of a problem, and for each
-            group to its axes (C, V) and its edges' references and weights (C,).
+          refs: references to the inertia, the five vectors of a problem and three more
+            of friction, and for each group to its axes (C, V) and its edges'
+            references, weights and bounds (C,).
           size: number of degrees of freedom.
           edges: each group's edges.
           counts: each group's contacts.
         """
         inertia, vectors, groups = refs
         loaded = [_load_vector(ref, size) for ref in vectors]
-        self.force, self.warmstart, self._sign, reference, weight = loaded
+        self.force, self.warmstart, self._sign, reference, weight = loaded[:5]
         self.reference: list[Any] = [reference]
         self.weight: list[Any] = [weight]
+        self.bound: list[Any] = [None]
         self._size, self._edges = size, edges
         self._inertia = _loads_of_matrix(inertia, size)
         # For each group a list of axes, each a list of parts (C, W).
         self._basis: list[list[list[Load]]] = []
-        for (axes, references, weights), count in zip(groups, counts, strict=True):
-            self.reference.append([_load(x, count) for x in references])
-            self.weight.append([_load(x, count) for x in weights])
+        for (axes, *of_edges), count in zip(groups, counts, strict=True):
+            references, weights, *bound = [
+                [_load(x, count) for x in values] for values in of_edges
+            ]
+            self.reference.append(references)
+            self.weight.append(weights)
+            self.bound.append(bound[0] if bound else None)
             self._basis.append(
                 [
                     [
@@ -175,6 +181,13 @@ class _Block:
                     for x in axes
                 ]
             )
+
+        self._has_friction = len(loaded) > 5
+        if self._has_friction:
+            for rows, of_friction in zip(
+                (self.reference, self.weight, self.bound), loaded[5:], strict=True
+            ):
+                rows.append(of_friction)
 
     def inertia_times(self, vector: list[jax.Array]) -> list[jax.Array]:
         result = []
@@ -198,11 +211,18 @@ class _Block:
                 for parts in axes
             ]
             rows.append([sum_signed(along, signs) for signs in edges])
-        return rows
+        return [*rows, vector] if self._has_friction else rows
+
+    def _parts(self, rows: list[Any]) -> tuple[Any, list[Any]]:
+        """Return the diagonal rows, of the limits and friction, and the groups'."""
+        last = len(self._edges) + 1
+        return [rows[0], *rows[last:]], rows[1:last]
 
     def transposed_times(self, rows: list[Any]) -> list[jax.Array]:
-        of_limits, *of_groups = rows
+        (of_limits, *friction), of_groups = self._parts(rows)
         result = jax.tree.map(jnp.multiply, self._sign, of_limits)
+        for vector in friction:
+            result = jax.tree.map(jnp.add, result, vector)
         for edges, axes, of_edges in zip(
             self._edges, self._basis, of_groups, strict=True
         ):
@@ -223,10 +243,13 @@ class _Block:
 
     def _add_gram(self, matrix: Matrix, weights: list[Any]) -> None:
         """Add J' diag(weights) J."""
-        of_limits, *of_groups = weights
+        (of_limits, *friction), of_groups = self._parts(weights)
         diagonal = _iota((WIDTH, WIDTH), 0) == _iota((WIDTH, WIDTH), 1)
-        for row, sign, weight in zip(matrix, self._sign, of_limits, strict=True):
-            entries = jnp.broadcast_to((sign**2 * weight)[:, None], diagonal.shape)
+        own = jax.tree.map(lambda sign, x: sign**2 * x, self._sign, of_limits)
+        for vector in friction:
+            own = jax.tree.map(jnp.add, own, vector)
+        for row, entry in zip(matrix, own, strict=True):
+            entries = jnp.broadcast_to(entry[:, None], diagonal.shape)
             row[0] = row[0] + jnp.where(diagonal, entries, 0.0)
         for edges, axes, of_edges in zip(
             self._edges, self._basis, of_groups, strict=True
@@ -287,7 +310,8 @@ def _newton(
     qacc, forces = newton.minimize(block, iterations, line_search)
     for ref, vector in zip(results, (qacc, block.transposed_times(forces))):
         _store_vector(ref, vector)
-    for refs, of_edges in zip(results[2], forces[1:], strict=True):
+    of_groups = forces[1 : len(results[2]) + 1]
+    for refs, of_edges in zip(results[2], of_groups, strict=True):
         for ref, force in zip(refs, of_edges, strict=True):
             ref[...] = force
 
@@ -363,15 +387,18 @@ def solve_many(
     padded = len(_parts(size)) * WIDTH
     vectors = [problem.force, problem.warmstart]
     vectors += [limits.sign, limits.reference, limits.weight]
+    vectors += jax.tree.leaves(problem.friction)
     counts = [len(group.basis) for group in problem.contacts]
     groups, of_groups, of_edges, entries = [], [], [], 0
     for group, count in zip(problem.contacts, counts, strict=True):
-        arrays = (group.basis, group.reference, group.weight)
+        arrays = [group.basis, group.reference, group.weight]
+        arrays += [] if group.bound is None else [group.bound]
         groups.append([list(jnp.moveaxis(x, 1, 0)) for x in arrays])
         contacts = max(_FEWEST_CONTACTS, 1 << (count - 1).bit_length())
         axes, edges = group.basis.shape[1], len(group.edges)
         of_edges.append([_spec(contacts)] * edges)
-        of_groups.append([[_spec(contacts, padded)] * axes, of_edges[-1], of_edges[-1]])
+        per_edge = [of_edges[-1]] * (len(arrays) - 1)
+        of_groups.append([[_spec(contacts, padded)] * axes, *per_edge])
         entries += axes * contacts * padded
     read = functools.partial(
         _Block,

@@ -12,26 +12,31 @@ import mujoco
 from gasil_envs.physics import dynamics
 from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
-from gasil_envs.physics.mjx import MjxPhysics, Unsupported
+from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
 from gasil_envs.precision import full_precision
 
 _LOGGER = logging.getLogger(__name__)
 
 
+def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
+    """Return why our physics does not take a model; None if it does."""
+    return dynamics.unsupported(model, fields) or left_out(model)
+
+
 def ours_or_mjx(
     model: mujoco.MjModel,
     fields: Sequence[str] = (),
-    iterations: int = 4,
-    ls_iterations: int = 8,
+    iterations: int | None = None,
+    ls_iterations: int | None = None,
 ) -> Physics:
     """Return our physics, or MJX's and a warning that says which part ours lacks.
 
     Raises:
       ValueError: if neither takes the model.
     """
-    reason = dynamics.unsupported(model, fields)
+    reason = unsupported(model, fields)
     if reason is None:
-        return JaxPhysics(model, fields, iterations)
+        return JaxPhysics(model, fields, iterations, ls_iterations)
     try:
         physics = MjxPhysics(model, fields, iterations, ls_iterations)
     except Unsupported as error:
@@ -51,17 +56,38 @@ class JaxPhysics:
     """Steps a MuJoCo model with our dynamics and solver; see `interface.Physics`.
 
     Args:
-      model: a model that `dynamics.unsupported` has nothing against.
+      model: a model that `unsupported` has nothing against.
       fields: names of the ``mjData`` arrays to return.
-      iterations: largest number of Newton iterations.
+      iterations: largest number of Newton iterations, default 100: it ends where it has
+        converged, mostly after 2 to 8.
+      ls_iterations: largest number of steps of each line search, default 16, or 4 if
+        iterations are given.
     """
 
     name = "jax"
 
     def __init__(
-        self, model: mujoco.MjModel, fields: Sequence[str] = (), iterations: int = 4
+        self,
+        model: mujoco.MjModel,
+        fields: Sequence[str] = (),
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
     ):
-        self._dynamics = dynamics.make(model, fields, iterations)
+        self._dynamics = dynamics.make(
+            model, fields, iterations or 100, ls_iterations or (4 if iterations else 16)
+        )
+        if self.is_stiff:
+            _LOGGER.warning(
+                "physics 'jax' may differ from C MuJoCo's by 1e-3 in this model: its "
+                "contacts are %.0e times as stiff as what they move (by friction, "
+                "impratio or solimp), and float32 resolves no more",
+                self._dynamics.layout.stiffness,
+            )
+
+    @property
+    def is_stiff(self) -> bool:
+        """Whether contacts are so stiff that float32 loses digits of the motion."""
+        return self._dynamics.layout.stiffness > 3e3
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
@@ -70,7 +96,9 @@ class JaxPhysics:
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""
-        return batch_last(partial(dynamics.kinematics, self._dynamics))(state)
+        own = self._dynamics
+        place = partial(dynamics.kinematics, own.model, own.fields)
+        return batch_last(place)(state)
 
     @full_precision
     def step(

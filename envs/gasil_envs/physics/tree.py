@@ -6,10 +6,11 @@ bodies are unrolled, and products with its zeros are left out.
 
 Shape letters: N bodies, the world first; V degrees of freedom; B batch. A spatial
 vector (6, B) is a rotation and then a translation of the point at the centre of mass of
-all bodies that move, of one tree or more; a rotation matrix is the list of its columns,
-(3, B) each.
+the bodies of its tree that move; a rotation matrix is the list of its columns, (3, B)
+each.
 """
 
+import itertools
 import operator
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -21,8 +22,9 @@ import numpy as np
 
 from gasil_envs.physics.batching import add, materialize, stacked, take, total
 
-FREE, SLIDE, HINGE = (
+FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
+    int(mujoco.mjtJoint.mjJNT_BALL),
     int(mujoco.mjtJoint.mjJNT_SLIDE),
     int(mujoco.mjtJoint.mjJNT_HINGE),
 )
@@ -36,7 +38,8 @@ class Kinematics(NamedTuple):
       columns: rotation of each body.
       xpos: (N, 3, B), origins of the bodies.
       xipos: (N, 3, B), their centres of mass.
-      com: (3, B), centre of mass of all bodies that move.
+      com: (3, B), centre of mass of all bodies that move; of each body's tree if there
+        are several, (N, 3, B).
       cinert: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass
         times offset, mass.
       cdof: (V, 6, B), motion of one unit of each velocity.
@@ -52,13 +55,8 @@ class Kinematics(NamedTuple):
 
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
-    if not np.isin(model.jnt_type, [FREE, SLIDE, HINGE]).all():
-        return "it has ball joints"
-    if model.jnt_stiffness[model.jnt_type == FREE].any():
-        return "it has free joints with springs"
-    tendons = model.tendon_stiffness, model.tendon_damping, model.tendon_armature
-    if any(x.any() for x in tendons):
-        return "it has tendons with springs, damping or armature"
+    if model.jnt_stiffness[model.jnt_type <= BALL].any():
+        return "it has free joints or balls with springs"
     if model.nmocap or model.body_gravcomp.any():
         return "it has mocap bodies or compensated gravity"
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
@@ -71,6 +69,16 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if model.opt.disableflags & (flags.mjDSBL_CLAMPCTRL | flags.mjDSBL_ACTUATION):
         return "its actuators or the limits of their controls are disabled"
     return None
+
+
+def trees(model: mujoco.MjModel) -> list[tuple[int, slice]]:
+    """Return a body of each tree that moves, and the tree's degrees of freedom."""
+    roots = model.body_rootid[model.dof_bodyid]
+    bounds = [*np.flatnonzero(np.diff(roots, prepend=-1)), model.nv]
+    return [
+        (int(roots[first]), slice(int(first), int(last)))
+        for first, last in itertools.pairwise(bounds)
+    ]
 
 
 def cross(a: jax.Array, b: jax.Array) -> jax.Array:
@@ -128,6 +136,21 @@ def _turn(
     return [column(j) for j in range(3)]
 
 
+def _product(
+    columns: Sequence[jax.Array], local: Sequence[jax.Array]
+) -> list[jax.Array]:
+    """Return the product of two rotation matrices."""
+    return [add(column[k] * columns[k] for k in range(3)) for column in local]
+
+
+def axis_angle(quaternion: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Return axis (3, B) and angle (B,), from 0 to pi, of a quaternion (4, B)."""
+    w, vector = quaternion[0], quaternion[1:]
+    length = jnp.sqrt(total(vector**2))
+    axis = vector * (jnp.where(w < 0.0, -1.0, 1.0) / jnp.maximum(length, 1e-15))
+    return axis, 2.0 * jnp.arctan2(length, jnp.abs(w))
+
+
 def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
     """Return the rotation of a quaternion of any length, (4, B)."""
     w, x, y, z = quaternion / jnp.sqrt(total(quaternion**2))
@@ -139,8 +162,14 @@ def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
 
 
 @jax.named_scope("smooth_dynamics")
-def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
-    """Compute positions, inertia and axes of motion at qpos (nq, B)."""
+def kinematics(
+    model: mujoco.MjModel, qpos: jax.Array, *, with_bases: bool = False
+) -> Kinematics:
+    """Compute positions, inertia and axes of motion at qpos (nq, B).
+
+    With `with_bases` a tree's centre of mass is also that of its parts that do not
+    move.
+    """
     size = qpos.shape[1:]
     zero = jnp.zeros((3, *size), jnp.float32)
     world = [jnp.broadcast_to(x[:, None], zero.shape) for x in np.eye(3, dtype="f")]
@@ -165,6 +194,13 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
                 dofs += [(zero, zero, x) for x in world]
                 dofs += [(x, position, zero) for x in turned]
                 continue
+            if model.jnt_type[joint] == BALL:
+                anchor = position + rotate(turned, model.jnt_pos[joint])
+                turned = _product(turned, _free_rotation(qpos[at : at + 4]))
+                turned = materialize(turned)
+                position = anchor - rotate(turned, model.jnt_pos[joint])
+                dofs += [(x, anchor, zero) for x in turned]
+                continue
             axis = rotate(turned, model.jnt_axis[joint])
             if model.jnt_type[joint] == SLIDE:
                 dofs.append((zero, zero, axis))
@@ -181,12 +217,27 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
     xipos = stacked([x + rotate(turned, local) for x, turned, local in places])
     mass = model.body_mass.astype(np.float32)[:, None]
     # What does not move is not counted: it may be heavy, and far away.
-    moving = mass * (model.body_weldid > 0)[:, None]
-    com = add(m * x for m, x in zip(moving[:, 0], xipos, strict=True)) / moving.sum()
+    moving = mass * ((model.body_weldid > 0) | with_bases)[:, None]
+
+    def centre(mass: np.ndarray) -> jax.Array:
+        return add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
+
+    of_trees = trees(model)
+    if len(of_trees) == 1 and not with_bases:
+        com = centre(moving)
+    else:
+        # Trees may be far from each other.
+        centres = {}
+        for root in np.unique(model.body_rootid):
+            own = (model.body_rootid == root)[:, None]
+            own_mass = moving * own if (moving * own).any() else mass * own
+            centres[root] = centre(own_mass) if own_mass.any() else xipos[root]
+        com = stacked([centres[root] for root in model.body_rootid])
+    of_dof = com if com.ndim == 2 else take(com, model.dof_bodyid)
     xipos, com = materialize((xipos, com))
     cinert = _inertia(model, columns, xipos - com, mass=mass)
     axis, anchor, translation = map(stacked, zip(*dofs, strict=True))
-    turning = _cross(axis, com - anchor)
+    turning = _cross(axis, of_dof - anchor)
     moved = [translation[:, i] + turning[i] for i in range(3)]
     cdof = stacked([*(axis[:, i] for i in range(3)), *moved], 1)
     cinert, cdof = materialize((cinert, cdof))
@@ -273,7 +324,8 @@ def _cross_force(a: jax.Array, f: jax.Array) -> jax.Array:
 def _sum_down(model: mujoco.MjModel, of_dof: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Sum from the root to each degree of freedom, without it, and to each body.
 
-    The three rotations of a free joint are one step. (V, 6, B) -> (V, 6, B), (N, 6, B).
+    The three rotations of a free joint or a ball are one step.
+    (V, 6, B) -> (V, 6, B), (N, 6, B).
     """
     before, to_body = [], [jnp.zeros_like(of_dof[0])]
     for body in range(1, model.nbody):
@@ -281,7 +333,7 @@ def _sum_down(model: mujoco.MjModel, of_dof: jax.Array) -> tuple[jax.Array, jax.
         first = model.body_jntadr[body]
         for joint in range(first, first + model.body_jntnum[body]):
             dof = model.jnt_dofadr[joint]
-            for width in (3, 3) if model.jnt_type[joint] == FREE else (1,):
+            for width in {FREE: (3, 3), BALL: (3,)}.get(model.jnt_type[joint], (1,)):
                 before += [running] * width
                 running = add([running, *of_dof[dof : dof + width]])
                 dof += width
@@ -337,7 +389,7 @@ def smooth(
     moved = materialize(jnp.stack([in_subtree[i] for i in model.dof_bodyid]))
     bias = total(cdof * moved[:, 10:], 1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
-    scalar = model.jnt_type != FREE
+    scalar = model.jnt_type > BALL
     if model.jnt_stiffness.any():
         index = model.jnt_qposadr[scalar]
         stretch = (
@@ -374,12 +426,12 @@ def _joint_inertia(
 
 def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
     """Return the force of a medium on each body, taken as a box, (N, 6, B)."""
-    mass = np.maximum(model.body_mass, 1e-12)[:, None]
+    mass = np.maximum(model.body_mass, mujoco.mjMINVAL)[:, None]
     trace = model.body_inertia.sum(axis=1, keepdims=True)
-    square = 6.0 * np.maximum(trace - 2 * model.body_inertia, 1e-12) / mass
+    square = 6.0 * np.maximum(trace - 2 * model.body_inertia, mujoco.mjMINVAL) / mass
     box = np.sqrt(square) * (model.body_mass[:, None] > 0)
     diameter = box.mean(axis=1, keepdims=True)
-    area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, 1e-12)
+    area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, mujoco.mjMINVAL)
     fourth = box**4
     turning = box * (fourth.sum(axis=1, keepdims=True) - fourth)
     rho, mu = model.opt.density, model.opt.viscosity

@@ -1,0 +1,186 @@
+"""Compare the physics with C MuJoCo, beside C with a start that differs by 1e-7."""
+
+import collections
+import contextlib
+import dataclasses
+import sys
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from generated_models import draw
+from plain_numpy import Program
+
+from gasil_envs.physics import dynamics, newton_batch, ours
+from gasil_envs.physics.interface import PhysicsState
+
+
+def load(xml):
+    """Return the model in an XML text or in a file."""
+    text = str(xml).lstrip().startswith("<")
+    load = mujoco.MjModel.from_xml_string if text else mujoco.MjModel.from_xml_path
+    return load(str(xml))
+
+
+def tight(model):
+    """Make C's own solver iterate until it has converged."""
+    model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
+    model.opt.iterations, model.opt.ls_iterations = 200, 200
+    model.opt.tolerance = 1e-14
+    return model
+
+
+def starts(model, count, seed=0, scale=0.1):
+    """Return positions, velocities and controls, (count, ...) each."""
+    rng = np.random.default_rng(seed)
+    qpos = model.qpos0 + scale * rng.normal(size=(count, model.nq))
+    for row in qpos:
+        mujoco.mj_normalizeQuat(model, row)
+    low, high = np.where(
+        model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]
+    ).T
+    control = rng.uniform(low, high, (count, model.nu))
+    return qpos, 5 * scale * rng.normal(size=(count, model.nv)), control
+
+
+def of_c(model, qpos, qvel, control, steps, fields=()):
+    """Return qpos, qvel and fields of C MuJoCo after steps."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, control
+    mujoco.mj_step(model, data, steps)
+    warned = bool(data.warning.number.any())
+    if fields:
+        mujoco.mj_rnePostConstraint(model, data)
+    state = np.concatenate([data.qpos, data.qvel])
+    if warned:
+        state[:] = np.nan
+    return state, {name: getattr(data, name).copy() for name in fields}
+
+
+@dataclasses.dataclass
+class Difference:
+    """Errors, max |a - b| / (1 + |b|), of a model's states after a number of steps."""
+
+    steps: int
+    error: np.ndarray
+    sensitivity: np.ndarray
+
+    @property
+    def excess(self):
+        """The largest error beyond 30 times what a start 1e-7 away makes of C."""
+        chaotic = self.sensitivity > 1e-3
+        error = np.where(chaotic, 0.0, self.error - 30 * self.sensitivity)
+        return float(np.max(error, initial=0.0))
+
+
+def relative(a, b):
+    return float(np.max(np.abs(a - b) / (1 + np.abs(b)), initial=0.0))
+
+
+def compare(model, count=4, seed=0, *, fields=(), steps=(1, 50), dtype=np.float32):
+    """Return the differences of our physics after each number of steps.
+
+    Those after the first also count the fields, relative to the largest of each.
+    """
+    own = dynamics.make(model, fields, 100, 30)
+    qpos, qvel, control = starts(model, count, seed)
+    state = PhysicsState(qpos.T, qvel.T, 0 * qvel.T)
+    single = jnp.zeros((0,))
+    del single
+    float32 = PhysicsState(
+        *(
+            jnp.asarray(x, jnp.float32)
+            for x in (state.qpos, state.qvel, state.qacc_warmstart)
+        )
+    )
+    with _products_at_once():
+        step = Program(
+            lambda state, control: dynamics.step(own, state, control, 1),
+            float32,
+            jnp.asarray(control.T, jnp.float32),
+        )
+    rounded = [x.astype(np.float32).astype(np.float64) for x in (qpos, qvel, control)]
+    results, of_fields = [], {}
+    for i in range(steps[-1]):
+        state, seen = step(state, control.T, dtype=dtype)
+        if i == 0:
+            of_fields = seen
+        if i + 1 in steps:
+            results.append((i + 1, np.concatenate([state.qpos, state.qvel]).T))
+    rng = np.random.default_rng(1)
+    differences = []
+    for number, ours_ in results:
+        error, sensitivity = [], []
+        for k in range(count):
+            right, right_fields = of_c(
+                model, *(x[k] for x in rounded), number, fields if number == 1 else ()
+            )
+            if not np.isfinite(right).all():
+                continue  # C itself fails.
+            own_error = relative(ours_[k], right)
+            if number == 1:
+                for name, x in right_fields.items():
+                    size = max(1.0, np.abs(x).max(initial=0.0))
+                    own_error = max(
+                        own_error, relative(of_fields[name][..., k] / size, x / size)
+                    )
+            error.append(own_error if np.isfinite(own_error) else np.inf)
+            near = []
+            for _ in range(2):
+                moved = [
+                    x[k]
+                    + 1e-7 * np.sign(rng.normal(size=x[k].shape)) * (1 + np.abs(x[k]))
+                    for x in rounded[:2]
+                ]
+                near.append(
+                    relative(of_c(model, *moved, rounded[2][k], number)[0], right)
+                )
+            sensitivity.append(max(near))
+        differences.append(Difference(number, np.array(error), np.array(sensitivity)))
+    return differences
+
+
+@contextlib.contextmanager
+def _products_at_once():
+    """Trace products of matrices as one operation each, which NumPy has a word for."""
+
+    def symmetric(left, right, spell_out):
+        return jnp.einsum("nib,njb->ijb", left, right)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(newton_batch, "_symmetric_product", symmetric)
+        for name, axes in (("", "nvb,vb->nb"), ("_transposed", "nvb,nb->vb")):
+            product = lambda m, v, spell_out, axes=axes: jnp.einsum(axes, m, v)
+            patch.setattr(newton_batch, f"_matvec{name}", product)
+        yield
+
+
+def why_not_ours(model, fields=()):
+    """Return why our physics does not take a model; None if it does."""
+    return ours.unsupported(model, fields)
+
+
+def main(first, last):
+    """Compare generated models, and print those that differ without a reason."""
+    count = collections.Counter()
+    for seed in range(first, last):
+        model = tight(load(draw(seed)))
+        why = why_not_ours(model)
+        if why is not None or not model.nv:
+            count["not ours" if why else "nothing moves"] += 1
+            continue
+        if ours.JaxPhysics(model).is_stiff:
+            count["stiff, which is told"] += 1
+            continue
+        fields = dynamics.FIELDS if why_not_ours(model, dynamics.FIELDS) is None else ()
+        differences = compare(model, 3, seed, fields=fields)
+        worst = max(x.excess for x in differences)
+        count["the same" if worst < 1e-4 else "different"] += 1
+        if worst >= 1e-4:
+            print(seed, *differences, flush=True)
+    print(dict(count))
+
+
+if __name__ == "__main__":
+    main(*map(int, sys.argv[1:]))
