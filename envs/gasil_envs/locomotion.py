@@ -70,8 +70,13 @@ class Task:
       reward: (state before, state after, fields, action) -> reward (), added to the
         others.
       healthy: (state, fields) -> bool (), whether an episode goes on.
-      solver_iterations: number of Newton iterations in JAX. 4 are enough for
-        most states of Gymnasium's tasks, 8 for all of robots with more contacts.
+      solver_iterations: largest number of Newton iterations in JAX; None for 100 of our
+        physics, which stops where it has converged, mostly after 2 to 8, and 8 of MJX,
+        or 30 if impratio is above 1. 4 are enough for most states of Gymnasium's tasks.
+      ls_iterations: largest number of steps of each line search; None for 16 of our
+        physics, or 4 if solver_iterations are given, and 8 of MJX.
+      keyframe: name or number of the model's keyframe that episodes start from; None
+        for the model's qpos0, at rest.
       start: random key -> qpos (nq,), qvel (nv,) of an episode's start; None for the
         model's own, with noise.
       episode_length: number of steps after which an episode is truncated.
@@ -101,7 +106,9 @@ class Task:
         Callable[[PhysicsState, PhysicsState, Fields, jax.Array], jax.Array] | None
     ) = None
     healthy: Callable[[PhysicsState, Fields], jax.Array] | None = None
-    solver_iterations: int = 8
+    solver_iterations: int | None = None
+    ls_iterations: int | None = None
+    keyframe: str | int | None = None
     start: Callable[[jax.Array], tuple[jax.Array, jax.Array]] | None = None
     episode_length: int = 1000
 
@@ -287,6 +294,7 @@ TASKS: Mapping[str, Task] = types.MappingProxyType(
             gymnasium_id="HumanoidStandup-v5",
             xml=ASSETS / "humanoidstandup.xml",
             frame_skip=5,
+            solver_iterations=8,
             forward_reward=0.0,
             control_cost=0.1,
             healthy_reward=1.0,
@@ -360,15 +368,15 @@ class LocomotionState(struct.PyTreeNode):
     position: jax.Array
 
 
-#: Physics engines by name: (model, fields, iterations) -> `Physics`.
-PHYSICS: Mapping[str, Callable[[mujoco.MjModel, tuple[str, ...], int], Physics]] = (
-    types.MappingProxyType(
-        {
-            "jax": ours_or_mjx,
-            "mjx": MjxPhysics,
-            "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
-        }
-    )
+#: Physics engines by name: (model, fields, iterations, ls_iterations) -> `Physics`.
+PHYSICS: Mapping[
+    str, Callable[[mujoco.MjModel, tuple[str, ...], int | None, int | None], Physics]
+] = types.MappingProxyType(
+    {
+        "jax": ours_or_mjx,
+        "mjx": MjxPhysics,
+        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+    }
 )
 
 #: Integrators by name; "model" is the integrator that the model specifies.
@@ -392,6 +400,37 @@ def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
         raise ValueError(f"xml is no model of MuJoCo: {why}") from None
 
 
+def _start(task: Task, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return qpos and qvel of a task's keyframe, or of its model's rest.
+
+    Raises:
+      ValueError: if the model has no such keyframe.
+    """
+    if task.keyframe is None:
+        return model.qpos0, np.zeros(model.nv)
+    names = [model.key(i).name for i in range(model.nkey)]
+    if task.keyframe in names:
+        number = names.index(task.keyframe)
+    elif isinstance(task.keyframe, int) and task.keyframe in range(model.nkey):
+        number = task.keyframe
+    else:
+        listed = ", ".join(names) or "none: the model has no keyframes"
+        raise ValueError(f"keyframe is {task.keyframe!r}: it must be one of {listed}")
+    return model.key_qpos[number], model.key_qvel[number]
+
+
+def _with_unit_quaternions(model: mujoco.MjModel, qpos: jax.Array) -> jax.Array:
+    """Return qpos with the quaternions of free joints and balls of length 1."""
+    before = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}
+    for joint, kind in enumerate(model.jnt_type):
+        if kind in before:
+            first = model.jnt_qposadr[joint] + before[kind]
+            quaternion = qpos[first : first + 4]
+            quaternion = quaternion / jnp.linalg.norm(quaternion)
+            qpos = qpos.at[first : first + 4].set(quaternion)
+    return qpos
+
+
 def _check(task: Task, model: mujoco.MjModel) -> None:
     """Raise `ValueError` if a task and its model do not fit or are not supported."""
     if not model.nu:
@@ -401,10 +440,12 @@ def _check(task: Task, model: mujoco.MjModel) -> None:
     skip = task.frame_skip
     low, high = model.actuator_ctrlrange.T
     length = task.episode_length
+    positive = (None, *range(1, 1000))
     for field, allowed, holds in (
         ("frame_skip", "1 or more", isinstance(skip, int) and skip > 0),
         ("episode_length", "1 or more", isinstance(length, int) and length > 0),
-        ("solver_iterations", "1 or more", task.solver_iterations > 0),
+        ("solver_iterations", "1 or more", task.solver_iterations in positive),
+        ("ls_iterations", "1 or more", task.ls_iterations in positive),
         ("hidden_positions", indexed, task.hidden_positions in entries),
         ("z_index", indexed, task.z_index in entries or task.healthy_z == _EVERYTHING),
         (
@@ -418,6 +459,14 @@ def _check(task: Task, model: mujoco.MjModel) -> None:
             raise ValueError(
                 f"{field} is {getattr(task, field)!r}: it must be {allowed}"
             )
+    if model.nactuator != model.nu:
+        raise ValueError(
+            "the model has actuators with several controls, such as pid: it must have "
+            "one for each actuator"
+        )
+    # C keeps which bodies sleep, which is in no state of ours.
+    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_SLEEP:
+        raise ValueError("the model has the flag sleep: it must be disabled")
     if not (low < high).all():
         name = model.actuator(int(np.argmin(low < high))).name
         raise ValueError(
@@ -474,10 +523,13 @@ class Locomotion(Env):
         _check(task, self.model)
         if INTEGRATORS[integrator] is not None:
             self.model.opt.integrator = INTEGRATORS[integrator]
-        self.physics = PHYSICS[physics](self.model, task.fields, task.solver_iterations)
+        self.physics = PHYSICS[physics](
+            self.model, task.fields, task.solver_iterations, task.ls_iterations
+        )
         self.dt = self.model.opt.timestep * task.frame_skip
         # A NumPy array becomes a constant of the traced functions.
-        self._start = np.asarray(self.model.qpos0, np.float32)
+        qpos, qvel = _start(task, self.model)
+        self._start, self._start_velocity = np.float32(qpos), np.float32(qvel)
         self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
 
     @property
@@ -521,18 +573,14 @@ class Locomotion(Env):
         noise = jax.random.uniform(
             position_key, self._start.shape, jnp.float32, -scale, scale
         )
-        qpos = noise + self._start
+        qpos = _with_unit_quaternions(self.model, noise + self._start)
         shape = (self.model.nv,)
         if self.task.normal_velocity_noise:
             qvel = scale * jax.random.normal(velocity_key, shape, jnp.float32)
         else:
             qvel = jax.random.uniform(velocity_key, shape, jnp.float32, -scale, scale)
-        # MuJoCo normalizes the quaternions in qpos; MJX does so only in some places.
-        for joint in np.flatnonzero(self.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
-            first = self.model.jnt_qposadr[joint] + 3
-            quaternion = qpos[first : first + 4]
-            quaternion = quaternion / jnp.linalg.norm(quaternion)
-            qpos = qpos.at[first : first + 4].set(quaternion)
+        if self._start_velocity.any():
+            qvel = qvel + self._start_velocity
         return self.state_at(qpos, qvel)
 
     def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:

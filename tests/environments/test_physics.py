@@ -80,7 +80,7 @@ def test_host_calls_that_would_deadlock_are_refused(monkeypatch):
     native._check_threads()
 
 
-def problems(batch, size, groups, seed=0):
+def problems(batch, size, groups, seed=0, *, pulling=False):
     """Random problems, and the same with every constraint as a row of a matrix."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(*batch, size, size))
@@ -102,12 +102,28 @@ def problems(batch, size, groups, seed=0):
         jacobian.append(rows.reshape(*batch, -1, size))
         reference.append(group.reference.reshape(*batch, -1))
         weight.append(group.weight.reshape(*batch, -1))
+    bound = np.zeros((*batch, sum(x.shape[-1] for x in reference)))
+    friction = None
+    if pulling:
+        # The last group's rows pull as well: every other one without bound.
+        most = np.where(np.arange(contacts[-1].weight.shape[-2]) % 2, np.inf, 1.0)
+        most = np.broadcast_to(most[:, None], contacts[-1].weight.shape)
+        contacts[-1] = contacts[-1].replace(bound=most)
+        bound[..., -most[0].size :] = most.reshape(*batch, -1)
+        friction = newton.FrictionRows(
+            draw_reference(size), draw_weight(size), rng.uniform(size=(*batch, size))
+        )
+        jacobian.append(np.broadcast_to(np.eye(size), (*batch, size, size)))
+        reference.append(friction.reference)
+        weight.append(friction.weight)
+        bound = np.concatenate([bound, friction.bound], axis=-1)
     problem = newton.Problem(
         inertia=root @ np.swapaxes(root, -1, -2) + np.eye(size),
         force=5.0 * rng.normal(size=(*batch, size)),
         warmstart=rng.normal(size=(*batch, size)),
         limits=limits,
         contacts=tuple(contacts),
+        friction=friction,
     )
     arrays = {
         "inertia": problem.inertia,
@@ -115,6 +131,7 @@ def problems(batch, size, groups, seed=0):
         "jacobian": np.concatenate(jacobian, axis=-2),
         "reference": np.concatenate(reference, axis=-1),
         "weight": np.concatenate(weight, axis=-1),
+        "bound": bound,
     }
     return arrays, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), problem)
 
@@ -123,37 +140,42 @@ def batch_last(problem):
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), problem)
 
 
-def plain_newton(inertia, force, jacobian, reference, weight):
-    """Newton's method in float64 with backtracking, until nothing changes."""
-    distance = lambda q: np.minimum(jacobian @ q - reference, 0.0)
-    cost = lambda q: (
-        0.5 * q @ inertia @ q - force @ q + 0.5 * np.sum(weight * distance(q) ** 2)
-    )
+def plain_newton(inertia, force, jacobian, reference, weight, bound):
+    """Newton's method in float64 with backtracking, until nothing changes.
+
+    A row whose bound is 0 pushes alone.
+    """
+    most = np.where(bound > 0, bound, np.inf)
+    distance = lambda q: jacobian @ q - reference
+    pushes = lambda q: np.clip(-weight * distance(q), np.where(bound, -bound, 0), most)
+    row_cost = lambda q: -pushes(q) * (distance(q) + 0.5 * pushes(q) / weight)
+    cost = lambda q: 0.5 * q @ inertia @ q - force @ q + np.sum(row_cost(q))
     qacc = np.linalg.solve(inertia, force)
     for _ in range(100):
-        gradient = inertia @ qacc - force + jacobian.T @ (weight * distance(qacc))
-        active = weight * (distance(qacc) < 0)
+        gradient = inertia @ qacc - force - jacobian.T @ pushes(qacc)
+        active = weight * (pushes(qacc) == -weight * distance(qacc))
         hessian = inertia + jacobian.T @ (active[:, None] * jacobian)
         direction, step = -np.linalg.solve(hessian, gradient), 1.0
         while cost(qacc + step * direction) > cost(qacc) and step > 1e-9:
             step /= 2
         qacc = qacc + step * direction
-    return qacc, -weight * distance(qacc)
+    return qacc, pushes(qacc)
 
 
 # (12, 40) is above the size up to which sums are spelled out.
 @pytest.mark.parametrize(
-    ("size", "groups"),
+    ("size", "groups", "pulling"),
     [
-        (5, []),
-        (5, [(2, SIMPLE)]),
-        (9, [(10, FLAT)]),
-        (9, [(3, SIMPLE), (8, PYRAMID)]),
-        (12, [(40, PYRAMID)]),
+        (5, [], False),
+        (5, [(2, SIMPLE)], False),
+        (9, [(10, FLAT)], False),
+        (9, [(3, SIMPLE), (8, PYRAMID)], False),
+        (12, [(40, PYRAMID)], False),
+        (6, [(3, FLAT), (4, SIMPLE)], True),
     ],
 )
-def test_newton_against_plain_numpy(size, groups):
-    arrays, problem = problems((20,), size, groups)
+def test_newton_against_plain_numpy(size, groups, pulling):
+    arrays, problem = problems((20,), size, groups, pulling=pulling)
     solution = jax.jit(jax.vmap(lambda p: solve(p, 20)))(problem)
     edge_forces = [np.zeros((20, 0)), *solution.edge_forces]
     edge_forces = np.concatenate([x.reshape(20, -1) for x in edge_forces], axis=1)
@@ -162,8 +184,9 @@ def test_newton_against_plain_numpy(size, groups):
         np.testing.assert_allclose(solution.qacc[i], qacc, rtol=1e-3, atol=3e-4)
         scale = np.abs(force).max()
         # The rows of the limits, one for each degree of freedom, are the first.
-        np.testing.assert_allclose(edge_forces[i], force[size:], atol=2e-3 * scale)
-        # What the edges leave of this is the limits'.
+        last = size + edge_forces.shape[1]
+        np.testing.assert_allclose(edge_forces[i], force[size:last], atol=2e-3 * scale)
+        # What the edges leave of this is the limits' and friction's.
         np.testing.assert_allclose(
             solution.constraint_force[i],
             arrays["jacobian"][i].T @ force,
@@ -202,17 +225,18 @@ def test_the_gpu_s_elimination_solves_the_same(size):
 
 
 @pytest.mark.parametrize(
-    ("size", "groups"),
+    ("size", "groups", "pulling"),
     [
-        (5, []),
-        (5, [(2, SIMPLE), (5, FLAT)]),
-        (16, [(3, PYRAMID)]),
-        (23, [(9, PYRAMID)]),
+        (5, [], False),
+        (5, [(2, SIMPLE), (5, FLAT)], False),
+        (16, [(3, PYRAMID)], False),
+        (23, [(9, PYRAMID)], False),
+        (18, [(3, PYRAMID), (4, SIMPLE)], True),
     ],
 )
-def test_the_kernel_of_a_gpu_solves_the_same(size, groups):
+def test_the_kernel_of_a_gpu_solves_the_same(size, groups, pulling):
     """Its operations are run by XLA; that it compiles for a GPU is another test."""
-    _, problem = problems((40,), size, groups)
+    _, problem = problems((40,), size, groups, pulling=pulling)
     contacts = []
     for group in problem.contacts:
         # The last contact is in play nowhere, and the one before it here and there.
@@ -220,8 +244,9 @@ def test_the_kernel_of_a_gpu_solves_the_same(size, groups):
         in_play[:, -1] = in_play[::2, -2] = 0.0
         contacts.append(group.replace(weight=group.weight * in_play))
     problem = batch_last(problem.replace(contacts=tuple(contacts)))
-    expected = jax.jit(functools.partial(solver.solve_many, 6, 4))(problem)
-    kernel = functools.partial(newton_kernel.solve_many, 6, 4, interpret=True)
+    most = (20, 20) if pulling else (6, 4)
+    expected = jax.jit(functools.partial(solver.solve_many, *most))(problem)
+    kernel = functools.partial(newton_kernel.solve_many, *most, interpret=True)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4),
         jax.jit(kernel)(problem),
@@ -247,9 +272,9 @@ def test_old_and_other_gpus_have_no_triton(monkeypatch, capability, expected):
     assert batching.has_triton() is expected
 
 
-@pytest.mark.parametrize("whole", [False, True])
-def test_the_kernels_of_a_gpu_can_be_lowered_for_one(whole):
-    _, problem = problems((20,), 9, [(3, SIMPLE), (8, PYRAMID)])
+@pytest.mark.parametrize(("whole", "pulling"), [(0, 0), (1, 0), (1, 1)])
+def test_the_kernels_of_a_gpu_can_be_lowered_for_one(whole, pulling):
+    _, problem = problems((20,), 9, [(3, SIMPLE), (8, PYRAMID)], pulling=pulling)
     problem = batch_last(problem)
 
     def solve(problem):

@@ -106,25 +106,26 @@ def test_a_task_s_own_functions_make_its_episodes():
 @pytest.mark.parametrize(
     ("parts", "what"),
     [
-        ({"world": '<geom type="box" size="1 1 1"/>'}, "other than planes, spheres"),
-        ({"motor": 'ctrlrange="-1 1" forcerange="-1 1"'}, "other than plain motors"),
+        ({"world": '<geom type="box" size="1 1 1"/>'}, "contacts of capsule and box"),
+        ({"top": '<option integrator="implicitfast"/>'}, "neither Euler nor RK4"),
         ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),
-        ({"joint": 'frictionloss="1"'}, "friction loss"),
         ({"top": '<option><flag clampctrl="disable"/></option>'}, "are disabled"),
     ],
 )
 def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):
-    Locomotion(Task(xml=arm(**parts), frame_skip=1, hidden_positions=0))
+    env = Locomotion(Task(xml=arm(**parts), frame_skip=1, hidden_positions=0))
+    assert env.backend == "mjx"
     assert "physics 'mjx' is used, some ten times slower than 'jax'" in caplog.text
     assert what in caplog.text and "\n" not in caplog.records[0].getMessage()
 
 
-def test_fields_of_several_trees_are_mjxs(caplog):
-    xml = ASSETS / "reacher.xml"
-    Locomotion(Task(xml=xml, frame_skip=1, fields=("xpos",)))
+def test_fields_about_a_base_that_does_not_move_are_mjxs(caplog):
+    xml = arm().replace('name="arm">', 'name="base"><geom size="1"/><body>')
+    xml = xml.replace("</body></worldbody>", "</body></body></worldbody>")
+    Locomotion(Task(xml=xml, frame_skip=1, hidden_positions=0))
     assert not caplog.text
-    Locomotion(Task(xml=xml, frame_skip=1, fields=("cvel",)))
-    assert "more than one kinematic tree, and cvel is returned" in caplog.text
+    Locomotion(Task(xml=xml, frame_skip=1, hidden_positions=0, fields=("cvel",)))
+    assert "its base has a mass and does not move, and cvel is returned" in caplog.text
 
 
 @pytest.mark.parametrize(

@@ -131,12 +131,12 @@ def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
             return f"it has contacts of {names}"
     if model.body_weldid[model.geom_bodyid[geoms[on_plane, 0]]].any():
         return "it has planes that move"
-    if _stay_parallel(model, geoms[(kinds == _CAPSULE).all(axis=1)]):
+    if stay_parallel(model, geoms[(kinds == _CAPSULE).all(axis=1)]):
         return "it has contacts of capsules that stay parallel"
     return None
 
 
-def _stay_parallel(model: mujoco.MjModel, geoms: np.ndarray) -> bool:
+def stay_parallel(model: mujoco.MjModel, geoms: np.ndarray) -> bool:
     """Whether two capsules are parallel in any state: they touch in two points then."""
     data, rng = mujoco.MjData(model), np.random.default_rng(0)
     parallel = np.ones(len(geoms), bool)
@@ -232,8 +232,9 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     up = constant(normal)
     across = axis - up * total(axis * up, 1)[:, None]
     length = jnp.sqrt(total(across**2, 1)[:, None])
-    along = across / jnp.maximum(length, 1e-15)
-    along = jnp.where(length > 1e-15, along, _orthogonal(up))
+    # The axis of an upright capsule is the normal but for rounding.
+    along = across / jnp.maximum(length, 1e-6)
+    along = jnp.where(length > 1e-6, along, _orthogonal(up))
     up = jnp.broadcast_to(up, along.shape)
     axes = [up, along, tree.cross(up, along)]
     return Touch(distance, position, jnp.stack(axes, axis=1))

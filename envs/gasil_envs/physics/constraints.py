@@ -29,6 +29,9 @@ from gasil_envs.physics.batching import (
     total,
 )
 
+#: The largest weight of an edge, in units of the inertia that it moves. Float32 does
+#: not resolve more. A contact is off by a share of 1 / this.
+_MOST_STIFFNESS = 1e5
 # The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1, 1), (1, -1), (1, 0))
 
@@ -147,6 +150,7 @@ class Constants(struct.PyTreeNode):
       friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes.
       margin: distance from which a contact is in play.
       inverse_weight: of an edge of the pyramid.
+      least_resistance: of an edge, the inverse of its greatest weight.
       impedance: of an edge.
     """
 
@@ -155,6 +159,7 @@ class Constants(struct.PyTreeNode):
     friction: np.ndarray
     margin: np.ndarray
     inverse_weight: np.ndarray
+    least_resistance: np.ndarray
     impedance: Impedance
 
 
@@ -226,6 +231,24 @@ class Layout(NamedTuple):
     limits: Limits
     groups: tuple[Group, ...]
     others: Others
+    impratio: float
+
+    @property
+    def stiffness(self) -> float:
+        """How much stiffer the stiffest contact is than the inertia that it moves."""
+        most = 0.0
+        for group in self.groups:
+            x = group.constants
+            softness = 1.0 - x.impedance.highest.astype(np.float64)
+            if len(group.edges) > 1:
+                softness = (
+                    softness
+                    * 2
+                    * x.friction[:, 0].astype(np.float64) ** 2
+                    / self.impratio
+                )
+            most = max(most, float(np.max(1.0 / softness)))
+        return min(most, _MOST_STIFFNESS)
 
 
 class Contacts(NamedTuple):
@@ -279,16 +302,16 @@ def layout(model: mujoco.MjModel) -> Layout:
         ),
     )
     contact = candidates.candidates(model)
-    motion_normal = _motion_normal(model, contact.geoms)
+    normal = motion_normal(model, contact.geoms)
     round_geoms = model.geom_type[contact.geoms] <= int(mujoco.mjtGeom.mjGEOM_CAPSULE)
     if (contact.dim > 3).any() or not round_geoms.all():
-        motion_normal = None
+        normal = None
     groups = [
-        _group(model, contact, dim, motion_normal=motion_normal)
+        _group(model, contact, dim, motion_normal=normal)
         for dim in (1, 3, 4, 6)
         if (contact.dim == dim).any()
     ]
-    return Layout(limits, tuple(groups), _others(model))
+    return Layout(limits, tuple(groups), _others(model), model.opt.impratio)
 
 
 def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
@@ -300,7 +323,7 @@ def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
     return tuple(tuple(map(int, edge)) for edge in edges)
 
 
-def _motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
+def motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
     """Return the normal of the plane that contains all motion, or None if none does.
 
     It is also None if a contact's tangents may be neither in the plane nor across it:
@@ -365,9 +388,14 @@ def _group(
         friction = friction[:, :1]
     sliding = friction[:, 0]
     inverse_weight = model.body_invweight0[body, 0].sum(axis=1)
+    floor = np.full(len(index), mujoco.mjMINVAL)
+    moved = inverse_weight
     if condim > 1:
-        inverse_weight = inverse_weight * (1 + sliding**2)
+        moved = inverse_weight = inverse_weight * (1 + sliding**2)
         inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
+        floor = floor * 2 * sliding**2 / model.opt.impratio
+    # Without friction an edge would weigh 1e10 times as much as what it moves.
+    floor = np.maximum(floor, moved / _MOST_STIFFNESS)
 
     def at(x: np.ndarray) -> np.ndarray:
         return x[index].astype(np.float32)
@@ -378,14 +406,17 @@ def _group(
         friction=_constant(friction),
         margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
+        least_resistance=_constant(floor),
         impedance=Impedance.of(model, at(contact.solref), at(contact.solimp)),
     )
     return Group(edges, pairs, constants)
 
 
-def _weight(impedance: jax.Array, inverse_weight: np.ndarray) -> jax.Array:
+def _weight(
+    impedance: jax.Array, inverse_weight: np.ndarray, least: Any = mujoco.mjMINVAL
+) -> jax.Array:
     resistance = inverse_weight * (1.0 - impedance) / impedance
-    return 1.0 / jnp.maximum(resistance, mujoco.mjMINVAL)
+    return 1.0 / jnp.maximum(resistance, least)
 
 
 @jax.named_scope("constraint_rows")
@@ -627,7 +658,8 @@ def contact_rows(
     speed = total(speed[:, None] * signs, 2)  # (C, edges, B)
     impedance = constants.impedance(gap)
     pull = constants.impedance.stiffness * impedance * jnp.where(active, gap, 0.0)
-    weight = jnp.where(active, _weight(impedance, constants.inverse_weight), 0.0)
+    weight = _weight(impedance, constants.inverse_weight, constants.least_resistance)
+    weight = jnp.where(active, weight, 0.0)
     # A normal that stands for two edges weighs as both.
     count = [
         2.0 if edges == _FLAT_PYRAMID and signs == (1, 0) else 1.0 for signs in edges

@@ -47,6 +47,8 @@ class Dynamics(NamedTuple):
     fields: tuple[str, ...]
 
 
+# From this stiffness of contacts on float32 loses digits of their forces.
+_STIFF = 300.0
 #: Fields that are about the centre of mass of each body's own tree, with its base.
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
@@ -106,20 +108,30 @@ class _Evaluation(NamedTuple):
     fields: Fields
 
 
-def _fields(dynamics: Dynamics, at: tree.Kinematics, *others: jax.Array) -> Fields:
-    """Return the fields to return; `others` are those from "cvel" on, in order."""
+def _fields(names: Sequence[str], at: tree.Kinematics, *others: jax.Array) -> Fields:
+    """Return the named fields; `others` are those from "cvel" on, in order."""
     every = zip(FIELDS, (at.xpos, at.xipos, at.cinert, *others), strict=True)
-    return {name: x for name, x in every if name in dynamics.fields}
+    return {name: x for name, x in every if name in names}
 
 
-def kinematics(dynamics: Dynamics, state: PhysicsState) -> Fields:
-    """Return the fields at `state`, with all forces 0."""
-    model, size = dynamics.model, state.qpos.shape[-1]
-    at = tree.kinematics(model, state.qpos)
+def kinematics(
+    model: mujoco.MjModel,
+    names: Sequence[str],
+    state: PhysicsState,
+    *,
+    with_bases: bool = False,
+) -> Fields:
+    """Return the named fields at `state`, with all forces 0.
+
+    With `with_bases` those about a tree's centre of mass count its parts that do not
+    move, as C MuJoCo does.
+    """
+    size = state.qpos.shape[-1]
+    at = tree.kinematics(model, state.qpos, with_bases=with_bases)
     cvel = tree.velocity(model, at.cdof, state.qvel)
     no_force = jnp.zeros((model.nv, size), jnp.float32)
     of_bodies = jnp.zeros((model.nbody, 6, size), jnp.float32)
-    return _fields(dynamics, at, cvel, no_force, no_force, of_bodies)
+    return _fields(names, at, cvel, no_force, no_force, of_bodies)
 
 
 def forward(
@@ -173,7 +185,12 @@ def forward(
         return solution.qacc, solution.constraint_force, of_bodies
 
     qacc, constraint_force, of_bodies = _with_contacts_in_play(constrain, contacts)
-    fields = _fields(dynamics, at, smooth.cvel, actuation, constraint_force, of_bodies)
+    if dynamics.layout.stiffness > _STIFF:
+        # The rows' forces are differences of large numbers; their sum need not be.
+        held = total(smooth.inertia * qacc, 1)
+        constraint_force = held - force
+    of_forces = actuation, constraint_force, of_bodies
+    fields = _fields(dynamics.fields, at, smooth.cvel, *of_forces)
     return _Evaluation(smooth.inertia, force + constraint_force, qacc, fields)
 
 
@@ -212,11 +229,13 @@ def step(
     control = actuation = jnp.clip(control, *own.control_range)
     if own.are_motors:
         motor = (own.transmission.of_qvel.T * own.gain[:, 0]).astype(np.float32)
-        actuation = total(jnp.asarray(motor)[..., None] * control, 1)
+        actuation = jnp.zeros_like(state.qvel)
+        if dynamics.model.nu:
+            actuation = total(jnp.asarray(motor)[..., None] * control, 1)
     is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     integrate = _euler if is_euler else _runge_kutta
     one = functools.partial(integrate, dynamics, actuation)
-    carry = (state, kinematics(dynamics, state))
+    carry = (state, kinematics(dynamics.model, dynamics.fields, state))
     return jax.lax.scan(lambda x, _: (one(*x), None), carry, length=frame_skip)[0]
 
 

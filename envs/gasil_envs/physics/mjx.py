@@ -1,5 +1,7 @@
 """MJX as MuJoCo ships it, as an engine of `interface.Physics`."""
 
+import copy
+import logging
 from collections.abc import Sequence
 from functools import partial
 
@@ -9,13 +11,17 @@ import mujoco
 import numpy as np
 from mujoco import mjx
 
+from gasil_envs.physics import candidates, collision, constraints
 from gasil_envs.physics.interface import Fields, PhysicsState
 from gasil_envs.precision import full_precision
+
+_LOGGER = logging.getLogger(__name__)
 
 #: The fields that MJX keeps among what depends on its implementation.
 _OF_IMPLEMENTATION = ("cinert", "cfrc_ext")
 
-#: Parts of a model that MJX leaves out without a word, and the arrays that have them.
+#: Parts of a model that neither MJX nor our physics has, and the arrays with them. MJX
+#: leaves them out without a word.
 _LEFT_OUT = {
     "nonlinear springs": ("jnt_stiffnesspoly", "tendon_stiffnesspoly"),
     "nonlinear damping": ("dof_dampingpoly", "tendon_dampingpoly"),
@@ -24,7 +30,13 @@ _LEFT_OUT = {
     "adhesion": ("geom_adhesion",),
     "moving surfaces": ("geom_surfacevel",),
     "plugins": ("nplugin",),
+    "flexes": ("nflex",),
 }
+_ENABLE, _DISABLE = mujoco.mjtEnableBit, mujoco.mjtDisableBit
+#: Flags that move nothing.
+_WITHOUT_EFFECT = _ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV
+#: Names of numbers of a model, by which MJX, unlike C, leaves contacts out.
+_MJX_NUMERICS = ("max_contact_points", "max_geom_pairs")
 
 
 def left_out(model: mujoco.MjModel) -> str | None:
@@ -33,7 +45,55 @@ def left_out(model: mujoco.MjModel) -> str | None:
         if any(np.any(getattr(model, name)) for name in names):
             return what
     options = ("noslip_iterations", "disableactuator")
-    return next((x for x in options if getattr(model.opt, x)), None)
+    for option in options:
+        if getattr(model.opt, option):
+            return option
+    flags = model.opt.enableflags & ~(_WITHOUT_EFFECT | _ENABLE.mjENBL_INVDISCRETE)
+    for flag in _ENABLE.__members__.values():
+        if flags & flag:
+            return f"the flag {flag.name.removeprefix('mjENBL_').lower()}"
+    if model.nactuator != model.nu:
+        return "actuators with several controls"
+    return None
+
+
+def differences(model: mujoco.MjModel) -> list[str]:
+    """Return the parts of a model in which MJX's numbers are not C MuJoCo's."""
+    geoms, dim, *_ = candidates.candidates(model)
+    kinds = model.geom_type[geoms].reshape(-1, 2)
+    on_plane = kinds[:, 0] == mujoco.mjtGeom.mjGEOM_PLANE
+    capsule = kinds == mujoco.mjtGeom.mjGEOM_CAPSULE
+    is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+    bodies = model.jnt_bodyid[is_free]
+    alone = ~np.isin(bodies, model.body_parentid)
+    numerics = [
+        mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name) >= 0
+        for name in _MJX_NUMERICS
+    ]
+    implicitfast = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    solimps = [model.geom_solimp, model.pair_solimp, model.jnt_solimp]
+    solimps += [model.eq_solimp, model.dof_solimp]
+    frictions = np.append(model.geom_friction[geoms, 0], model.pair_friction[:, 0])
+    found = {
+        "friction of steep capsules on planes": (
+            constraints.motion_normal(model, geoms) is None
+            and (on_plane & capsule[:, 1] & (dim > 1)).any()
+        ),
+        "contacts of capsules that stay parallel": collision.stay_parallel(
+            model, geoms[capsule.all(axis=1)]
+        ),
+        "contacts of cylinders, ellipsoids, boxes and meshes": (
+            kinds[:, 1] > int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+        ).any(),
+        "friction below 1e-5": (frictions < mujoco.mjMINMU).any(),
+        "solimp of width 0": any((x[:, 2] <= mujoco.mjMINVAL).any() for x in solimps),
+        "equalities of bodies": (model.eq_type <= int(mujoco.mjtEq.mjEQ_WELD)).any(),
+        "turning of free bodies with implicitfast": (
+            model.opt.integrator == implicitfast and alone.any()
+        ),
+        f"contacts that {' or '.join(_MJX_NUMERICS)} leaves out": any(numerics),
+    }
+    return [what for what, differs in found.items() if differs]
 
 
 class Unsupported(ValueError):
@@ -52,10 +112,11 @@ class MjxPhysics:
     Args:
       model: the model; its solver options are overwritten.
       fields: names of the ``mjData`` arrays to return.
-      iterations: Newton iterations.
-      ls_iterations: line-search steps. Float32 never meets MuJoCo's tolerance, which is
-        meant for float64, so that all of its 100 iterations would run. 4 and 8 give the
-        same result (relative error against C MuJoCo 6e-7 on walker2d).
+      iterations: Newton iterations, default 8, or 30 if impratio is above 1.
+      ls_iterations: line-search steps, default 8. Float32 never meets MuJoCo's
+        tolerance, which is meant for float64, so that all of its 100 iterations would
+        run. 4 and 8 give the same result (relative error against C MuJoCo 6e-7 on
+        walker2d).
 
     Raises:
       Unsupported: if MJX does not take the model.
@@ -67,20 +128,37 @@ class MjxPhysics:
         self,
         model: mujoco.MjModel,
         fields: Sequence[str] = (),
-        iterations: int = 4,
-        ls_iterations: int = 8,
+        iterations: int | None = None,
+        ls_iterations: int | None = None,
     ):
-        model.opt.iterations = iterations
-        model.opt.ls_iterations = ls_iterations
+        model.opt.iterations = iterations or (30 if model.opt.impratio > 1 else 8)
+        model.opt.ls_iterations = ls_iterations or 8
         # humanoid.xml specifies PGS, which MJX does not have.
         model.opt.solver = mujoco.mjtSolver.mjSOL_NEWTON
         self._fields = tuple(fields)
+        what = left_out(model)
+        if what is None and (model.geom_fluid[:, 0] > 0).any():
+            what = "fluidshape ellipsoid"
+        if what is not None:
+            raise Unsupported(what)
+        without = copy.copy(model)
+        without.opt.enableflags &= ~_WITHOUT_EFFECT
+        # Sensors move nothing, and MJX lacks many.
+        without.opt.disableflags |= _DISABLE.mjDSBL_SENSOR
         try:
-            self._model = mjx.put_model(model)
-            self._blank_data = mjx.make_data(model)
-        except NotImplementedError as error:
-            raise Unsupported(str(error).partition("\n")[0].rstrip(".")) from None
-        self._left_out = left_out(model)
+            self._model = mjx.put_model(without)
+            self._blank_data = mjx.make_data(without)
+            qpos, qvel, control = map(jnp.zeros, (model.nq, model.nv, model.nu))
+            state = PhysicsState(qpos, qvel, qvel)
+            jax.eval_shape(partial(self.step, frame_skip=1), state, control)
+        except Exception as error:  # MJX has many kinds of them.
+            lines = str(error).strip().splitlines() or [""]
+            raise Unsupported(lines[0].rstrip(".") or type(error).__name__) from None
+        if differs := differences(model):
+            _LOGGER.warning(
+                "physics 'mjx' differs from C MuJoCo's in this model's %s",
+                ", ".join(differs),
+            )
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
@@ -110,13 +188,14 @@ class MjxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,).
+        """Advance `frame_skip` time steps under one control (nu,)."""
+        return self._step(state, control, frame_skip)
 
-        Raises:
-          Unsupported: if MJX would leave out a part of the model.
-        """
-        if self._left_out is not None:
-            raise Unsupported(self._left_out)
+    # MJX takes seconds to trace this, which the check of the model needs too.
+    @partial(jax.jit, static_argnums=(0, 3))
+    def _step(
+        self, state: PhysicsState, control: jax.Array, frame_skip: int
+    ) -> tuple[PhysicsState, Fields]:
         data = self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
             lambda data, _: (mjx.step(self._model, data), None),

@@ -8,10 +8,10 @@ error or a warning in a simulation, its result is NaN, which ends its episode.
 
 import collections
 import concurrent.futures
-import copy
 import itertools
 import os
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, Protocol
 
 import jax
@@ -20,8 +20,9 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
+from gasil_envs.physics import dynamics
+from gasil_envs.physics.batching import batch_last
 from gasil_envs.physics.interface import Fields, PhysicsState
-from gasil_envs.physics.mjx import MjxPhysics
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 
@@ -183,21 +184,19 @@ class MujocoPhysics:
         # By number of simulations. Devices call at the same time, and each call takes
         # its own simulations.
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
-        # Initial states are computed far more often than they are used, so MJX computes
-        # them without a host call.
-        placed = copy.copy(model)
-        # MJX may lack some of these, and placing bodies needs none.
-        placed.geom_contype[:] = placed.geom_conaffinity[:] = 0
-        placed.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self._at_start = MjxPhysics(placed, fields)
+        # Initial states are computed far more often than they are used, so they are
+        # computed without a host call.
+        self._place = batch_last(
+            partial(dynamics.kinematics, model, self._fields, with_bases=True)
+        )
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
-        return self._at_start.init(qpos, qvel)
+        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""
-        return self._at_start.kinematics(state)
+        return self._place(state)
 
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int

@@ -162,8 +162,14 @@ def _free_rotation(quaternion: jax.Array) -> list[jax.Array]:
 
 
 @jax.named_scope("smooth_dynamics")
-def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
-    """Compute positions, inertia and axes of motion at qpos (nq, B)."""
+def kinematics(
+    model: mujoco.MjModel, qpos: jax.Array, *, with_bases: bool = False
+) -> Kinematics:
+    """Compute positions, inertia and axes of motion at qpos (nq, B).
+
+    With `with_bases` a tree's centre of mass is also that of its parts that do not
+    move.
+    """
     size = qpos.shape[1:]
     zero = jnp.zeros((3, *size), jnp.float32)
     world = [jnp.broadcast_to(x[:, None], zero.shape) for x in np.eye(3, dtype="f")]
@@ -211,13 +217,13 @@ def kinematics(model: mujoco.MjModel, qpos: jax.Array) -> Kinematics:
     xipos = stacked([x + rotate(turned, local) for x, turned, local in places])
     mass = model.body_mass.astype(np.float32)[:, None]
     # What does not move is not counted: it may be heavy, and far away.
-    moving = mass * (model.body_weldid > 0)[:, None]
+    moving = mass * ((model.body_weldid > 0) | with_bases)[:, None]
 
     def centre(mass: np.ndarray) -> jax.Array:
         return add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
 
     of_trees = trees(model)
-    if len(of_trees) == 1:
+    if len(of_trees) == 1 and not with_bases:
         com = centre(moving)
     else:
         # Trees may be far from each other.
@@ -420,12 +426,12 @@ def _joint_inertia(
 
 def _drag(model: mujoco.MjModel, at: Kinematics, cvel: jax.Array) -> jax.Array:
     """Return the force of a medium on each body, taken as a box, (N, 6, B)."""
-    mass = np.maximum(model.body_mass, 1e-12)[:, None]
+    mass = np.maximum(model.body_mass, mujoco.mjMINVAL)[:, None]
     trace = model.body_inertia.sum(axis=1, keepdims=True)
-    square = 6.0 * np.maximum(trace - 2 * model.body_inertia, 1e-12) / mass
+    square = 6.0 * np.maximum(trace - 2 * model.body_inertia, mujoco.mjMINVAL) / mass
     box = np.sqrt(square) * (model.body_mass[:, None] > 0)
     diameter = box.mean(axis=1, keepdims=True)
-    area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, 1e-12)
+    area = np.prod(box, axis=1, keepdims=True) / np.maximum(box, mujoco.mjMINVAL)
     fourth = box**4
     turning = box * (fourth.sum(axis=1, keepdims=True) - fourth)
     rho, mu = model.opt.density, model.opt.viscosity

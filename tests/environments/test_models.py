@@ -1,0 +1,163 @@
+"""Each part of a model, and generated models, against C MuJoCo."""
+
+import mujoco
+import pytest
+from against_mujoco import compare, load, tight, why_not_ours
+from generated_models import draw
+
+from gasil_envs.physics.dynamics import FIELDS
+from gasil_envs.physics.mjx import differences
+from gasil_envs.physics.ours import JaxPhysics
+
+DROP = """<mujoco><option timestep="0.005" {option}/><worldbody>
+<geom name="ground" type="plane" size="5 5 1" {ground}/>
+<body name="one" pos="0 0 0.15" euler="20 30 10"><freejoint/><geom name="it" {geom}/>
+</body>{world}</worldbody>{more}</mujoco>"""
+
+ARMS = """<mujoco><option {option}/><worldbody><body><joint name="a" axis="0 1 0" {a}/>
+<geom type="capsule" size="0.05" fromto="0 0 0 0 0 1"/><body pos="0 0 1">
+<joint name="b" axis="0.6 0.8 0" {b}/>
+<geom type="capsule" size="0.04" fromto="0 0 0 0.3 0 0.5"/></body></body>
+{world}</worldbody><actuator>{actuator}</actuator>{more}</mujoco>"""
+
+
+def drop(geom='size="0.2"', **parts):
+    names = dict.fromkeys(("option", "ground", "world", "more"), "")
+    return DROP.format(geom=geom, **names | parts)
+
+
+def arms(**parts):
+    names = ("option", "a", "b", "world", "actuator", "more")
+    return ARMS.format(**dict.fromkeys(names, "") | parts)
+
+
+SECOND = '<body name="two" pos="0 0 .4"><freejoint/><geom size=".2"/></body>'
+CAPSULE = 'type="capsule" size="0.1 0.2"'
+TENDON = """<tendon><fixed name="t" {}><joint joint="a" coef="1"/>
+<joint joint="b" coef="-0.7"/></fixed></tendon>"""
+ROW = "<equality><joint {} polycoef='{}'/></equality>"
+GENERAL = """<general joint="b" gaintype="affine" gainprm="1 2 0.5" biastype="affine"
+biasprm="0.1 -2 -0.3" ctrlrange="-1 1"/>"""
+
+MODELS = {
+    # C ignores this number of MJX's.
+    "contacts are not left out": drop(
+        'type="box" size="0.1 0.2 0.15"',
+        more='<custom><numeric name="max_contact_points" data="1"/></custom>',
+    ),
+    "impratio": drop(CAPSULE, option='impratio="100"'),
+    "no friction": drop('size="0.2" friction="0" priority="1"'),
+    "solimp of width 0": drop('size="0.2" solimp="0.8 0.99 0"'),
+    "box": drop('type="box" size="0.1 0.2 0.15"', ground='euler="10 20 0"'),
+    "cylinder": drop('type="cylinder" size="0.1 0.2"'),
+    "ellipsoid": drop('type="ellipsoid" size="0.1 0.2 0.15"'),
+    "condim 1": drop(CAPSULE + ' condim="1"', ground='condim="1"'),
+    "condim 4": drop(CAPSULE + ' condim="4"'),
+    "condim 6": drop(CAPSULE + ' condim="6" friction="1 0.1 0.1"'),
+    "sphere on a box": drop(
+        'type="box" size="0.1 0.2 0.15"',
+        world='<body pos="0 .1 .45"><freejoint/><geom size=".2"/></body>',
+    ),
+    "pair": drop(
+        CAPSULE + ' contype="0" conaffinity="0"',
+        more="""<contact><pair geom1="it" geom2="ground" condim="6" solref="0.03 1"
+        friction="1 0.5 0.1 0.1 0.1"/></contact>""",
+    ),
+    "exclude": drop(
+        world=SECOND,
+        more='<contact><exclude body1="one" body2="two"/></contact>',
+    ),
+    "servos": arms(
+        b='actuatorfrcrange="-2 2"',
+        actuator=f"""<position joint="a" kp="30" ctrlrange="-1 1" forcerange="-5 5"/>
+        <velocity joint="b" kv="3" gear="2" ctrlrange="-3 3"/>{GENERAL}""",
+    ),
+    "friction loss": arms(a='frictionloss="1"', b='frictionloss="0.3" damping="1"'),
+    "balls": arms(
+        world="""<body pos="3 0 0"><joint type="ball" damping="0.3" pos="0.1 0 0"/>
+        <geom size="0.1"/><body pos="0.3 0 0.5"><joint type="ball" range="0 5"
+        limited="true"/><geom type="box" size="0.1 0.2 0.05" pos="0.2 0 0" contype="0"
+        conaffinity="0"/></body></body>"""
+    ),
+    "joint equality": arms(more=ROW.format('joint1="a" joint2="b"', "0 1.5 0.3 0 0")),
+    "held joint": arms(more=ROW.format('joint1="a"', "0.2 0 0 0 0")),
+    "tendon": arms(
+        actuator="""<motor tendon="t" ctrlrange="-1 1"/>
+        <position tendon="t" kp="10" ctrlrange="-1 1"/>""",
+        more=TENDON.format(
+            'range="-0.05 0.05" limited="true" stiffness="5" damping="2" '
+            'frictionloss="0.4"'
+        ),
+    ),
+    "trees far apart": arms(
+        option='integrator="RK4"',
+        world="""<body pos="100 0 0"><freejoint/>
+        <geom type="box" size="0.1 0.2 0.3" pos="0 0 0.5" contype="0" conaffinity="0"/>
+        </body>""",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_part_of_a_model_is_mujocos(name):
+    model = tight(load(MODELS[name]))
+    is_stiff = name == "no friction"
+    fields = () if is_stiff else FIELDS
+    assert why_not_ours(model, fields) is None
+    assert JaxPhysics(model).is_stiff is is_stiff
+    for difference in compare(model, fields=fields, steps=(1, 10)):
+        most = 3e-4 if is_stiff else 1e-5
+        assert difference.error.size and difference.excess < most, difference
+
+
+# Small ones that our physics takes, from 0 to 100.
+SEEDS = (3, 4, 10, 11, 16, 21, 24, 25, 29, 31, 38, 44, 47, 48, 49, 52, 56, 57)
+
+
+@pytest.mark.parametrize("part", range(4))
+def test_generated_models_are_mujocos(part):
+    """`python tests/against_mujoco.py 0 2000` compares 2,000, after fifty steps too."""
+    for seed in SEEDS[part::4]:
+        model = tight(load(draw(seed)))
+        assert why_not_ours(model) is None
+        is_stiff = JaxPhysics(model).is_stiff
+        fields = FIELDS if why_not_ours(model, FIELDS) is None and not is_stiff else ()
+        for difference in compare(model, 2, seed, fields=fields, steps=(1, 5)):
+            assert difference.excess < (1e-2 if is_stiff else 1e-4), (seed, difference)
+
+
+@pytest.mark.parametrize(
+    ("xml", "what"),
+    [
+        (drop(CAPSULE), "friction of steep capsules on planes"),
+        (MODELS["contacts are not left out"], "max_contact_points"),
+        (MODELS["no friction"], "friction below 1e-5"),
+        (MODELS["solimp of width 0"], "solimp of width 0"),
+        (drop(option='integrator="implicitfast"'), "with implicitfast"),
+        (
+            drop(
+                world=SECOND,
+                more='<equality><weld body1="one" body2="two"/></equality>',
+            ),
+            "equalities of bodies",
+        ),
+    ],
+)
+def test_where_mjx_is_not_mujoco_is_told(xml, what):
+    assert any(what in x for x in differences(load(xml)))
+
+
+def test_two_capsules_that_stay_parallel_have_two_contacts_which_ours_lacks():
+    xml = drop(CAPSULE, world=f'<body pos="0 0 .4"><geom {CAPSULE}/></body>')
+    assert why_not_ours(load(xml)) is None
+    fixed = "<body><joint axis='0 0 1'/><geom type='capsule' size='0.1 0.2'/></body>"
+    both = fixed + fixed.replace("<body>", "<body pos='0.1 0 0'>")
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody>{both}</worldbody></mujoco>"
+    )
+    assert why_not_ours(model) == "it has contacts of capsules that stay parallel"
+
+
+def test_a_model_drawn_twice_is_the_same():
+    assert draw(3) == draw(3) and len({draw(seed) for seed in range(20)}) == 20
+    assert sum(why_not_ours(load(draw(i))) is None for i in range(20)) >= 8
