@@ -64,7 +64,9 @@ class Curve:
         """
         search = self.search
         raw = not getattr(search, "normalize_rewards", True)
-        own = search is not None and not (self.changes or search.decompose_rewards)
+        sees_phase = self.settings.get("observe_phase", False)
+        other = self.changes or sees_phase or (search and search.decompose_rewards)
+        own = search is not None and not other
         return self.reward_delay > 1, raw, own and self.agent in PAPERS
 
     def point(self, searched: Store) -> Point | None:

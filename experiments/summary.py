@@ -292,10 +292,10 @@ class Summary:
         }
         for page in self.pages.values():
             for search in page.figure.searches.values():
-                # The preset "paper" has normalized rewards, "scaled" decomposed ones.
-                other = search.decompose_rewards or not getattr(
-                    search, "normalize_rewards", True
-                )
+                # The preset "paper" has normalized rewards and the paper's bonus,
+                # "scaled" decomposed rewards.
+                other = search.decompose_rewards or getattr(search, "bonus", None)
+                other = other or not getattr(search, "normalize_rewards", True)
                 # On the sparse tasks each agent has one setting for all, and so has
                 # adaptive imitation where that returns about as much as its searches.
                 kind = "delayed" if search.reward_delay > 1 else "dense"
