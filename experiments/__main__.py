@@ -13,6 +13,7 @@ import tyro
 
 from experiments import (
     benchmark,
+    doing_nothing,
     engine,
     point_mass_layouts,
     point_mass_moments,
@@ -243,6 +244,7 @@ COMMANDS: Mapping[str, tuple[Any, Callable[[Any], int | None]]] = {
     "profile": (profile.Options, profile.run),
     "roofline": (roofline.Options, roofline.run),
     "zoo": (zoo.Options, zoo.run),
+    "doing_nothing": (doing_nothing.Options, doing_nothing.run),
     "point_mass_layouts": (point_mass_layouts.Options, point_mass_layouts.run),
     "point_mass_moments": (point_mass_moments.Options, point_mass_moments.run),
     "two_doors": (two_doors.Options, two_doors.run),

@@ -23,7 +23,9 @@ _POWER = 0.8
 _DRAWS = 10_000
 #: With fewer seeds there is no verdict, and no interval, which would be far too narrow.
 FEWEST_SEEDS = 5
-_VERDICTS = ("better", "not clear", "worse")
+#: The verdict on two curves that both return less than doing nothing.
+BELOW = "both below doing nothing"
+_VERDICTS = ("better", "not clear", "worse", BELOW)
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
 
@@ -71,11 +73,18 @@ class Comparison(Difference):
       high: the high end.
       visible: the smallest true difference that would be found with a probability of
         80%, at the level of the family's smallest p-value.
+      below: whether both curves return less than doing nothing.
     """
 
     low: float
     high: float
     visible: float
+    below: bool = False
+
+    @property
+    def verdict(self) -> str:
+        """Better, worse, not clear, or that both are below doing nothing."""
+        return BELOW if self.below else super().verdict
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
@@ -201,6 +210,17 @@ def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
     one, two = ours[..., :, None], others[..., None, :]
     points = np.add(one > two, one >= two, dtype=np.int8)
     return points.mean(axis=(-1, -2)) / 2
+
+
+def improvement_share(scores: Scores, panel: str, ours: str, other: str) -> float:
+    """Return `share_of_more` of two curves, NaN below all; NaN without scores."""
+    if not {(panel, ours), (panel, other)} <= scores.keys():
+        return math.nan
+    pair = [
+        np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
+        for x in (ours, other)
+    ]
+    return float(share_of_more(*pair))
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:

@@ -116,6 +116,8 @@ class Figure:
         curve "NAME early".
       solved_from: (task) -> the return of a success. If it is given, what counts is the
         share of seeds that solve the task (see `shares`), not their returns.
+      floor: whether what doing nothing returns is shown, and no curve is better or
+        worse than another if both return less.
     """
 
     title: str
@@ -127,6 +129,7 @@ class Figure:
     over: tuple[str, str] | None = None
     early: int | None = None
     solved_from: Callable[[str], float] | None = None
+    floor: bool = False
 
     def curves(self) -> list[tuple[str, str, Curve]]:
         """Return all curves, each with its panel and name."""

@@ -120,11 +120,16 @@ def rank(rows: Sequence[Mapping[str, Any]]) -> list[tuple[float, str]]:
     return sorted(ranked, reverse=True)
 
 
+def leads(name: str = "0-127.csv") -> list[tuple[float, str]]:
+    """Return the stored layouts as `rank` does."""
+    with (RESULTS / "point_mass_layouts" / name).open(newline="") as file:
+        return rank(list(csv.DictReader(file)))
+
+
 def run(options: Options) -> None:
     """Print the best layouts."""
     for name in ("0-127.csv", "65-117.csv"):
-        with (RESULTS / "point_mass_layouts" / name).open(newline="") as file:
-            ranked = rank(list(csv.DictReader(file)))
+        ranked = leads(name)
         print(f"{name}: lead of PPO+GASIL in {len(ranked)} layouts")
         for lead, line in ranked[: options.count]:
             print(f"{lead:+.1f} {line}")

@@ -16,14 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from experiments import plots, shares
+from experiments import doing_nothing, plots, point_mass_layouts, shares
 from experiments.comparisons import (
+    BELOW,
     FEWEST_SEEDS,
     Comparison,
     Scores,
     compare,
     counted,
     improvement,
+    in_words,
     interval,
     judged,
     number,
@@ -205,6 +207,7 @@ class Page:
         *("table", "returns", "differences", "tally", "evaluated", "aggregate"),
         *("protocol", "grids", "searches", "importance", "ranks", "published"),
         *("passing", "shares", "lead", "sooner", "noise", "means", "better", "chosen"),
+        *("points", "layouts", "apart", "final", "foretold"),
     )
 
     def __init__(
@@ -236,7 +239,21 @@ class Page:
     def _compared(self, scores: Scores) -> dict[tuple[str, ...], Comparison]:
         """Return the figure's comparisons of scores, corrected family by family."""
         families = self.figure.families()
-        return {k: x for one in families for k, x in compare(scores, one).items()}
+        every = {k: x for one in families for k, x in compare(scores, one).items()}
+        if not self.figure.floor:
+            return every
+        terms = self.figure.compared()
+        return {
+            key: dataclasses.replace(
+                one, below=all(self._is_below(scores, *x) for _, *x in terms[key])
+            )
+            for key, one in every.items()
+        }
+
+    def _is_below(self, scores: Scores, panel: str, label: str) -> bool:
+        """Return whether a curve returns less than doing nothing on its task."""
+        floor = doing_nothing.stored()[self.figure.panels[panel][label].env].mean
+        return float(interquartile_mean(scores[panel, label])) < floor
 
     def table(self) -> str:
         """Return the final returns: a row for each panel and curve."""
@@ -256,7 +273,19 @@ class Page:
                 against = self.comparisons.get((panel, rival, label))
                 cells += [f"{against}", against.verdict] if against else ["", ""]
             rows.append(cells)
+        if self.figure.floor:
+            rows = [
+                row
+                for panel, own in itertools.groupby(rows, lambda row: row[0])
+                for row in (*own, self._floor_row(panel, len(head)))
+            ]
         return markdown_table(head, rows)
+
+    def _floor_row(self, panel: str, columns: int) -> list[str]:
+        """Return the row of a table about what doing nothing returns."""
+        env = next(iter(self.figure.panels[panel].values())).env
+        cells = [panel, "doing nothing", "", in_words(*doing_nothing.stored()[env])]
+        return [*cells, *[""] * (columns - len(cells))]
 
     def returns(self, *panels: str) -> str:
         """Return final returns without intervals: a row per curve, a column per panel.
@@ -326,8 +355,10 @@ class Page:
             on = [panel for panel in panels if other in self.figure.panels[panel]]
             verdicts = _verdicts(self.comparisons, on, (ours, other))
             measured = "" if len(verdicts) == len(on) else " measured"
-            better, worse = map([*verdicts.values()].count, ("better", "worse"))
-            tasks = f"{better}{f' (worse on {worse})' if worse else ''}"
+            count = [*verdicts.values()].count
+            less = [f"{x} on {count(x)}" for x in ("worse", BELOW) if count(x)]
+            extra = f" ({', '.join(less)})" if less else ""
+            tasks = f"{count('better')}{extra}"
             tasks += f" of {len(verdicts)}{measured} tasks"
             names.setdefault(tasks, []).append(other.upper())
         parts = [
@@ -438,6 +469,80 @@ class Page:
                 cells += [f"{x:.0f}" for x in (np.median(means), means.min())]
             rows.append([name, f"{len(points)}", *cells])
         return markdown_table(head, rows)
+
+    def points(self, panel: str, name: str, seeds: str = "final") -> str:
+        """Return the final returns of each point of a search, where all are stored.
+
+        A row is a learning rate.
+
+        Args:
+          panel: the panel.
+          name: the curve, whose search has a learning rate and an alpha.
+          seeds: "final" for the curve's seeds, "search" for those of its search.
+        """
+        curve = self.figure.panels.get(panel, {}).get(name)
+        search = curve and curve.search
+        if curve is None or not search or seeds not in ("final", "search"):
+            raise self._no_slot("points", panel, name, seeds)
+        own = SEEDS if seeds == "search" else range(curve.seeds)
+        rows: dict[str, list[str]] = {}
+        points = search.points(self.searched)
+        for point, runs in zip(points, search.runs(points, own)):
+            if not all(run in self.searched for run in runs):
+                return ""
+            finals = np.array([self.searched[run].final for run in runs])
+            row = rows.setdefault(f"{point['learning_rate']:g}", [])
+            row.append(interval(finals))
+        alphas = dict.fromkeys(f"alpha {point['alpha']:g}" for point in points)
+        cells = [[rate, *row] for rate, row in rows.items()]
+        head = f"{panel}, {len(own)} seeds; learning rate"
+        return markdown_table([head, *alphas], cells)
+
+    def apart(self, panel: str, ours: str, other: str) -> str:
+        """Return a comparison of the page, or an empty text if curves are missing."""
+        compared = self.comparisons.get((panel, ours, other))
+        return f"{compared}, {compared.verdict}" if compared else ""
+
+    def final(self, panel: str, name: str, seeds: str = "final") -> str:
+        """Return a curve's final return.
+
+        Args:
+          panel: the panel.
+          name: the curve.
+          seeds: "final" for the curve's, "search" for what its search's seeds returned.
+        """
+        curve = self.figure.panels.get(panel, {}).get(name)
+        if curve is None or seeds not in ("final", "search"):
+            raise self._no_slot("final", panel, name, seeds)
+        if seeds == "search":
+            best = curve.search and curve.search.best(self.searched)
+            return number(best[1].mean()) if best else ""
+        scores = self.scores.get((panel, name))
+        return "" if scores is None else interval(scores)
+
+    def foretold(self, *words: str) -> str:
+        """Return whether predicted verdicts came true, or that they are not measured.
+
+        Args:
+          *words: panel, curve, other curve and the predicted verdict, again and again.
+        """
+        true = []
+        for panel, ours, other, verdict in zip(*[iter(words)] * 4, strict=True):
+            if (panel, ours, other) not in self.figure.compared():
+                raise self._no_slot("foretold", *words)
+            if (compared := self.comparisons.get((panel, ours, other))) is None:
+                return "not measured"
+            true.append(compared.verdict == verdict)
+        return "yes" if all(true) else f"{true.count(True)} of {len(true)}"
+
+    def layouts(self) -> str:
+        """Return in how many of the point mass' random layouts PPO+GASIL is ahead.
+
+        It is ahead where the mean return of its best point is higher than PPO's.
+        """
+        leads = [lead for lead, _ in point_mass_layouts.leads()]
+        ahead = sum(lead > 0 for lead in leads)
+        return f"{ahead} of {len(leads)} ({ahead / len(leads):.1%})"
 
     def importance(self) -> str:
         """Return a table of how much each hyperparameter matters to each agent."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_figures import DELAYS
 
-from experiments import comparisons, plots, report, search, summary
+from experiments import comparisons, doing_nothing, plots, report, search, summary
 from experiments.comparisons import compare
 from experiments.curves import Arm, Curve, Figure, difference, grid
 from experiments.figures import FIGURES
@@ -428,3 +428,39 @@ def test_no_verdict_of_a_note_is_typed_by_hand():
         for sentence in allowed:
             text = text.replace(sentence, "")
         assert not re.findall(words, text), path.name
+
+
+def test_of_two_curves_below_doing_nothing_neither_is_better(tmp_path, monkeypatch):
+    panels = grid(("ant",), ["ppo", "ppo+gasil"], base=None, seeds=5)
+    figure = Figure("Ants", "", panels, floor=True)
+    store = Store(tmp_path)
+    for i, curve in enumerate(panels["ant"].values()):
+        rows = np.arange(1.0, 11.0)
+        records = [
+            Record(rows, np.full(10, 900.0 * i + j), rows, {"physics": "mjx"})
+            for j in range(5)
+        ]
+        store.add(dict(zip(curve.runs(store), records, strict=True)))
+    for floor, verdict in ((2000.0, comparisons.BELOW), (500.0, "better")):
+        returned = {"ant": doing_nothing.Return(floor, floor, floor)}
+        monkeypatch.setattr(doing_nothing, "stored", lambda returned=returned: returned)
+        page = report.Page("matrix", store, figure=figure)
+        (compared,) = page.comparisons.values()
+        assert compared.verdict == verdict
+        assert page.tally() == (
+            f"- ppo+gasil against ppo: {verdict} on 1 of 1; probability of improvement "
+            "1.00 [1.00, 1.00]."
+        )
+        assert f"| ant | doing nothing |  | {floor:.0f} [" in page.table()
+
+
+def test_predictions_are_compared_with_verdicts(published):
+    page = published.pages["paper_controls"]
+    first = ("walker2d-delayed", "ppo+bonus", "ppo")
+    verdict = page.comparisons[first].verdict
+    assert page.foretold(*first, verdict) == "yes"
+    assert page.foretold(*first, verdict, *first, "none") == "1 of 2"
+    missing = ("ant-delayed", "ppo+gasil", "ppo+bonus")
+    assert page.foretold(*missing, "better") == "not measured"
+    with pytest.raises(InputError, match="foretold"):
+        page.foretold("ant-delayed", "ppo", "ppo+bonus", "better")
