@@ -10,7 +10,15 @@ from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import Any
 
-from experiments import benchmark, engine, profile, report, summary, zoo
+from experiments import (
+    benchmark,
+    doing_nothing,
+    engine,
+    profile,
+    report,
+    summary,
+    zoo,
+)
 from experiments.curves import Curve, Figure
 from experiments.engine import Setup
 from experiments.figure_results import Results
@@ -28,6 +36,7 @@ COMMANDS: Mapping[str, ModuleType] = {
     "benchmark": benchmark,
     "profile": profile,
     "zoo": zoo,
+    "doing_nothing": doing_nothing,
 }
 
 

@@ -23,7 +23,9 @@ _POWER = 0.8
 _DRAWS = 10_000
 #: With fewer seeds there is no verdict, and no interval, which would be far too narrow.
 FEWEST_SEEDS = 5
-_VERDICTS = ("better", "not clear", "worse")
+#: The verdict on two curves that both return less than doing nothing.
+BELOW = "both below doing nothing"
+_VERDICTS = ("better", "not clear", "worse", BELOW)
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
 
@@ -54,6 +56,7 @@ class Comparison:
       high: the high end.
       visible: the smallest true difference that would be found with a probability of
         80%, at the level of the family's smallest p-value.
+      below: whether both curves return less than doing nothing.
     """
 
     middle: float
@@ -61,11 +64,12 @@ class Comparison:
     low: float
     high: float
     visible: float
+    below: bool = False
 
     @property
     def verdict(self) -> str:
-        """Better, worse or not clear."""
-        return verdict(self.middle, self.p)
+        """Better, worse, not clear, or that both are below doing nothing."""
+        return BELOW if self.below else verdict(self.middle, self.p)
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
@@ -188,6 +192,17 @@ def more(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
     """Return the share of pairs of seeds in which ours is more, from (..., seeds)."""
     return more(ours[..., :, None], others[..., None, :]).mean(axis=(-1, -2))
+
+
+def improvement_share(scores: Scores, panel: str, ours: str, other: str) -> float:
+    """Return `share_of_more` of two curves, NaN below all; NaN without scores."""
+    if not {(panel, ours), (panel, other)} <= scores.keys():
+        return math.nan
+    pair = [
+        np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
+        for x in (ours, other)
+    ]
+    return float(share_of_more(*pair))
 
 
 def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:

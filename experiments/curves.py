@@ -64,7 +64,9 @@ class Curve:
         """
         search = self.search
         raw = not getattr(search, "normalize_rewards", True)
-        own = search is not None and not (self.changes or search.decompose_rewards)
+        sees_phase = self.settings.get("observe_phase", False)
+        other = self.changes or sees_phase or (search and search.decompose_rewards)
+        own = search is not None and not other
         return self.reward_delay > 1, raw, own and self.agent in PAPERS
 
     def point(self, searched: Store) -> Point | None:
@@ -119,6 +121,8 @@ class Figure:
         not in the figure any more; verdicts are still corrected for them.
       solved_from: (task) -> the return of a success. If it is given, what counts is the
         share of seeds that solve the task (see `shares`), not their returns.
+      floor: whether what doing nothing returns is shown, and no curve is better or
+        worse than another if both return less.
     """
 
     title: str
@@ -131,6 +135,7 @@ class Figure:
     early: int | None = None
     dropped_pairs: int = 0
     solved_from: Callable[[str], float] | None = None
+    floor: bool = False
 
     def curves(self) -> list[tuple[str, str, Curve]]:
         """Return all curves, each with its panel and name."""

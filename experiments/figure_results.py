@@ -7,11 +7,12 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from experiments import shares
+from experiments import doing_nothing, shares
 from experiments.comparisons import Comparison, Scores, compare
 from experiments.curves import Curve, Figure
 from experiments.store import Record, Store
 from gasil_jax.host.runs import Run
+from gasil_jax.statistics import interquartile_mean
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,7 +97,20 @@ class Results:
         compared: dict[tuple[str, ...], Comparison] = {}
         for family in self.figure.families():
             compared |= compare(scores, family, dropped)
-        return compared
+        if not self.figure.floor:
+            return compared
+        terms = self.figure.compared()
+        return {
+            key: dataclasses.replace(
+                one, below=all(self._is_below(scores, *x) for _, *x in terms[key])
+            )
+            for key, one in compared.items()
+        }
+
+    def _is_below(self, scores: Scores, panel: str, label: str) -> bool:
+        """Return whether a curve returns less than doing nothing on its task."""
+        floor = doing_nothing.stored()[self.figure.panels[panel][label].env].mean
+        return float(interquartile_mean(scores[panel, label])) < floor
 
     @functools.cached_property
     def steps(self) -> shares.Steps:

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure as Picture
 from PIL import Image
 
+from experiments import doing_nothing
 from experiments.comparisons import Scores
 from experiments.curves import Figure
 from experiments.search import AGENTS
@@ -178,6 +179,14 @@ def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> 
             band = {"color": lines[label]["color"], "alpha": 0.2, "linewidth": 0}
             axes.fill_between(steps, low, high, **band)
         axes.plot(steps, middle_of[label], label=label, **lines[label])
+    if figure.floor:
+        # Before labels, whose places depend on the limits.
+        env = next(iter(figure.panels[panel].values())).env
+        floor = doing_nothing.stored()[env].mean
+        axes.axhline(floor, color="gray", linestyle=(0, (1, 1)), linewidth=1.0)
+        at = axes.get_yaxis_transform()
+        words = {"color": "gray", "fontsize": 6, "va": "bottom", "transform": at}
+        axes.text(0.01, floor, "doing nothing", **words)
     if _has_direct_labels(figure):
         ends = {label: float(middle_of[label][-1]) for label in ranked}
         color_of = {label: lines[label]["color"] for label in ends}

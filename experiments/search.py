@@ -265,6 +265,8 @@ PAPER_SPACES: Mapping[str, Space] = {
     "ppo+bc": {**_PAPER_RATES, "behavior_cloning_coefficient": _COEFFICIENTS},
     "ppo+sil": {**_PAPER_RATES, "sil_coefficient": _COEFFICIENTS},
     "ppo+gasil": _PAPER,
+    # The control: PPO+GASIL's bonus as a constant.
+    "ppo+bonus": {name: _PAPER[name] for name in ("learning_rate", "alpha")},
 }
 #: The largest number of points that are tried; of more, as many are drawn.
 _PAPER_POINTS = 32
@@ -297,9 +299,11 @@ class PaperSearch(SingleStage):
     Attributes:
       normalize_rewards: whether rewards are normalized, as in the code of the authors'
         SIL, or raw, as in baselines' ppo1 and GAIL. The paper does not say which.
+      bonus: the form of PPO+GASIL's bonus; None for the agent's own.
     """
 
     normalize_rewards: bool = True
+    bonus: str | None = None
 
     def _base(self) -> Algorithm:
         base = algorithm(
@@ -308,6 +312,7 @@ class PaperSearch(SingleStage):
             num_envs=1,
             stagger_episodes=False,
             normalize_rewards=self.normalize_rewards,
+            **({"bonus": self.bonus} if self.bonus else {}),
         )
         return base.replace(**HUMANOID) if self._has_schedule else base
 

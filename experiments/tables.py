@@ -8,6 +8,7 @@ none of these.
 """
 
 import csv
+import itertools
 import pathlib
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -15,20 +16,23 @@ from typing import Any
 
 import numpy as np
 
+from experiments import doing_nothing
 from experiments import shares as statistics
 from experiments.comparisons import (
+    BELOW,
     FEWEST_SEEDS,
     Comparison,
     Effect,
     Scores,
     counted,
     improvement,
+    in_words,
     interval,
     judged,
     number,
     over_tasks,
 )
-from experiments.curves import Figure, name_of
+from experiments.curves import Curve, Figure, name_of
 from experiments.figure_results import Results
 from experiments.search import (
     AGENTS,
@@ -43,6 +47,7 @@ from experiments.search import (
     mean_ranks,
 )
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError, unknown
 from gasil_jax.statistics import interquartile_mean
 
 #: Mean returns that others have published, after about 1M steps, with their sources.
@@ -112,7 +117,20 @@ def table(results: Results) -> str:
             against = results.comparisons.get((panel, rival, label))
             cells += [f"{against}", against.verdict] if against else ["", ""]
         rows.append(cells)
+    if results.figure.floor:
+        rows = [
+            row
+            for panel, own in itertools.groupby(rows, lambda row: row[0])
+            for row in (*own, _floor(results.figure, panel, len(head)))
+        ]
     return markdown_table(head, rows)
+
+
+def _floor(figure: Figure, panel: str, columns: int) -> list[str]:
+    """Return the row of a table about what doing nothing returns."""
+    env = next(iter(figure.panels[panel].values())).env
+    cells = [panel, "doing nothing", "", in_words(*doing_nothing.stored()[env])]
+    return [*cells, *[""] * (columns - len(cells))]
 
 
 def returns(results: Results, *panels: str) -> str:
@@ -207,8 +225,10 @@ def better(results: Results, kind: str, ours: str, *others: str) -> str:
         on = [panel for panel in panels if other in results.figure.panels[panel]]
         verdicts = _verdicts(results.comparisons, on, (ours, other))
         measured = "" if len(verdicts) == len(on) else " measured"
-        better, worse = map([*verdicts.values()].count, ("better", "worse"))
-        tasks = f"{better}{f' (worse on {worse})' if worse else ''}"
+        count = [*verdicts.values()].count
+        less = [f"{x} on {count(x)}" for x in ("worse", BELOW) if count(x)]
+        extra = f" ({', '.join(less)})" if less else ""
+        tasks = f"{count('better')}{extra}"
         tasks += f" of {len(verdicts)}{measured} tasks"
         names.setdefault(tasks, []).append(other.upper())
     parts = [
@@ -317,6 +337,65 @@ def searches(results: Results) -> str:
             cells += [f"{x:.0f}" for x in (np.median(means), means.min())]
         rows.append([name, f"{len(points)}", *cells])
     return markdown_table(head, rows)
+
+
+def _curve(results: Results, panel: str, name: str) -> Curve:
+    """Return a curve; raise `InputError` if the figure has none of the name."""
+    if name not in (curves := results.figure.panels.get(panel, {})):
+        raise InputError(unknown("curve", name, [*curves]))
+    return curves[name]
+
+
+def points(results: Results, panel: str, name: str, seeds: str = "final") -> str:
+    """Return the final returns of each point of a search, where all are stored.
+
+    A row is a learning rate. They are of the curve's seeds, or with "search" of those
+    of the search, whose points have a learning rate and an alpha.
+    """
+    curve, rows = _curve(results, panel, name), dict[str, list[str]]()
+    own = SEEDS if seeds == "search" else range(curve.seeds)
+    search, store = curve.search, results.searched
+    assert search is not None
+    every = search.points(store)
+    for point, runs in zip(every, search.runs(every, own)):
+        if not all(run in store for run in runs):
+            return ""
+        row = rows.setdefault(f"{point['learning_rate']:g}", [])
+        row.append(interval(np.array([store[run].final for run in runs])))
+    alphas = dict.fromkeys(f"alpha {point['alpha']:g}" for point in every)
+    head = f"{panel}, {len(own)} seeds; learning rate"
+    return markdown_table([head, *alphas], [[rate, *row] for rate, row in rows.items()])
+
+
+def apart(results: Results, panel: str, ours: str, other: str) -> str:
+    """Return a comparison of the page, or an empty text if curves are missing."""
+    compared = results.comparisons.get((panel, ours, other))
+    return f"{compared}, {compared.verdict}" if compared else ""
+
+
+def final(results: Results, panel: str, name: str, seeds: str = "final") -> str:
+    """Return a curve's final return; with "search" that of its search's best point."""
+    curve = _curve(results, panel, name)
+    if seeds == "search":
+        best = curve.search.best(results.searched) if curve.search else None
+        return number(best[1].mean()) if best else ""
+    scores = results.scores.get((panel, name))
+    return "" if scores is None else interval(scores)
+
+
+def foretold(results: Results, *words: str) -> str:
+    """Return whether predicted verdicts came true, or that they are not measured.
+
+    The words are panel, curve, other curve and the predicted verdict, again and again.
+    """
+    true = []
+    for panel, ours, other, verdict in zip(*[iter(words)] * 4, strict=True):
+        if (panel, ours, other) not in results.figure.compared():
+            raise InputError(f"foretold has {panel}, {ours}, {other}: not compared")
+        if (compared := results.comparisons.get((panel, ours, other))) is None:
+            return "not measured"
+        true.append(compared.verdict == verdict)
+    return "yes" if all(true) else f"{true.count(True)} of {len(true)}"
 
 
 def ranks(results: Results, name: str) -> str:
@@ -482,7 +561,7 @@ SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(table, returns, differences, tally, evaluated, better, aggregate, passing),
-        *(published, grids, searches, ranks),
+        *(published, grids, searches, ranks, points, apart, final, foretold),
         *(shares, means, lead, sooner, noise),
     )
 }

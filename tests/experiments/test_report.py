@@ -11,6 +11,7 @@ from test_figures import DELAYS
 
 from experiments import (
     comparisons,
+    doing_nothing,
     figure_results,
     plots,
     report,
@@ -438,3 +439,39 @@ def test_no_verdict_of_a_note_is_typed_by_hand():
         for sentence in allowed:
             text = text.replace(sentence, "")
         assert not re.findall(words, text), name
+
+
+def test_of_two_curves_below_doing_nothing_neither_is_better(tmp_path, monkeypatch):
+    panels = grid(("ant",), ["ppo", "ppo+gasil"], base=None, seeds=5)
+    figure = Figure("Ants", "", panels, floor=True)
+    store = Store(tmp_path)
+    for i, curve in enumerate(panels["ant"].values()):
+        rows = np.arange(1.0, 11.0)
+        records = [
+            Record(rows, np.full(10, 900.0 * i + j), rows, {"physics": "jax"})
+            for j in range(5)
+        ]
+        store.add(dict(zip(curve.runs(store), records, strict=True)))
+    for floor, verdict in ((2000.0, comparisons.BELOW), (500.0, "better")):
+        returned = {"ant": doing_nothing.Return(floor, floor, floor)}
+        monkeypatch.setattr(doing_nothing, "stored", lambda returned=returned: returned)
+        results = figure_results.Results(figure, store)
+        (compared,) = results.comparisons.values()
+        assert compared.verdict == verdict
+        assert tables.tally(results) == (
+            f"- ppo+gasil against ppo: {verdict} on 1 of 1; probability of improvement "
+            "1.00 [1.00, 1.00]."
+        )
+        assert f"| ant | doing nothing |  | {floor:.0f} [" in tables.table(results)
+
+
+def test_predictions_are_compared_with_verdicts(published):
+    results = published["paper_controls"]
+    first = ("walker2d-delayed", "ppo+bonus", "ppo")
+    verdict = results.comparisons[first].verdict
+    assert tables.foretold(results, *first, verdict) == "yes"
+    assert tables.foretold(results, *first, verdict, *first, "none") == "1 of 2"
+    missing = ("ant-delayed", "ppo+gasil", "ppo+bonus")
+    assert tables.foretold(results, *missing, "better") == "not measured"
+    with pytest.raises(InputError, match="foretold"):
+        tables.foretold(results, "ant-delayed", "ppo", "ppo+bonus", "better")
