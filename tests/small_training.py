@@ -25,7 +25,7 @@ SMALL = (
     *(*FLAGS, *DISCRIMINATOR_FLAGS, "--total-steps", "1e3", "--batch-steps", "256"),
     *("--num-epochs", "2", "--buffer-steps", "300", "--discriminator-updates", "3"),
     *("--alpha", "0.5", "--alpha-schedule", "0", "0.5", "500", "1"),
-    *("--first-seed", "5"),
+    *("--learning-rate", "3e-4", "--first-seed", "5"),
 )
 #: Two programs of two points each. The first step of points 2 and 3 is beyond float32.
 GRID = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=3,1")

@@ -5,6 +5,7 @@ import json
 import pathlib
 import re
 import runpy
+import shutil
 import sys
 
 import matplotlib.pyplot as plt
@@ -12,8 +13,8 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from gasil_jax.host import policy_file
-from gasil_jax.sweeps import saved_states
+from gasil_jax.agents import expert
+from gasil_jax.host import checkpoint, policy_file, saved
 
 SMALL = {"num_epochs": 1, "hidden_sizes": (8,)}
 EXAMPLES = pathlib.Path(__file__).parent.parent / "docs" / "examples"
@@ -90,11 +91,51 @@ def test_an_agent_of_ones_own_trains(run_script, small, monkeypatch):
 
 
 def test_a_policy_plays_in_gymnasium(run_script, untrained_hopper, tmp_path):
-    env, _, _, states = saved_states.load(untrained_hopper)
+    env, _, _, states = saved.load(untrained_hopper)
     policy_file.save(tmp_path / "policy.npz", states, env, [0], np.zeros(1))
     arguments = (tmp_path, "Hopper-v5", "--episodes", "2")
     lines = run_script("gymnasium_rollout.py", *arguments).splitlines()
     assert [line.split(":")[0] for line in lines] == ["episode 0", "episode 1"]
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
+def test_good_trajectories_become_a_data_set(
+    run_script, untrained_point_mass, tmp_path, monkeypatch
+):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    out = shutil.copytree(untrained_point_mass, tmp_path / "run")
+    *_, states = saved.load(out)
+    # Four whole episodes and a fifth that may be cut fill the buffer.
+    lengths, returns = (50, 50, 50, 40, 10), (9.0, 4.5, 3.0, 2.0, -1.0)
+    buffer = states.agent.buffer
+    assert sum(lengths) == buffer.return_.shape[1]
+    rng = np.random.default_rng(0)
+    filled = buffer.replace(
+        observation=rng.normal(size=buffer.observation.shape).astype(np.float32),
+        action=rng.normal(size=buffer.action.shape).astype(np.float32),
+        return_=np.float32(np.repeat(returns, lengths))[None],
+        time=np.concatenate([np.arange(x, dtype=np.int32) for x in lengths])[None],
+        size=np.full_like(buffer.size, sum(lengths)),
+    )
+    states = states.replace(agent=states.agent.replace(buffer=filled))
+    (root,) = out.glob("programs/*/checkpoints")
+    record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=1.0)
+    checkpoint.write(root, 1, states, record)
+
+    printed = run_script("export_minari.py", out, "mass/good-v0")
+    assert printed == "4 episodes in mass/good-v0\n"
+    episodes = [*minari.load_dataset("mass/good-v0").iterate_episodes()]
+    assert [len(episode.actions) for episode in episodes] == [50, 50, 50, 40]
+    seen = np.concatenate([episode.observations[:-1] for episode in episodes])
+    np.testing.assert_array_equal(seen, filled.observation[0, :190])
+    for episode, total in zip(episodes, returns):
+        assert episode.rewards[-1] == total and not episode.rewards[:-1].any()
+        assert episode.truncations[-1] and not episode.terminations.any()
+    # An agent that imitates an expert can read it.
+    observation, action = expert.load("minari:mass/good-v0")
+    np.testing.assert_array_equal(observation, filled.observation[0, :190])
+    np.testing.assert_array_equal(action, filled.action[0, :190])
 
 
 def test_the_notebook_tells_its_story(monkeypatch, capsys):

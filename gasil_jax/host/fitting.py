@@ -75,10 +75,10 @@ def fit(
       algorithm: the algorithm that the seeds share.
       seeds: number of seeds, counted from seed 0; or the seeds' own numbers.
       points: values of hyperparameters, one mapping from names to values per point.
-        Each point is trained with all seeds, in the same program; of equal points one
-        is. In a folder the points that it has come first. The arrays that a
-        callback gets are then (points x seeds, ...), all seeds of the first point
-        first.
+        Each point is trained with all seeds, in the same program, and equal points
+        once. The points that a folder has come first, and are the default. The arrays
+        that a callback gets are then (points x seeds, ...), all seeds of the first
+        point first.
       folder: folder for the files of a run or a sweep, created if it is missing; None
         keeps nothing. All commands can read it, if a command line can name what was
         trained: an environment from `gasil_jax.make_env`, an agent that can be
@@ -139,10 +139,9 @@ def fit(
         evaluate_every=evaluate_every,
         evaluate_episodes=evaluate_episodes,
     )
-    described = _describe(env, _plain(algorithm), numbers, recording)
-    requested = dataclasses.replace(
-        described, points=completed(every, described.algorithm)
-    )
+    requested = _describe(env, _plain(algorithm), numbers, recording)
+    every = completed(every, requested.algorithm)
+    requested = dataclasses.replace(requested, points=every)
     interruption = Interruption()
     with contextlib.ExitStack() as stack:
         if folder is None:
@@ -153,6 +152,9 @@ def fit(
             how_to_continue = "continue with the same arguments and resume=True"
             stack.enter_context(noted(how_to_continue))
             stack.enter_context(interruption)
+            if points is None and folders.has_config(path):
+                # Those of the folder.
+                requested = dataclasses.replace(requested, points=())
             requested = _begin(path, requested, resume=resume)
         missing = requested.unfinished(path)
         outcomes = training.train_programs(

@@ -169,7 +169,8 @@ class Program:
             return [(columns, {}) for columns in metrics]
         scores = self.table("evaluations.csv", ("mean",))
         last = metrics[0]["env_steps"][-1]
-        if not scores[0] or scores[0]["env_steps"][-1] < last:
+        # Training that was stopped has no evaluation at its end.
+        if self.is_finished and not (scores[0] and scores[0]["env_steps"][-1] >= last):
             raise InputError(f"{self.path}/evaluations.csv is damaged: it lacks rows")
         return list(zip(metrics, scores))
 

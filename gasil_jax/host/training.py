@@ -103,7 +103,7 @@ def train_programs(
             )
             with each.opened():
                 with progress.aside("starting the trackers"):
-                    own = _trackers(recording.log, each, len(programs) == 1)
+                    own = _trackers(recording.log, each)
                 outcome = driver.drive(
                     members,
                     each.path,
@@ -124,17 +124,16 @@ def train_programs(
     return outcomes
 
 
-def _trackers(names: Sequence[str], program: Program, is_alone: bool) -> list[Tracker]:
+def _trackers(names: Sequence[str], program: Program) -> list[Tracker]:
     """Return the trackers of a program, which has the name of its run or sweep."""
     if not names:
         return []
-    *_, sweep, _, name = program.path.absolute().parts
     run = program.runs[0]
     labels = map("-".join, zip(*(map(str, x) for x in program.labels.values())))
     return trackers.make(
         names,
         program.path,
-        run_name=sweep if is_alone else f"{sweep}-{name}",
+        run_name=program.path.absolute().parent.parent.name,
         config={"env": run.env, **vars(run.settings), **run.algorithm.settings},
         members={
             label: {**own, "seed": seed}

@@ -11,9 +11,10 @@ import pytest
 from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
-from gasil_jax import algorithms, evaluate, merge, render, run, sweep
-from gasil_jax.host import run_folder
-from gasil_jax.sweeps import programs
+from gasil_jax import algorithms, evaluate, render, run, sweep
+from gasil_jax.cli import options
+from gasil_jax.host.sweep import Sweep
+from gasil_jax.host.sweep import read as read_sweep
 
 MODULE = '''
 import sys
@@ -203,21 +204,26 @@ def column(path, name):
     return {float(row[header.index(name)]) for row in rows}
 
 
+def metrics(folder):
+    (path,) = folder.glob("programs/*/metrics.csv")
+    return path
+
+
 def test_every_command_takes_it(tmp_path, capsys):
     out = tmp_path / "run"
     assert run.main([*SMALL, "--my-weight", "0.25", "--out", str(out)]) == 0
-    assert column(out / "metrics.csv", "my_weight") == {0.25}
+    assert column(metrics(out), "my_weight") == {0.25}
     described = json.loads((out / "config.json").read_text())["algorithm"]
     assert described["agent"] == "my_agents:Own" and described["my_weight"] == 0.25
-    again = ["--env", "point_mass", "--out", str(out), "--resume"]
+    again = ["--out", str(out), "--resume"]
     # The total of steps may grow.
-    before = (out / "metrics.csv").read_text()
+    before = metrics(out).read_text()
     assert run.main([*again, "--total-steps", "384"]) == 0
-    after = (out / "metrics.csv").read_text()
+    after = metrics(out).read_text()
     assert after.startswith(before) and after.count("\n") == 1 + 3
     summary = json.loads((out / "summary.json").read_text())
     assert summary["env_steps_per_seed"] == 384
-    assert column(out / "metrics.csv", "my_weight") == {0.25}
+    assert column(metrics(out), "my_weight") == {0.25}
     assert run.main([*again, "--my-weight", "0.3"]) == 2
     assert "my_weight was 0.25, is 0.3" in capsys.readouterr().err
     assert evaluate.main([str(out), "--episodes", "1"]) == 0
@@ -227,13 +233,11 @@ def test_every_command_takes_it(tmp_path, capsys):
     grid = [*SMALL, "--grid", "my_weight=0.1,0.3"]
     for part in ("1/2", "2/2"):
         assert sweep.main([*grid, "--shard", part, "--out", "parts"]) == 0
-    assert merge.main(["parts"]) == 0
     assert column(tmp_path / "parts" / "results.csv", "my_weight") == {0.1, 0.3}
     (tmp_path / "points.json").write_text('[{"my_weight": 0.2}, {"gamma": 0.9}]')
-    options = sweep.run_options.parse(
-        sweep.Options, [*SMALL, "--points-file", "points.json"], "gasil_jax.sweep"
-    )
-    (program,) = programs.group(sweep.make_plan(options).runs.values())
+    words = [*SMALL, "--points-file", "points.json"]
+    _, requested = options.read(options.SweepOptions, words, "x")
+    (program,) = requested.unfinished(tmp_path)
     assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]
 
 
@@ -245,7 +249,7 @@ def test_it_may_be_derived_from_another_agent(tmp_path):
     assert described["agent"] == "my_agents:Derived"
     for name, value in (("my_bonus", 0.25), ("alpha", 0.3), ("buffer_steps", 70)):
         assert described[name] == value
-    assert column(tmp_path / "run" / "metrics.csv", "good_steps") == {0, 70}
+    assert column(metrics(tmp_path / "run"), "good_steps") == {0, 70}
     assert evaluate.main(["run", "--episodes", "1"]) == 0
 
 
@@ -253,7 +257,7 @@ def test_the_help_explains_its_settings(capsys):
     with pytest.raises(SystemExit):
         run.main(["--help", "--agent", "my_agents:Own"])
     assert re.search(
-        r"--my-weight FLOAT\W+share of the reward", capsys.readouterr().out
+        r"--my-weight NUMBER\W+share of the reward", capsys.readouterr().out
     )
 
 
@@ -333,15 +337,14 @@ def test_its_numbers_are_checked(tmp_path, capsys, program, arguments, why):
 
 
 def test_a_run_without_its_module_says_so(my_agents, tmp_path, capsys):
-    described = {"env": "point_mass", "seeds": 1, "first_seed": 0, "settings": {}}
-    text = json.dumps(described | {"algorithm": {"agent": "gone:Own"}})
-    (tmp_path / "config.json").write_text(text)
+    algorithm = gasil_jax.Algorithm(my_agents.Own(my_weight=0.25))
+    Sweep("point_mass", algorithm, (0,)).write(tmp_path)
+    assert read_sweep(tmp_path).algorithm == algorithm
+    path = tmp_path / "config.json"
+    path.write_text(path.read_text().replace("my_agents:Own", "gone:Own"))
     assert evaluate.main([str(tmp_path)]) == 2
     message = "error: agent 'gone:Own' can't be imported: No module named 'gone'\n"
     assert capsys.readouterr().err == message
-    algorithm = gasil_jax.Algorithm(my_agents.Own(my_weight=0.25))
-    run_folder.write_description(tmp_path, described | {"algorithm": algorithm})
-    assert run_folder.read(tmp_path)["algorithm"] == algorithm
 
 
 def test_an_algorithm_has_the_numbers_of_its_agent(my_agents):

@@ -1,61 +1,35 @@
-"""Sweeps run or are refused; a point's results are those of a single run."""
+"""Sweeps run, grow or are refused; a point's results are those of a single run."""
 
 import csv
 import json
 import os
+import re
 import signal
-import types
 
 import jax
 import numpy as np
 import pytest
-from small_training import DISCRIMINATOR_FLAGS, FLAGS
+from small_training import FLAGS
 
-import gasil_jax
-from gasil_jax import evaluate, merge, numpy_policy, plot, policy, run, sweep
+from gasil_jax import evaluate, sweep
+from gasil_jax.cli import options as options_
+from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
-from gasil_jax.figures import plotting
-from gasil_jax.host import run_folder, run_options
-from gasil_jax.host.environments import Settings
+from gasil_jax.host import points, saved, training
 from gasil_jax.host.members import Members
-from gasil_jax.sweeps import assembly, programs, saved_states, tables
-from gasil_jax.sweeps import points as sweep_points
-from gasil_jax.sweeps.plan import Plan
-from gasil_jax.sweeps.points import PAPER_RANGES
+from gasil_jax.host.points import PAPER_RANGES
 
-SMALL = (
-    *(*FLAGS, "--preset", "paper", "--total-steps", "512", "--batch-steps", "256"),
-    *("--minibatch-size", "64", "--num-epochs", "2", "--buffer-steps", "300"),
-    *DISCRIMINATOR_FLAGS,
-)
-
-
-_MANY = (
-    "learning_rate",
-    "learning_rate_decay",
-    "gamma",
-    "gae_lambda",
-    "clip_epsilon",
-    "entropy_coefficient",
-    "max_grad_norm",
-    "initial_std",
-    "alpha",
-)
+pytestmark = pytest.mark.xdist_group("commands")
 
 
 def points_of(*arguments):
-    given = ["--env", "point_mass", *arguments]
-    options = run_options.parse(sweep.Options, given, "x")
-    run_options.check(options)
-    return sweep.make_plan(options).points
+    words = ["--env", "point_mass", *arguments]
+    return list(options_.read(SweepOptions, words, "x")[1].points)
 
 
 def test_a_grid_is_every_combination():
-    assert points_of("--grid", "buffer_steps=1e3") == points_of(
-        "--grid", "buffer_steps=1000"
-    )
-    points = points_of("--grid", "alpha=0.1,1", "discriminator_updates=1,5")
-    assert points == [
+    assert points_of("--grid", "buffer_steps=1e3") == [{"buffer_steps": 1000}]
+    assert points_of("--grid", "alpha=0.1,1", "discriminator-updates=1,5,1") == [
         {"alpha": 0.1, "discriminator_updates": 1},
         {"alpha": 0.1, "discriminator_updates": 5},
         {"alpha": 1.0, "discriminator_updates": 1},
@@ -64,86 +38,44 @@ def test_a_grid_is_every_combination():
 
 
 def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
-    many = [f"{name}=0.1,0.2,0.3,0.4,0.5,0.6" for name in _MANY]
+    names = "learning_rate learning_rate_decay gamma gae_lambda clip_epsilon alpha"
+    many = [f"{name}=0.1,0.2,0.3,0.4,0.5,0.6" for name in names.split()]
     # Combinations are drawn, not listed: there may be too many.
     with monkeypatch.context() as patch:
-        patch.setattr(sweep_points, "itertools", None)
-        points = points_of("--agent", "ppo+gasil", "--random", "20", "--grid", *many)
-    assert len({tuple(point.items()) for point in points}) == 20
-    points = points_of("--random", "16")
-    assert len({tuple(point.items()) for point in points}) == 16
-    for point in points:
+        patch.setattr(points, "itertools", None)
+        drawn = points_of("--random", "20", "--grid", *many)
+    assert len({tuple(point.items()) for point in drawn}) == 20
+    drawn = points_of("--random", "16")
+    assert len({tuple(point.items()) for point in drawn}) == 16
+    for point in drawn:
         assert set(point) == set(PAPER_RANGES)
         assert all(value in PAPER_RANGES[name] for name, value in point.items())
-
-
-def test_points_that_vary_in_different_things_have_a_table(tmp_path, monkeypatch):
-    def metrics(value):
-        returns = np.array([np.nan, value, np.nan])
-        return {
-            "episode_return": returns,
-            "episode_length": 10 * returns,
-            "env_steps": np.arange(3.0),
-            "skipped_updates": np.zeros(3),
-        }
-
-    training = {"env_steps": 9, "compile_seconds": 1.0, "train_seconds": 1.0}
-    training |= {"device": "cpu", "device_count": 1, "versions": {}}
-    points = [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
-    plan = Plan("point_mass", Settings(), gasil_jax.algorithm(), points, [5])
-    trained = [
-        types.SimpleNamespace(
-            runs=program.runs,
-            path=tmp_path / str(value),
-            tables=lambda value=value: [(metrics(value), {})],
-            training=training,
-        )
-        for program, value in zip(programs.group(plan.runs.values()), (1.0, 2.0))
-    ]
-    drawn = []
-
-    def marginals(path, values, returns, *, importance, **_):
-        path.touch()
-        drawn.append((values, returns, importance))
-
-    monkeypatch.setattr(plotting, "marginals", marginals)
-    summary = tables.write(tmp_path, tables.read(plan, trained))
-    assert summary["best_by_mean"] == 1
-    assert summary["points"][1]["interquartile_mean"] == 2.0
-    told = "(mean 2.0, interquartile mean 2.0, worst seed 2.0)"
-    assert f"best_by_mean: learning_rate=0.0001 {told}" in tables.report(
-        points, summary
-    )
-    # A point that does not name a value has the sweep's own.
-    ((values, returns, importance),) = drawn
-    assert values == {
-        "alpha": [1.0, 0.1],
-        "buffer_steps": [500, 1000],
-        "learning_rate": [3e-4, 1e-4],
-    }
-    assert list(returns) == [1.0, 2.0]
-    assert summary["importance"] == importance == dict.fromkeys(values)
-    header, *rows = (tmp_path / "results.csv").read_text().splitlines()
-    assert header == (
-        "point,seed,alpha,buffer_steps,learning_rate,final_return,final_length,diverged"
-    )
-    assert rows == ["0,5,1.0,500,,1,10,0", "1,5,,,0.0001,2,20,0"]
+    # So a sweep can grow by more of them.
+    assert points_of("--random", "4") == drawn[:4]
 
 
 def test_points_from_a_file(tmp_path):
     path = tmp_path / "points.json"
     path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
-    points = points_of("--points-file", str(path))
-    assert points == [{"alpha": 1.0, "buffer_steps": 500}, {"learning_rate": 1e-4}]
+    own = options_.read(SweepOptions, ["--env", "point_mass", "--random", "1"], "x")[1]
+    default = own.algorithm.settings
+    # A point that does not name a value has the sweep's own.
+    assert points_of("--points-file", str(path)) == [
+        {"alpha": 1.0, "buffer_steps": 500, "learning_rate": default["learning_rate"]},
+        {
+            "alpha": default["alpha"],
+            "buffer_steps": default["buffer_steps"],
+            "learning_rate": 1e-4,
+        },
+    ]
     for text, message in (
         ("[", "can't be read"),
         ("[" * 100_000, "can't be read"),
         (f'[{{"alpha": 1{"0" * 400}}}]', "it must be 0 or more and finite"),
         ("{}", "a list of points"),
-        ("[3]", "3 is not a point"),
+        ("[3]", "each point must be an object"),
         ('[{"alhpa": 1}]', "did you mean 'alpha'"),
         ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
-        ('[{"alpha": 1}, {"alpha": 1.0}]', "it has {'alpha': 1} twice"),
     ):
         path.write_text(text)
         with pytest.raises(InputError, match=message):
@@ -154,10 +86,7 @@ def test_points_from_a_file(tmp_path):
     ("arguments", "message"),
     [
         ("--grid alhpa=1", "did you mean 'alpha'"),
-        (
-            "--agent ppo --grid alpha=1",
-            "gail, not of ppo. What can vary: batch_steps",
-        ),
+        ("--agent ppo --grid alpha=1", "gail, not of ppo. What can vary: batch_steps"),
         (
             "--agent ppo+sil --grid buffer_steps=9",
             "buffer_steps is a setting of ppo+bc, ppo+bc+novelty, gasil, "
@@ -169,181 +98,204 @@ def test_points_from_a_file(tmp_path):
         ),
         ("--grid num_envs=1,2", "'num_envs' can't vary: it must be one of batch_steps"),
         ("--grid foo=1", "'foo' can't vary: it must be one of batch_steps"),
-        ("--agent ppo --random 5", "random is 5: it must be at most 4"),
         ("--grid alpha=1,big", "it must be numbers, like alpha=0.1,0.2"),
         ("--grid buffer_steps=1.5", "whole numbers, like buffer_steps=10,20"),
         ("--grid alpha=0.1,-1", "alpha is -1.0"),
         ("--grid minibatch_size=64,60", "minibatch_size is 60"),
-        ("--random 0", "random is 0"),
-        ("--random 3 --grid alpha=0.1,0.2,0.1", "random is 3: it must be at most 2"),
         ("--grid alpha=0.02,0.1 alpha=0.2", "grid has alpha twice"),
+        ("--grid alpha=1 --points-file x", "points_file can't be combined with grid"),
+        ("--agent ppo --random 5", "random is 5: it must be from 1 to 4, of 4 points"),
+        ("--random 0", "random is 0"),
+        ("--random 3 --grid alpha=0.1,0.2,0.1", "it must be from 1 to 2, of 2 points"),
         ("", "grid is empty"),
         ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
         ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
-        ("--grid alpha=1 --shard 1/2 --out x", "1 members (points x seeds) make 1"),
+        ("--grid alpha=1 --shard 1/2 --out x", "1 runs (points x seeds) make 1"),
         ("--grid alpha=1 --shard 1/1", "shard needs --out"),
         ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
         ("--grid alpha=1 --launcher rya", "launcher is 'rya': it must be one of"),
         ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
         ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
         ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
-        ("--grid alpha=1 --launcher ray --shards 999999999 --out x", "make 1 shards"),
     ],
 )
 def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
     assert sweep.main(["--env", "point_mass", *arguments.split()]) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.splitlines()) == 1
+    (error,) = capsys.readouterr().err.splitlines()
+    assert message in error
 
 
-def test_points_of_a_sweep_equal_single_runs(tmp_path, capsys):
-    out = tmp_path / "sweep"
-    arguments = (*SMALL, "--seeds", "2", "--out", str(out))
-    # The last point's first step is beyond float32: it must not harm the others.
-    grid = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=1,3")
-    assert sweep.main([*arguments, *grid]) == 0
-    assert "best_by_mean: learning_rate=0.0003" in capsys.readouterr().out
+def table(folder):
+    with (folder / "results.csv").open() as file:
+        return list(csv.DictReader(file))
 
-    rows = list(csv.DictReader((out / "results.csv").open()))
+
+def test_a_sweep_from_end_to_end(swept):
+    out, told, printed = swept
+    assert "x 8 runs" in told
+    best, worst, speed, following = printed.splitlines()
+    value = r"-?\d+\.\d"
+    sentence = (
+        rf"point (0|1), learning_rate=0.0003, discriminator_updates=(3|1): "
+        rf"mean {value}, interquartile mean {value}, worst seed {value}$"
+    )
+    assert re.match(f"best mean: {sentence}", best), best
+    assert re.match(f"best worst seed: {sentence}", worst), worst
+    assert re.match(r"[\d,]+ steps/s on .*, in out$", speed), speed
+    commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out"
+    assert following == f"next: {commands}"
+
+    rows = table(out)
     assert [(row["point"], row["seed"]) for row in rows] == [
-        (str(point), str(seed)) for point in range(4) for seed in range(2)
+        (str(point), seed) for point in range(4) for seed in "56"
     ]
-    assert [int(row["diverged"]) for row in rows] == [0] * 4 + [1] * 4
+    assert [row["discriminator_updates"] for row in rows[::2]] == ["3", "1", "3", "1"]
+    # The points beyond float32 did not harm the others.
+    diverged = [int(row["skipped_updates"]) > 0 for row in rows]
+    assert diverged == [False] * 4 + [True] * 4
     summary = json.loads((out / "summary.json").read_text())
     assert summary["best_by_mean"] in (0, 1)
     assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
-    for name in ("sweep.png", "hyperparameters.png"):
+    assert summary["device_count"] == jax.local_device_count()
+    for name in ("learning_curve.png", "sweep.png", "hyperparameters.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
-
-    alone = tmp_path / "alone"
-    more = ("--discriminator-updates", "3", "--out", str(alone))
-    # As many members as a program of the sweep has, which it shares.
-    assert run.main([*SMALL, "--seeds", "4", *more]) == 0
-    expected = json.loads((alone / "summary.json").read_text())["final_return"]
-    result = {
-        row["seed"]: float(row["final_return"]) for row in rows if row["point"] == "1"
-    }
-    single = {seed: expected[seed] for seed in ("0", "1")}
-    assert result == pytest.approx(single, rel=1e-3, abs=1e-3)
-    _, algorithm, seeds, states = saved_states.load(out, point=1)
-    assert algorithm.agent.discriminator_updates == 3 and seeds == [0, 1]
-    _, _, _, by_itself = saved_states.load(alone)
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3),
-        states.actor_critic.params,
-        jax.tree.map(lambda x: np.asarray(x)[:2], by_itself.actor_critic.params),
-    )
-    with pytest.raises(ValueError, match="it must be 'last'"):
-        saved_states.load(out, "best", point=1)
-    best = saved_states.load(out)[1]
-    assert best.agent.discriminator_updates == (1, 3)[summary["best_by_mean"]]
-    assert evaluate.main([str(out), "--point", "4"]) == 2
-    assert "has points 0 to 3" in capsys.readouterr().err
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
-    assert all(curves[name].shape == (4, 2, 2) for name in curves)
-    assert summary["env_steps_per_second"] > 0
-    assert summary["device_count"] == jax.local_device_count()
+    assert all(curves[name].shape == (4, 2, 4) for name in curves)
 
-    # The commands take it as they take a run, and its best policies are beside it.
-    drawn = plot.read(out, point=1)
-    assert drawn.final == pytest.approx([result["0"], result["1"]], rel=1e-3)
-    best_seed = max(range(2), key=lambda seed: curves["episode_return"][0, seed, -1])
-    env, _, _, states = saved_states.load(out, seed=best_seed)
-    expected = policy.weights(states, env)
-    for name, weight in numpy_policy.read(out, best_seed).items():
-        np.testing.assert_allclose(weight, np.squeeze(expected[name]), rtol=1e-6)
 
-    # A half of the points has a program for itself, of the same shapes.
-    parts = tmp_path / "parts"
-    where = ("--out", str(parts), "--shard")
-    part = lambda number, *more: sweep.main(
-        [*SMALL, "--seeds", "2", *grid, *where, f"{number}/2", *more]
-    )
-    assert part(2) == 0
-    assert merge.main([str(parts)]) == 2
-    assert "4 of 8 runs are missing" in capsys.readouterr().err
-    assert part(1) == 0
-    # The last one writes the tables.
-    told = capsys.readouterr().out
-    assert "shard 1/2 is done" in told and "best_by_mean" in told
-    assert (parts / "results.csv").read_bytes() == (out / "results.csv").read_bytes()
-    merged = np.load(parts / "curves.npz")
-    assert set(merged) == set(curves)
+def test_points_equal_single_runs(trained, swept):
+    single, curves = (np.load(x.folder / "curves.npz") for x in (trained, swept))
     for name in curves:
-        np.testing.assert_array_equal(merged[name], curves[name])
-    merged = json.loads((parts / "summary.json").read_text())
-    assert set(merged) == set(summary)
-    for name in ("points", "best_by_mean", "best_by_worst_seed", "versions", "device"):
-        assert merged[name] == summary[name]
-    assert (parts / "sweep.png").read_bytes() == (out / "sweep.png").read_bytes()
+        expected = single[name][0, :2]
+        np.testing.assert_allclose(curves[name][0], expected, rtol=1e-3, atol=1e-3)
+    _, algorithm, seeds, states = saved.load(swept.folder, point=0)
+    assert seeds == [5, 6] and algorithm.agent.discriminator_updates == 3
+    _, _, _, expected = saved.load(trained.folder)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b[:2], rtol=1e-3, atol=1e-3),
+        states.actor_critic.params,
+        expected.actor_critic.params,
+    )
 
 
-def test_a_sweep_continues_with_its_own_points_from_any_file(
-    tmp_path, capsys, monkeypatch
-):
-    first, copy, other = (tmp_path / f"{name}.json" for name in ("a", "b", "c"))
-    points = [{"alpha": 0.1}, {"alpha": 1.0, "discriminator_updates": 2}]
-    for path, listed in ((first, points), (copy, points), (other, points[:1])):
-        path.write_text(json.dumps(listed))
-    out = tmp_path / "sweep"
-    out.mkdir()
-    begun = [*SMALL, "--out", str(out), "--points-file", str(first)]
-    options = run_options.parse(sweep.Options, begun, "x")
-    run_options.write_config(options, out, points=points)
+def test_the_commands_take_a_point_or_the_best_one_and_say_so(swept, capsys):
+    folder = str(swept.folder)
+    best = json.loads((swept.folder / "summary.json").read_text())["best_by_mean"]
+    assert evaluate.main([folder, "--episodes", "1"]) == 0
+    told = capsys.readouterr()
+    assert f"point {best}, the best by mean (learning_rate=0.0003" in told.err
+    assert evaluate.main([folder, "--episodes", "1", "--point", str(best)]) == 0
+    assert capsys.readouterr().out == told.out
+    for arguments, message in (
+        (["--point", "4"], f"point is 4: {folder} has points 0 to 3"),
+        (["--point", "1", "--checkpoint", "best"], "it must be 'last'"),
+    ):
+        assert evaluate.main([folder, *arguments]) == 2
+        assert message in capsys.readouterr().err
 
-    arguments = [*SMALL, "--out", str(out), "--resume", "--points-file"]
-    planned, read = [], []
 
-    def prepare(options, jobs):
-        planned.append([job.hyperparameters[0]["alpha"] for job in jobs])
+@pytest.fixture
+def planned(monkeypatch):
+    """What sweeps would train in a test, where they end before it."""
+    every = []
+
+    def prepare(requested, programs, *_, **__):
+        every.append((requested, programs))
         raise InputError("enough")
 
-    original = run_folder.read
-    monkeypatch.setattr(assembly, "prepare", prepare)
-    monkeypatch.setattr(
-        run_folder, "read", lambda folder: read.append(folder) or original(folder)
-    )
-    for path in (copy, other):
-        assert sweep.main([*arguments, str(path)]) == 2
-    # Its config.json has the points as well.
-    first.unlink()
-    assert sweep.main(["--resume", "--out", str(out)]) == 2
-    assert planned == [[0.1, 1.0]] * 3 and read == [out] * 3
-    other.unlink()
-    assert sweep.main([*arguments, str(other)]) == 2
-    assert "c.json, which can't be read" in capsys.readouterr().err
+    monkeypatch.setattr(training, "prepare", prepare)
+    return every
+
+
+def begun(folder, *arguments):
+    """Write what a sweep has written when it is killed at once."""
+    folder.mkdir()
+    words = [*FLAGS, *arguments]
+    options_.read(SweepOptions, words, "x")[1].write(folder)
+    return ["--resume", "--out", str(folder)]
+
+
+OWN_GAMMA = {"gamma": 0.98}  # of the tuned preset
 
 
 @pytest.mark.parametrize(
-    ("before", "more", "points"),
+    ("before", "more", "expected"),
     [
-        (["--random", "2"], ["--grid", "alpha=0.5"], 3),
-        (["--grid", "alpha=0.1,0.2"], ["--random", "3"], 5),
-        (["--grid", "alpha=0.1,0.2,0.3", "--random", "1"], ["--random", "3"], 3),
-        (["--points-file", "a.json"], ["--grid", "alpha=0.5"], 2),
-        (["--grid", "alpha=0.5"], ["--points-file", "a.json"], 2),
+        (["--grid", "alpha=0.5"], [], [{"alpha": 0.5}]),
+        (
+            ["--grid", "alpha=0.5"],
+            ["--grid", "alpha=0.1"],
+            [{"alpha": 0.5}, {"alpha": 0.1}],
+        ),
+        # A grid that lacks an axis has the sweep's own value; equal runs are one.
+        (
+            ["--grid", "alpha=0.5", "gamma=0.9,0.98"],
+            ["--grid", "alpha=0.5,2"],
+            [
+                {"alpha": 0.5, "gamma": 0.9},
+                {"alpha": 0.5, **OWN_GAMMA},
+                {"alpha": 2.0, **OWN_GAMMA},
+            ],
+        ),
+        (
+            ["--grid", "alpha=0.5"],
+            ["--grid", "gamma=0.9,0.98", "alpha=0.5"],
+            [{"alpha": 0.5, **OWN_GAMMA}, {"alpha": 0.5, "gamma": 0.9}],
+        ),
+        (
+            ["--points-file", "a.json"],
+            ["--grid", "alpha=0.5"],
+            [{"alpha": 0.7}, {"alpha": 0.5}],
+        ),
     ],
 )
-def test_a_sweep_grows_by_points_of_another_source(
-    before, more, points, tmp_path, monkeypatch
+def test_a_sweep_continues_and_grows(
+    before, more, expected, tmp_path, monkeypatch, planned
 ):
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "a.json").write_text('[{"alpha": 0.7}]')
-    options = run_options.parse(sweep.Options, [*SMALL, "--out", "s", *before], "x")
-    (tmp_path / "s").mkdir()
-    plan = sweep.make_plan(options)
-    run_options.write_config(options, tmp_path / "s", points=plan.points)
-    planned = []
+    file = tmp_path / "a.json"
+    file.write_text('[{"alpha": 0.7}]')
+    again = begun(tmp_path / "s", *before)
+    # Its config.json has the points as well.
+    file.unlink()
+    assert sweep.main([*again, *more]) == 2
+    ((requested, programs),) = planned
+    assert list(requested.points) == expected
+    assert sum(len(each.runs) for each in programs) == len(expected)
 
-    def prepare(options, jobs):
-        planned.append(options)
-        raise InputError("enough")
 
-    monkeypatch.setattr(assembly, "prepare", prepare)
-    assert sweep.main(["--resume", "--out", "s", *more]) == 2
-    stored = run_folder.read(tmp_path / "s")
-    assert len(sweep.make_plan(planned[0], stored).points) == points
+def test_random_points_grow_by_more(tmp_path, planned):
+    again = begun(tmp_path / "s", "--random", "2", "--seeds", "3")
+    assert sweep.main([*again, "--random", "5"]) == 2
+    ((requested, programs),) = planned
+    assert list(requested.points) == points_of("--random", "5")
+    assert sum(len(each.runs) for each in programs) == 15
+
+
+def test_other_settings_and_a_folder_of_something_else_are_refused(
+    tmp_path, capsys, planned
+):
+    again = begun(tmp_path / "s", "--grid", "alpha=1")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "text.tex").touch()
+    grid = [*FLAGS, "--grid", "alpha=1"]
+    for words, message in (
+        ([*again, "--gamma", "0.9"], "gamma was 0.98, is 0.9"),
+        ([*again, "--reward-delay", "3"], "reward_delay was 1, is 3"),
+        ([*grid, "--out", str(tmp_path / "s")], "is not empty"),
+        ([*grid, "--out", str(tmp_path / "thesis")], "is not empty"),
+        ([*again, "--points-file", "no.json"], "no.json, which can't be read"),
+    ):
+        assert sweep.main(words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert message in line
+    assert not planned
+    # A sweep without a name does not look into the folder that it starts in.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path / "s")
+        assert sweep.main(grid) == 2
+    assert len(planned) == 1
 
 
 def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
@@ -375,6 +327,7 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
     interrupt(1, 30, ["--resume", "--out", str(out)])
     seconds = (first / "training.json").read_bytes()
     assert sweep.main(["--resume", "--out", str(out)]) == 0
-    assert (out / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+    for name in ("results.csv", "policy.npz"):
+        assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     # The first program was finished, and is left as it was.
     assert (first / "training.json").read_bytes() == seconds

@@ -8,27 +8,30 @@ import signal
 
 import brax.envs
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_training
+from test_checkpoints import assert_same
+from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import Decompose, Normalize, evaluate, plot, render, run
-from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, metrics_files, run_folder, run_options
+from gasil_jax.host import checkpoint, driver, fitting, saved
 from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.sweep import Recording
 
 # Iterations, the longest of a chunk, and the algorithm of both ways to train.
 ITERATIONS, CHUNK = 100, 2
 PPO = gasil_jax.algorithm("ppo", **small_training.SETTINGS)
-PPO = PPO.replace(total_steps=ITERATIONS * 128)
+SHORT, PPO = PPO, PPO.replace(total_steps=ITERATIONS * 128)
 FLAGS = (
     *(*small_training.FLAGS, "--agent", "ppo", "--preset", "paper"),
     "--no-normalize-rewards",
     *("--total-steps", str(ITERATIONS * 128), "--stagger-episodes"),
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
-BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
+TABLES = ("metrics.csv", "evaluations.csv")
 
 
 @pytest.fixture(scope="module")
@@ -51,45 +54,42 @@ def commanded(tmp_path_factory):
     return out
 
 
-def test_it_continues_what_a_command_began_but_no_sweep(env, tmp_path):
-    options = run_options.parse(
-        run_options.Options, [*FLAGS, "--evaluate-every", "128"], "x"
+@pytest.fixture(scope="module")
+def fitted(env, commanded, tmp_path_factory):
+    """The result of `fit`, its folder, and what its callback was given."""
+    folder, seen = tmp_path_factory.mktemp("fitted") / "out", []
+    arguments = {"seeds": 2, "folder": folder, "callback": seen.append, **EVALUATED}
+    return gasil_jax.fit(env, PPO, **arguments), folder, seen
+
+
+def assert_equal_folders(first, second):
+    """Compare tables, results and policies, to the last digit."""
+    for name in TABLES:
+        one, other = (program_of(x) / name for x in (first, second))
+        assert one.read_bytes() == other.read_bytes()
+    for name in ("results.csv", "policy.npz"):
+        assert (first / name).read_bytes() == (second / name).read_bytes()
+
+
+def test_it_gives_the_numbers_of_the_command_line(fitted, commanded):
+    result, folder, seen = fitted
+    assert_equal_folders(folder, commanded)
+    assert {x.name for x in folder.iterdir()} == {x.name for x in commanded.iterdir()}
+    first, second = (
+        json.loads((x / "config.json").read_text()) for x in (folder, commanded)
     )
-    once = PPO.replace(total_steps=128)
-    options = dataclasses.replace(options, config=once.config)
-    for name, more in (("run", {}), ("sweep", {"points": [{}]})):
-        (tmp_path / name).mkdir()
-        run_options.write_config(options, tmp_path / name, **more)
-    arguments = {"seeds": 1, "resume": True, "evaluate_every": 128}
-    before = (tmp_path / "sweep" / "config.json").read_text()
-    with pytest.raises(ValueError, match="a sweep: continue it with"):
-        gasil_jax.fit(env, once, folder=tmp_path / "sweep", **arguments)
-    assert (tmp_path / "sweep" / "config.json").read_text() == before
-    gasil_jax.fit(env, once, folder=tmp_path / "run", **arguments)
-    stored = run_folder.read(tmp_path / "run")
-    assert (stored["preset"], stored["evaluate_episodes"]) == ("paper", None)
+    assert (first.pop("preset"), second.pop("preset")) == (None, "paper")
+    assert first == second and first["only_python"] is None
 
-
-def same(result, folder):
-    """Compare a result's tables with those of a folder, to the last digit."""
-    for found, name in (
-        (result.metrics, "metrics.csv"),
-        (result.evaluations, "evaluations.csv"),
-    ):
-        expected = metrics_files.read_metrics(folder / name, {"seed": [0, 1]})
-        assert set(found) == set(expected)
-        for column in expected:
-            np.testing.assert_array_equal(found[column], expected[column])
-
-
-def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
-    seen = []
-    result = gasil_jax.fit(env, PPO, seeds=2, callback=seen.append, **EVALUATED)
-    same(result, commanded)
+    curves = np.load(commanded / "curves.npz")
+    for name, values in result.metrics.items():
+        np.testing.assert_array_equal(values, curves[name][0])
+    for name, values in result.evaluations.items():
+        np.testing.assert_array_equal(values, curves[f"evaluation_{name}"][0])
     assert result.metrics["policy_loss"].shape == (2, ITERATIONS)
     assert result.evaluations["mean"].shape == (2, 4)
     np.testing.assert_array_equal(result.states.iteration, [ITERATIONS] * 2)
-    assert capsys.readouterr().err == ""
+    assert_same(result.states, saved.load(commanded)[-1])
 
     sizes = [progress.metrics["policy_loss"].shape[1] for progress in seen]
     assert sum(sizes) == ITERATIONS and max(sizes) <= CHUNK
@@ -102,12 +102,16 @@ def test_it_gives_the_numbers_of_the_command_line(env, commanded, capsys):
     )
 
 
-def test_without_a_discriminator_there_is_no_reward(commanded):
+def test_all_commands_read_its_folder(fitted, tmp_path, capsys):
+    for command, name in ((plot, "x.png"), (evaluate, "x.csv"), (render, "x.gif")):
+        assert command.main([str(fitted[1]), "--out", str(tmp_path / name)]) == 0
+        assert (tmp_path / name).stat().st_size > 0
+    assert "point_mass, ppo" in capsys.readouterr().out
     with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
-        gasil_jax.load_reward(commanded)
+        gasil_jax.load_reward(fitted[1])
 
 
-def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
+def test_it_stops_early_and_goes_on(env, commanded, tmp_path, capsys):
     """What stops it is a state, which is still there when training has gone on."""
     states, late, out = [], [], tmp_path / "out"
 
@@ -123,17 +127,19 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
     assert [int(x.iteration[1]) for x in states][-2:] == [48, 50]
     with pytest.raises(RuntimeError, match=r"iteration \d+ are gone: read"):
         late[0].states  # noqa: B018
-    for last, result in zip(*map(jax.tree.leaves, (states[-1], first.states))):
-        if not jax.dtypes.issubdtype(last.dtype, jax.dtypes.prng_key):
-            np.testing.assert_array_equal(last, result)
-    assert checkpoint.latest(out / "checkpoints")[0].iteration == 50
+    assert_same(states[-1], first.states)
+    root = program_of(out) / "checkpoints"
+    assert checkpoint.latest(root)[0].iteration == 50
 
     with pytest.raises(ValueError, match=r"folder is .*: give resume=True"):
         gasil_jax.fit(env, PPO, **arguments)
-    with pytest.raises(ValueError, match=r"gamma was 0.99, is 0.9: only total_steps"):
-        gasil_jax.fit(env, PPO.replace(gamma=0.9), resume=True, **arguments)
-    with pytest.raises(ValueError, match="evaluate_every was 5120, is None"):
-        gasil_jax.fit(env, PPO, resume=True, **arguments)
+    for changed, why in (
+        (PPO.replace(gamma=0.9), r"gamma was 0.99, is 0.9; .*evaluate_every was 5120"),
+        (PPO.replace(clip_epsilon_schedule=lambda steps: 1.0), "is 'a function'"),
+        (gasil_jax.algorithm("gasil"), "agent was ppo, is gasil"),
+    ):
+        with pytest.raises(ValueError, match=why):
+            gasil_jax.fit(env, changed, resume=True, **arguments)
     # A program that is interrupted continues like one that was stopped.
     interrupt = lambda progress: os.kill(os.getpid(), signal.SIGTERM)
     with pytest.raises(Interrupted) as interrupted:
@@ -141,18 +147,76 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path):
             env, PPO, resume=True, callback=interrupt, **arguments, **EVALUATED
         )
     assert "resume=True" in interrupted.value.__notes__[0]
-    same(gasil_jax.fit(env, PPO, resume=True, **arguments, **EVALUATED), commanded)
-    policies = [np.load(folder / "policy.npz") for folder in (out, commanded)]
-    for name in policies[1]:
-        np.testing.assert_array_equal(*(arrays[name] for arrays in policies))
-    assert gasil_jax.load_policy(out)(np.zeros(env.observation_size)).shape == (2,)
-    # Without its checkpoints it would begin anew, and replace the policy.
-    shutil.rmtree(out / "checkpoints")
-    with pytest.raises(ValueError, match="holds the results of training that has end"):
-        gasil_jax.fit(env, PPO, resume=True, **arguments, **EVALUATED)
+    (root / "00000099.partial" / "state").mkdir(parents=True)
+    # A command goes on with it, and `fit` again where a command was stopped.
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert_equal_folders(out, commanded)
+    assert not list(root.glob("*.partial"))
+    capsys.readouterr()
+    again = gasil_jax.fit(env, PPO, resume=True, **arguments, **EVALUATED)
+    assert capsys.readouterr().err == ""
+    assert_same(again.states, saved.load(commanded)[-1])
+    assert_equal_folders(out, commanded)
+
+
+def test_it_continues_what_a_command_began(env, tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        stop = lambda *arguments: os.kill(os.getpid(), signal.SIGTERM)
+        patch.setattr(driver, "log", stop)
+        arguments = [*FLAGS, "--seeds", "2", "--out", str(tmp_path)]
+        assert run.main(arguments) == 128 + signal.SIGTERM
+    result = gasil_jax.fit(env, PPO, seeds=2, folder=tmp_path, resume=True)
+    assert_same(result.states, gasil_jax.fit(env, PPO, seeds=2).states)
+
+
+def test_more_seeds_and_points_are_trained_and_no_others(env, tmp_path):
+    """What is there is not trained again, and longer training continues."""
+    folder = tmp_path / "out"
+
+    def fit(total_steps=256, **arguments):
+        algorithm, calls = SHORT.replace(total_steps=total_steps), []
+        result = gasil_jax.fit(
+            env,
+            algorithm,
+            folder=folder,
+            resume=True,
+            callback=lambda x: calls.append(x.metrics["policy_loss"].shape),
+            **arguments,
+        )
+        return result, calls
+
+    rates = [{"learning_rate": x} for x in (1e-3, 1e-2)]
+    first, calls = fit(seeds=[4, 2], points=rates[:1])
+    assert calls == [(2, 1)] * 2
+    assert fit(seeds=[4, 2], points=rates[:1])[1] == []
+    # Seeds in another order keep their numbers.
+    result, calls = fit(seeds=[2, 4], points=rates[:1])
+    assert calls == []
+    flipped = jax.tree.map(lambda x: x[:, ::-1], first.states)
+    assert_same(result.states, flipped)
     np.testing.assert_array_equal(
-        np.load(out / "policy.npz")["mean"], policies[1]["mean"]
+        np.load(folder / "policy.npz")["log_std"],
+        flipped.actor_critic.policy.params["params"]["log_std"][0],
     )
+    # A point more, and a seed.
+    result, calls = fit(seeds=[2, 4, 7], points=rates[1:])
+    assert calls == [(4, 1)] * 2
+    assert result.metrics["policy_loss"].shape == (2, 3, 2)
+    for name, values in first.metrics.items():
+        np.testing.assert_array_equal(result.metrics[name][0, :2], values[0, ::-1])
+    assert len(list((folder / "programs").iterdir())) == 2
+    config = json.loads((folder / "config.json").read_text())
+    assert (config["points"], config["seeds"]) == (rates, [2, 4, 7])
+    # All of it longer.
+    longer, calls = fit(total_steps=384, seeds=[2, 4, 7])
+    assert sorted(calls) == [(2, 1), (4, 1)]
+    for name, values in result.metrics.items():
+        np.testing.assert_array_equal(longer.metrics[name][..., :2], values)
+    assert longer.states.iteration.tolist() == [[3] * 3] * 2
+    with pytest.raises(ValueError, match="total_steps was 384"):
+        fit(seeds=[2, 4, 7])
+    with pytest.raises(ValueError, match=r"seeds were \[2, 4, 7\]"):
+        fit(total_steps=384, seeds=[2, 4])
 
 
 def test_points_are_trained_beside_each_other(env):
@@ -160,10 +224,13 @@ def test_points_are_trained_beside_each_other(env):
     algorithm, seen = PPO.replace(total_steps=4 * 128), []
     points = [{"learning_rate": 1e-3}, {"learning_rate": 1e-2, "gamma": 0.9}]
     callback = lambda progress: seen.append(progress.metrics["policy_loss"].shape[0])
-    result = gasil_jax.fit(env, algorithm, seeds=3, points=points, callback=callback)
+    result = gasil_jax.fit(
+        env, algorithm, seeds=3, points=[*points, points[0]], callback=callback
+    )
     assert set(seen) == {6}
-    # As many members, so that they share a program.
-    one = gasil_jax.fit(env, algorithm.replace(**points[1]), seeds=6)
+    # As many members, so that they share a program. Its numbers may be arrays.
+    one = algorithm.replace(learning_rate=np.float64(1e-2), gamma=jnp.float32(0.9))
+    one = gasil_jax.fit(env, one, seeds=6)
     for name, values in one.metrics.items():
         together = result.metrics[name]
         assert together.shape == (2, 3, 4)
@@ -175,98 +242,73 @@ def test_points_are_trained_beside_each_other(env):
     assert not np.allclose(*result.metrics["policy_loss"], rtol=1e-3)
 
 
-def test_checkpoints_without_evaluations_are_no_reason_to_begin_anew(own, tmp_path):
-    description, root = tmp_path / "fit.json", tmp_path / "checkpoints"
-
-    def fit(**arguments):
-        # It stops after a chunk.
-        once = lambda progress: True
-        return gasil_jax.fit(own, PPO, folder=tmp_path, callback=once, **arguments)
-
-    before = fit().metrics["policy_loss"].shape[1]
-    (root / "00000099.partial" / "state").mkdir(parents=True)
-    saved = sorted(root.rglob("*"))
-    described = json.loads(description.read_text())
-    del described["sha256"]
-    description.write_text(json.dumps(described | EVALUATED))
-    with pytest.raises(InputError, match=f"0000000{before} .* no evaluations_size"):
-        fit(resume=True, **EVALUATED)
-    assert sorted(root.rglob("*")) == saved
-
-    description.write_text(json.dumps(described))
-    assert fit(resume=True).metrics["policy_loss"].shape[1] > before
-    # What a killed process had half written is deleted.
-    assert saved[0] in root.iterdir() and not list(root.glob("*.partial"))
-
-
-def test_its_folder_is_a_runs_folder(env, commanded, tmp_path, capsys):
-    out = tmp_path / "out"
-    # It ends early, before any evaluation; the command trains the rest.
-    begun = {"callback": lambda progress: True, **EVALUATED}
-    gasil_jax.fit(env, PPO, seeds=2, folder=out, **begun)
-    assert json.loads((out / "summary.json").read_text())["final_return_mean"] is None
-    assert run.main(["--resume", "--out", str(out)]) == 0
-    rows = [x / "metrics.csv" for x in (out, commanded)]
-    assert rows[0].read_text() == rows[1].read_text()
-    # The command adds nothing to what `fit` writes, and says the same of it.
-    whole = tmp_path / "whole"
-    gasil_jax.fit(env, PPO, seeds=2, folder=whole, **EVALUATED)
-    assert {x.name for x in whole.iterdir()} == {x.name for x in commanded.iterdir()}
-    contents = [json.loads((x / "config.json").read_text()) for x in (whole, commanded)]
-    differing = {name for name in contents[1] if contents[0][name] != contents[1][name]}
-    assert differing == {"out", "preset", "sha256"}
-    assert contents[0].keys() == contents[1].keys()
-    summaries = [json.loads((x / "summary.json").read_text()) for x in (whole, out)]
-    for name in ("env", "agent", "final_return", "final_evaluation"):
-        assert summaries[0][name] == summaries[1][name]
-    for command, path in (
-        (plot, tmp_path / "curves.png"),
-        (evaluate, tmp_path / "scores.csv"),
-        (render, tmp_path / "film.gif"),
-    ):
-        assert command.main([str(whole), "--out", str(path)]) == 0
-        assert path.stat().st_size > 0
-    assert "point_mass, ppo" in capsys.readouterr().out
-
-
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({}, "the environment is not one that gasil_jax.make_env returned"),
-        ({"seeds": [4, 2]}, "the seeds do not follow one another"),
-        (
-            {"algorithm": PPO.replace(clip_epsilon_schedule=lambda steps: 1.0)},
-            "function has no JSON form",
-        ),
-        (
-            {"algorithm": dataclasses.replace(PPO, rewards=(Normalize(), Decompose()))},
-            "options can't name the agent or the models of rewards",
-        ),
+        ({"clip_epsilon_schedule": lambda steps: 1.0}, "a schedule that is a function"),
+        ({"rewards": (Normalize(), Decompose())}, "a model of rewards without a name"),
+        ({}, None),
     ],
 )
-def test_what_no_run_can_describe_is_plotted(env, own, changes, why, tmp_path, capsys):
-    out = tmp_path / "out"
-    arguments = {"algorithm": PPO, **changes, "folder": out}
-    once = lambda progress: progress.iteration >= 30
-    gasil_jax.fit(env if changes else own, callback=once, **arguments)
-    assert not (out / "config.json").exists()
-    assert (out / "learning_curve.png").exists()
+def test_it_is_told_what_no_command_line_can_name(env, changes, why):
+    algorithm = PPO.replace(**{x: y for x, y in changes.items() if x != "rewards"})
+    if "rewards" in changes:
+        algorithm = dataclasses.replace(PPO, **changes)
+    told = fitting._describe(env, algorithm, [0], Recording()).only_python
+    assert told == why if why is None else why in told
+
+
+def test_what_no_command_line_can_name_is_read_where_it_can_be(own, tmp_path, capsys):
+    gasil = gasil_jax.algorithm(
+        "gasil", **small_training.SETTINGS, **small_training.DISCRIMINATOR
+    )
+    out, why = tmp_path / "out", "an environment that is not from gasil_jax.make_env"
+    stop, seeds = lambda progress: True, [3, 5]
+    begun = gasil_jax.fit(own, gasil, seeds=seeds, callback=stop, folder=out)
+    assert json.loads((out / "config.json").read_text())["only_python"] == why
+    assert gasil_jax.load_policy(out)(np.zeros(own.observation_size)).shape == (2,)
+    # What ended in one iteration alone is no curve: it has all of it in the end.
+    whole = gasil_jax.fit(own, gasil, seeds=seeds, folder=out, resume=True)
+    losses, first = (x.metrics["policy_loss"] for x in (whole, begun))
+    np.testing.assert_array_equal(losses[:, : first.shape[1]], first)
     assert plot.main([str(out), "--out", str(tmp_path / "curves.png")]) == 0
-    assert "PointMass, ppo" in capsys.readouterr().out
-    for command in (evaluate, render):
-        assert command.main([str(out)]) == 2
+    assert "PointMass, gasil" in capsys.readouterr().out
+    for command, *words in (
+        (evaluate, str(out)),
+        (render, str(out)),
+        (run, "--resume", f"--out={out}"),
+    ):
+        assert command.main(words) == 2
         (message,) = capsys.readouterr().err.splitlines()
-        assert why in message and "use it with gasil_jax.plot" in message
+        assert why in message and "use gasil_jax.fit, gasil_jax.load_policy" in message
+
+    # With what only Python has, the states and the reward are read.
+    given = {"env": own, "algorithm": gasil}
+    assert_same(saved.load(out, **given)[-1], whole.states)
+    reward = gasil_jax.load_reward(out, seed=5, **given)
+    steps = np.ones((4, own.observation_size)), np.zeros((4, 2))
+    one = gasil_jax.member(whole.states, 1)
+    expected = gasil.agent.reward(one.agent, one.normalizer)(*map(jnp.float32, steps))
+    np.testing.assert_allclose(reward(*steps), expected, rtol=1e-6)
+    with pytest.raises(ValueError, match="with what no command line can name"):
+        gasil_jax.load_reward(out, env=own)
+    with pytest.raises(ValueError, match=r"run is .*env 'PointMass' is unknown"):
+        gasil_jax.load_reward(out, algorithm=gasil)
+
+
+BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
 
 
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"seeds": 0}, "seeds is 0: it must be from 1"),
-        ({"seeds": []}, r"seeds is \[\]: it must be a number of seeds"),
+        ({"seeds": 0}, "seeds is 0: it must be a number of seeds"),
+        ({"seeds": 2**21}, "seeds is 2097152: it must be from 1"),
+        ({"seeds": []}, r"seeds is 0: it must be from 1"),
         ({"seeds": None}, "seeds is None: it must be a number of seeds"),
         ({"seeds": True}, "seeds is True: it must be a number of seeds"),
-        ({"seeds": jax.numpy.zeros(2, int)}, r"seeds is \[0, 0\]: it must be a number"),
+        ({"seeds": b"x"}, "seeds is b'x': it must be a number of seeds"),
+        ({"seeds": jnp.zeros(2, int)}, r"seeds is \[0, 0\]: it must be different"),
         ({"seeds": [1, 1]}, "different whole numbers"),
         ({"seeds": [-1]}, "different whole numbers"),
         ({"evaluate_every": 0}, "evaluate_every is 0: it must be a whole number"),
@@ -282,27 +324,27 @@ def test_what_no_run_can_describe_is_plotted(env, own, changes, why, tmp_path, c
         (BEGUN | {"evaluate_episodes": 3}, "evaluate_episodes was 10, is 3: only tot"),
         ({"points": []}, r"points is \[\]: it must be a list of at least one dict"),
         ({"points": [{"alpha": 1.0}]}, "alpha is a setting of .*, not of ppo"),
-        ({"points": [{}], "folder": "new"}, "folder is new: a folder holds one point"),
-        (BEGUN | {"seeds": 2}, r"seeds was \(0,\), is \(0, 1\): only total_steps"),
+        ({"points": [{"num_epochs": 2}]}, "num_epochs is not traced"),
     ],
 )
 def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").touch()
-    (tmp_path / "begun").mkdir()
-    described = {"seeds": [0], "evaluate_every": 128, "evaluate_episodes": 10}
-    why_no_run = "the environment is not one that gasil_jax.make_env returned"
-    described |= {"why_no_run": why_no_run, "env": "PointMass", "agent": "ppo"}
-    (tmp_path / "begun" / "fit.json").write_text(json.dumps(described))
+    if changes.get("folder") == "begun":
+        begun = fitting._describe(own, PPO, [0], Recording(evaluate_every=128))
+        (tmp_path / "begun").mkdir()
+        begun.write(tmp_path / "begun")
     with pytest.raises(ValueError, match=why):
         gasil_jax.fit(own, **{"algorithm": PPO, **changes})
 
 
-def test_a_command_says_why_it_can_t_continue_what_no_options_describe(
-    tmp_path, capsys
-):
-    described = {"why_no_run": "x", "env": "Own", "agent": "ppo", "seeds": [0]}
-    (tmp_path / "fit.json").write_text(json.dumps(described))
-    assert run.main(["--resume", "--out", str(tmp_path)]) == 2
-    assert "a folder of gasil_jax.fit that" in capsys.readouterr().err
+def test_without_its_checkpoints_it_does_not_begin_anew(env, fitted, tmp_path):
+    """It would replace the policy."""
+    out = shutil.copytree(fitted[1], tmp_path / "out")
+    shutil.rmtree(program_of(out) / "checkpoints")
+    more = PPO.replace(total_steps=2 * PPO.config.total_steps)
+    before = (out / "policy.npz").read_bytes()
+    with pytest.raises(ValueError, match="holds training that has ended, and no undam"):
+        gasil_jax.fit(env, more, seeds=2, folder=out, resume=True, **EVALUATED)
+    assert (out / "policy.npz").read_bytes() == before

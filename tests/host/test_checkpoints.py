@@ -1,0 +1,259 @@
+"""Any state is saved whole, damage is seen, and the newest and the best are kept."""
+
+import errno
+import json
+import os
+import pathlib
+import subprocess
+import sys
+from unittest import mock
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint
+import pytest
+
+from gasil_jax.host import checkpoint
+
+#: Characters that mean something to a shell, to patterns, to URLs, or nothing at all.
+NAMES = ("sweep[lr=1e-3]", "a*?{b}", "line\nline", "$x%20#", " é ", "--x")
+#: A name that no encoding has.
+BYTES = os.fsdecode(b"\xff")
+
+
+def write(root, iteration, score=None, state=None):
+    record = checkpoint.Record(metrics_rows=5, evaluations_rows=0, score=score)
+    checkpoint.write(root, iteration, state or {"x": np.zeros(1000)}, record)
+
+
+def names(root):
+    return sorted(path.name for path in root.iterdir())
+
+
+def assert_same(states, others):
+    """Compare states bit for bit, with their random keys."""
+    assert jax.tree.structure(states) == jax.tree.structure(others)
+    for x, y in zip(jax.tree.leaves(states), jax.tree.leaves(others), strict=True):
+        assert x.dtype == y.dtype
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        assert np.asarray(x).tobytes() == np.asarray(y).tobytes()
+
+
+STATES = {
+    "zero size": {"x": np.zeros((3, 0), np.float32), "y": np.zeros((0, 2), bool)},
+    "scalars": {"x": np.float32(1.5), "y": np.int8(-3), "z": np.bool_(True)},
+    "not NumPy's": {"x": jnp.arange(3, dtype=jnp.bfloat16), "y": jnp.ones(5, "int4")},
+    "not a number": {"x": np.array([np.nan, -0.0, np.inf], np.float32)},
+    "keys": [jax.random.key(1), jax.random.split(jax.random.key(2, impl="rbg"), 3)],
+    "names": {"a/b": {"../x": np.int8(2)}, "": np.int8(3), "file": np.int8(4)},
+    "one array": np.arange(5, dtype=np.uint16),
+    "transposed": (np.int32([[1, 2], [3, 4]]).T, np.int32([1, 2, 3])[::2]),
+    "nothing": {},
+}
+
+
+@pytest.mark.parametrize("kind", STATES)
+def test_any_state_is_saved_and_restored(kind, tmp_path):
+    state = STATES[kind]
+    checkpoint.save(tmp_path / "state", state)
+    like = jax.eval_shape(lambda: state)
+    assert_same(checkpoint.restore(tmp_path / "state", like), state)
+
+
+@pytest.mark.parametrize("name", [*NAMES, pytest.param(BYTES, id="bytes")])
+def test_a_checkpoint_is_read_from_a_folder_of_any_name(name, tmp_path):
+    state = {"x": np.arange(1000, dtype=np.float32)}
+    write(tmp_path / "before", 1, 2.0, state)
+    root = (tmp_path / "before").rename(tmp_path / name)
+    write(root, 2, 1.0, state)
+    for found in (checkpoint.latest(root)[0], checkpoint.best(root)):
+        assert_same(found.restore(state), state)
+
+
+def test_a_type_of_the_same_size_is_not_taken_for_another(tmp_path):
+    checkpoint.save(tmp_path / "state", {"x": jnp.ones(3, jnp.bfloat16)})
+    with pytest.raises(ValueError, match=r"holds another state: \['x'\] differs"):
+        checkpoint.restore(tmp_path / "state", {"x": jnp.ones(3, jnp.float16)})
+
+
+def test_what_reads_otherwise_does_not_count_as_written(tmp_path, monkeypatch):
+    checkpointer = orbax.checkpoint.StandardCheckpointer
+    save = checkpointer.save
+    worse = lambda self, path, arrays: save(self, path, {"['x']": 2 * arrays["['x']"]})
+    monkeypatch.setattr(checkpointer, "save", worse)
+    with pytest.raises(checkpoint.WriteError, match="is not what was written"):
+        write(tmp_path, 1, state={"x": np.ones(3)})
+    assert checkpoint.latest(tmp_path) == (None, [])
+
+
+def truncate(folder):
+    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
+    os.truncate(path, path.stat().st_size // 2)
+
+
+def flip_a_bit(folder):
+    path = max(folder.rglob("*"), key=lambda p: p.stat().st_size * p.is_file())
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def delete_a_file(folder):
+    next(p for p in sorted((folder / "state").rglob("*")) if p.is_file()).unlink()
+
+
+def delete_the_manifest(folder):
+    (folder / "manifest.json").unlink()
+
+
+def edit_the_manifest(**changes):
+    def damage(folder):
+        path = folder / "manifest.json"
+        manifest = json.loads(path.read_text())
+        record = manifest["record"] | changes.pop("record", {})
+        path.write_text(json.dumps(manifest | {"record": record} | changes))
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        truncate,
+        flip_a_bit,
+        delete_a_file,
+        delete_the_manifest,
+        edit_the_manifest(files=[]),
+        edit_the_manifest(files={"state": 3}),
+        edit_the_manifest(record={"score": "high"}),
+        edit_the_manifest(record={"metrics_rows": -1}),
+        lambda folder: (folder / "manifest.json").write_text("[" * 100_000),
+        lambda folder: (folder / "manifest.json").write_bytes(b"\xff"),
+    ],
+)
+def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_path):
+    states = [{"x": np.full(1000, float(i), np.float32)} for i in range(3)]
+    for i, state in enumerate(states):
+        write(tmp_path, i, float(i), state)
+    damage(tmp_path / "00000002")
+    newest, errors = checkpoint.latest(tmp_path)
+    assert newest.iteration == 1
+    assert len(errors) == 1 and "00000002 is damaged" in errors[0]
+    np.testing.assert_array_equal(newest.restore(states[1])["x"], states[1]["x"])
+    # The best may be the damaged one: another is never taken for it.
+    with pytest.raises(ValueError, match="00000002 is damaged"):
+        checkpoint.best(tmp_path)
+    assert checkpoint.best_score(tmp_path) >= 1.0
+    # Written again, it is whole.
+    write(tmp_path, 2, None, states[2])
+    assert checkpoint.latest(tmp_path)[0].iteration == 2
+    assert checkpoint.best(tmp_path).iteration == 1
+
+
+def test_a_damaged_checkpoint_does_not_count_as_the_newest(tmp_path):
+    for iteration in (1, 5):
+        write(tmp_path, iteration)
+    flip_a_bit(tmp_path / "00000005")
+    assert checkpoint.latest(tmp_path)[0].iteration == 1
+    checkpoint.set_aside(tmp_path, newer_than=1)
+    write(tmp_path, 2)
+    checkpoint.prune(tmp_path, 1)
+    newest = checkpoint.read(tmp_path / "00000002")
+    assert checkpoint.latest(tmp_path) == (newest, [])
+    assert names(tmp_path) == ["00000002", "00000005.damaged"]
+
+
+def test_the_best_and_the_newest_are_kept(tmp_path):
+    for i, score in enumerate([None, 3.0, 9.0, 1.0, 2.0, None]):
+        write(tmp_path, i, score)
+        checkpoint.prune(tmp_path, 2)
+    assert names(tmp_path) == ["00000002", "00000004", "00000005"]
+    assert checkpoint.best(tmp_path).iteration == 2
+
+
+def test_what_cannot_be_read_now_is_not_taken_for_damaged(tmp_path, monkeypatch):
+    write(tmp_path, 1)
+    stale = mock.Mock(side_effect=OSError(errno.ESTALE, os.strerror(errno.ESTALE)))
+    with monkeypatch.context() as patched:
+        patched.setattr(checkpoint, "_hashes", stale)
+        with pytest.raises(OSError, match="Stale"):
+            checkpoint.latest(tmp_path)
+        with pytest.raises(checkpoint.WriteError, match="Stale"):
+            write(tmp_path, 1)
+    assert checkpoint.latest(tmp_path)[0].iteration == 1
+
+
+def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
+    for i in range(3):
+        write(tmp_path, i)
+    rename = pathlib.Path.rename
+
+    def fail(path, other):
+        if path.name == "00000001":
+            raise PermissionError
+        return rename(path, other)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(pathlib.Path, "rename", fail)
+        checkpoint.prune(tmp_path, 1)
+    assert names(tmp_path) == ["00000001", "00000002"]
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "unlink", mock.Mock(side_effect=PermissionError))
+        checkpoint.prune(tmp_path, 1)
+    assert names(tmp_path) == ["00000001.partial", "00000002"]
+    assert checkpoint.latest(tmp_path)[0].iteration == 2
+    checkpoint.delete_partial(tmp_path)
+    assert names(tmp_path) == ["00000002"]
+
+
+def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path):
+    """Each of Orbax's and TensorStore's threads has a traceback of its own."""
+    program = """
+import pathlib, resource, sys
+import numpy as np
+from gasil_jax.host import checkpoint
+
+# No file may grow beyond this: writing fails as on a full disk.
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
+try:
+    checkpoint.write(pathlib.Path(sys.argv[1]), 1, state, {})
+except checkpoint.WriteError as error:
+    print(error, file=sys.stderr)
+"""
+    arguments = [sys.executable, "-c", program, str(tmp_path)]
+    ended = subprocess.run(arguments, capture_output=True, text=True)
+    assert ended.stderr == f"{tmp_path} can't be written: File too large\n"
+    assert names(tmp_path) == []
+
+
+def test_what_failed_first_is_told_where_cleaning_up_fails_too(tmp_path):
+    with pytest.raises(OSError, match="File too large"):
+        with checkpoint._orbax(tmp_path / "state"):
+            try:
+                raise ValueError(f"writing fails: os_error_code='{errno.EFBIG}'")
+            finally:  # Cleaning up.
+                raise OSError(errno.ENOTEMPTY, "Directory not empty")
+    with pytest.raises(OSError, match="Directory not empty"):
+        with checkpoint._orbax(tmp_path / "state"):
+            raise OSError(errno.ENOTEMPTY, "Directory not empty")
+
+
+def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(sys, "unraisablehook", told.append)
+    (tmp_path / "state").mkdir()
+    with pytest.raises(ValueError, match="already exists"):
+        checkpoint.save(tmp_path / "state", {"x": np.ones(3)})
+    for text in ("Event loop is closed", "mine"):
+        sys.unraisablehook(mock.Mock(exc_value=RuntimeError(text)))
+    assert [str(unraisable.exc_value) for unraisable in told] == ["mine"]
+
+
+def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
+    broken = mock.Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO)))
+    monkeypatch.setattr(os, "fsync", broken)
+    with pytest.raises(checkpoint.WriteError, match=r"written: Input/output error$"):
+        write(tmp_path, 1)
