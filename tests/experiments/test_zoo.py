@@ -9,8 +9,7 @@ import pytest
 import gasil_jax
 from experiments import zoo
 from gasil_jax import evaluate, numpy_policy, policy
-from gasil_jax.host import policy_file
-from gasil_jax.sweeps import saved_states
+from gasil_jax.host import policy_file, saved
 
 NAMES = numpy_policy.zoo()
 
@@ -52,7 +51,7 @@ def test_a_name_that_it_lacks_is_told(capsys):
 def test_a_better_policy_replaces_another(untrained_hopper, tmp_path):
     run, kept = tmp_path / "run", tmp_path / "zoo"
     shutil.copytree(untrained_hopper, run)
-    env, _, seeds, states = saved_states.load(run)
+    env, _, seeds, states = saved.load(run)
     policy_file.save(run / "policy.npz", states, env, seeds, np.array([3.0]))
     assert "hopper: " in zoo.add(run, 2, kept)
     assert "stays" in zoo.add(run, 2, kept)
