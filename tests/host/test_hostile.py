@@ -71,7 +71,7 @@ NEVER = [
 NUMBERS = [None, True, np.True_, "3", [1]]
 #: What else each function refuses, by the name of its value.
 SETTINGS = {
-    "gamma": [*NUMBERS, 0, 1.5, np.timedelta64(1)],
+    "gamma": [*NUMBERS, 1.5, np.timedelta64(1)],
     "learning_rate": [*NUMBERS, 1e-60, 1e300],
     "num_envs": [*NUMBERS, 0, 0.5, 2**62, 2**2000],
     "buffer_steps": [*NUMBERS, 0, 0.5, 2**62],
