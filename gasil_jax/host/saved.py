@@ -87,8 +87,9 @@ def _choose_point(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"
             )
-        values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
-        note(f"{folder}: point {point}, the best by mean ({values})")
+        if point <= last:
+            values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
+            note(f"{folder}: point {point}, the best by mean ({values})")
     point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")

@@ -4,7 +4,6 @@ import csv
 import json
 import logging as standard_logging
 import os
-import pathlib
 import re
 import shutil
 import signal
@@ -13,19 +12,15 @@ import jax
 import numpy as np
 import pytest
 from small_training import FLAGS, SETTINGS
+from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import plot, run, statistics, sweep
+from gasil_jax import run, statistics, sweep
+from gasil_jax.cli import plot
 from gasil_jax.evaluation import evaluate as evaluate_directly
-from gasil_jax.figures import plotting
-from gasil_jax.host import checkpoint, trackers
+from gasil_jax.host import checkpoint, plotting, saved, tables, trackers
+from gasil_jax.host.evaluations import Evaluation, evaluation_key
 from gasil_jax.host.members import make_members
-from gasil_jax.host.periodic_evaluation import (
-    EvaluationSchedule,
-    PeriodicEvaluation,
-    evaluation_key,
-)
-from gasil_jax.sweeps import saved_states
 
 ITERATIONS, EVERY, EPISODES = 22, 5, 3
 SEEDS = (5, 6, 7)
@@ -69,8 +64,14 @@ def evaluated(tmp_path_factory):
 
 
 def rows(out):
-    with (out / "evaluations.csv").open() as file:
+    with (program_of(out) / "evaluations.csv").open() as file:
         return list(csv.DictReader(file))
+
+
+def assert_same_tables(first, second):
+    for name in ("evaluations.csv", "metrics.csv"):
+        one, other = (program_of(x) / name for x in (first, second))
+        assert one.read_bytes() == other.read_bytes()
 
 
 def means(out):
@@ -87,7 +88,8 @@ def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
 ):
     out, _ = evaluated
     table = rows(out)
-    assert list(table[0]) == ["seed", "env_steps", "mean", "min", "max", "length"]
+    names = ["point", "seed", "env_steps", "mean", "min", "max", "length"]
+    assert list(table[0]) == names
     assert [(int(row["env_steps"]), int(row["seed"])) for row in table] == [
         (iteration * 128, seed)
         for iteration in (0, 5, 10, 15, 20, 22)
@@ -97,27 +99,29 @@ def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
         low, mean, high = (float(row[name]) for name in ("min", "mean", "max"))
         assert low <= mean <= high and row["length"] == "50"
     summary = json.loads((out / "summary.json").read_text())
-    last = {row["seed"]: float(row["mean"]) for row in table[-3:]}
-    assert summary["final_evaluation"] == pytest.approx(last)
-    assert summary["final_evaluation_mean"] == pytest.approx(np.mean([*last.values()]))
-    assert summary["final_length"] == {"5": 50.0, "6": 50.0, "7": 50.0}
-    assert summary["final_length_mean"] == 50.0
+    (point,) = summary["points"]
+    last = [float(row["mean"]) for row in table[-3:]]
+    assert point["final_evaluation"] == pytest.approx(np.mean(last))
+    assert point["final_length"] == 50.0
+    with (out / "results.csv").open() as file:
+        written = [float(row["final_evaluation"]) for row in csv.DictReader(file)]
+    assert written == pytest.approx(last)
     assert summary["evaluation_seconds"] > 0
 
 
 def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
     out, alone = evaluated[0], tmp_path / "alone"
     assert run.main([*SMALL, "--out", str(alone)]) == 0
-    assert (alone / "metrics.csv").read_bytes() == (out / "metrics.csv").read_bytes()
-    assert not (alone / "evaluations.csv").exists()
-    summary = json.loads((alone / "summary.json").read_text())
-    assert not any("evaluation" in name for name in summary)
-    assert "evaluation" not in capsys.readouterr().out
+    tables_ = [program_of(x) / "metrics.csv" for x in (out, alone)]
+    assert tables_[0].read_bytes() == tables_[1].read_bytes()
+    assert not (program_of(alone) / "evaluations.csv").exists()
+    assert "evaluation" not in (alone / "results.csv").read_text()
+    assert "evaluation " not in capsys.readouterr().out
 
 
 def test_the_scores_are_those_of_evaluate(evaluated):
     out, _ = evaluated
-    env, algorithm, seeds, states = saved_states.load(out)
+    env, algorithm, seeds, states = saved.load(out)
     for index, (seed, row) in enumerate(zip(seeds, rows(out)[-3:], strict=True)):
         scores = evaluate_directly(
             env,
@@ -137,27 +141,21 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     # As if it had been killed after the checkpoint in the middle of two evaluations.
-    for path in (out / "checkpoints").iterdir():
+    (program_of(out) / "training.json").unlink()
+    for path in (program_of(out) / "checkpoints").iterdir():
         if int(path.name) > 8:
             shutil.rmtree(path)
     assert run.main(["--resume", "--out", str(out)]) == 0
-    for name in ("evaluations.csv", "metrics.csv"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
-    cut = (out / "evaluations-cut-1.csv").read_bytes()
-    assert (whole / "evaluations.csv").read_bytes().endswith(cut) and cut
+    assert_same_tables(out, whole)
     # Once more there is nothing to do.
     assert run.main(["--resume", "--out", str(out)]) == 0
-    before, after = (json.loads((x / "summary.json").read_text()) for x in (whole, out))
-    for name in ("final_evaluation", "final_evaluation_mean"):
-        assert before[name] == after[name]
-    assert (out / "evaluations.csv").read_bytes() == (
-        whole / "evaluations.csv"
-    ).read_bytes()
+    assert (out / "results.csv").read_bytes() == (whole / "results.csv").read_bytes()
+    assert_same_tables(out, whole)
 
 
 def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monkeypatch):
     whole, out = evaluated[0], tmp_path / "out"
-    score = PeriodicEvaluation.score
+    score = Evaluation.score
 
     def interrupted(self, states, done):
         if done == 10:
@@ -165,21 +163,19 @@ def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monke
         return score(self, states, done)
 
     with monkeypatch.context() as patch:
-        patch.setattr(PeriodicEvaluation, "score", interrupted)
+        patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
     assert len(rows(out)) == 3 * len(SEEDS)
     assert run.main(["--resume", "--out", str(out)]) == 0
-    for name in ("evaluations.csv", "metrics.csv"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
-    assert not list(out.glob("*-cut-*"))
+    assert_same_tables(out, whole)
 
 
 def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
     evaluated, tmp_path, monkeypatch
 ):
     whole, out = evaluated[0], tmp_path / "out"
-    score = PeriodicEvaluation.score
+    score = Evaluation.score
 
     def interrupted(self, states, done):
         scores = score(self, states, done)
@@ -187,13 +183,12 @@ def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
         return scores
 
     with monkeypatch.context() as patch:
-        patch.setattr(PeriodicEvaluation, "score", interrupted)
+        patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
     assert {row["env_steps"] for row in rows(out)} == {"0"}
     assert run.main(["--resume", "--out", str(out)]) == 0
-    for name in ("evaluations.csv", "metrics.csv"):
-        assert (out / name).read_bytes() == (whole / name).read_bytes()
+    assert_same_tables(out, whole)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +206,7 @@ def test_evaluations_may_not_change_on_the_way(more, message, evaluated, capsys)
 
 def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
     out, _ = evaluated
-    root, by_iteration = out / "checkpoints", means(out)
+    root, by_iteration = program_of(out) / "checkpoints", means(out)
     del by_iteration[0]  # Of the untrained policy there is no checkpoint.
     best = max(by_iteration, key=by_iteration.__getitem__)
     assert checkpoint.best(root).iteration == best
@@ -227,7 +222,7 @@ def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
     assert set(scores) == {8, 16, ITERATIONS} | so_far
     for iteration, score in scores.items():
         assert score == pytest.approx(by_iteration.get(iteration))
-    _, _, _, states = saved_states.load(out, "best")
+    _, _, _, states = saved.load(out, "best")
     assert set(np.asarray(states.iteration)) == {best}
 
 
@@ -275,12 +270,11 @@ def scored(tmp_path, seeds, devices, times=1):
     params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
     states = states.replace(actor_critic=params)
     path = tmp_path / f"{devices}.csv"
-    evaluation = PeriodicEvaluation(
-        members, EvaluationSchedule(128, 4), path, labels={"seed": seeds}
-    )
+    table = tables.TableWriter(path, {"seed": seeds}, columns=Evaluation.COLUMNS)
+    evaluation = Evaluation(members, every=128, num_episodes=4, table=table)
     for _ in range(times):
         evaluation.score(states, 1)
-    evaluation.writer.close()
+    table.close()
     with path.open() as file:
         table = list(csv.DictReader(file))
     return {
@@ -314,7 +308,6 @@ def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
     arguments = (*SMALL, "--seeds", "2", "--total-steps", "1024", *EVALUATED)
     grid = ("--grid", "batch_steps=128,256")
     assert sweep.main([*arguments, *grid, "--out", str(out)]) == 0
-    assert "s of evaluations)" in capsys.readouterr().out
     curves = np.load(out / "curves.npz")
     steps = curves["evaluation_env_steps"]
     np.testing.assert_array_equal(steps[0, 0], [0, 640, 1024])
@@ -338,32 +331,4 @@ def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
     path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
     assert sweep.main(["--resume", "--out", str(out)]) == 2
     error = capsys.readouterr().err
-    assert "evaluations.csv is damaged: it lacks iterations" in error
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--evaluate-every 0", "evaluate_every is 0: it must be 1 or more"),
-        ("--evaluate-every -5", "evaluate_every is -5: it must be 1 or more"),
-        (
-            "--evaluate-every x",
-            "evaluate_every is 'x': it must be a whole number",
-        ),
-        (
-            "--evaluate-every 9 --evaluate-episodes 0",
-            "evaluate_episodes is 0: it must be 1 or more",
-        ),
-        ("--evaluate-episodes 0", "evaluate_episodes is 0: it must be 1 or more"),
-        ("--evaluate-episodes 3", "evaluate_episodes is 3: it needs evaluate_every"),
-        ("--evaluate-every 9 --evaluate-episodes 1e12", "GB of memory"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(arguments, message, tmp_path, capsys):
-    for main, more in ((run.main, ()), (sweep.main, ("--grid", "gamma=0.9,0.99"))):
-        out = ("--out", str(tmp_path / "out"))
-        assert main([*SMALL, *out, *arguments.split(), *more]) == 2
-        error = capsys.readouterr().err
-        assert message in error and len(error.splitlines()) == 1
-        assert "evaluate_" in error
-        assert not pathlib.Path(out[1]).exists()
+    assert "evaluations.csv is damaged: it lacks rows" in error
