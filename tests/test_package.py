@@ -47,12 +47,16 @@ def test_the_commands_are_listed(capsys):
 
 
 @pytest.mark.parametrize("command", package.COMMANDS)
-def test_every_command_tells_its_version(command, capsys):
+def test_every_command_tells_its_version_and_its_options(command, capsys):
     module = importlib.import_module(f"gasil_jax.{command}")
-    with pytest.raises(SystemExit) as exit_:
-        module.main(["--version"])
-    assert exit_.value.code == 0
-    assert capsys.readouterr().out == f"{gasil_jax.__version__}\n"
+    for flag, start in (
+        ("--version", f"{gasil_jax.__version__}\n"),
+        ("--help", f"usage: python -m gasil_jax.{command} "),
+    ):
+        with pytest.raises(SystemExit) as exit_:
+            module.main([flag])
+        assert exit_.value.code == 0
+        assert capsys.readouterr().out.startswith(start)
 
 
 def test_an_algorithm_can_be_made_before_anything_else():
