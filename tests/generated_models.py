@@ -143,7 +143,7 @@ class Writer:
         self.bodies.append(name)
         pos = 0.3 * self.scale * self.rng.uniform(-1, 1, 3)
         if depth == 0:
-            far = self.scale * self.pick(0, 0, 0, 100)
+            far = self.scale * self.pick(0, 0, 0, 10)
             pos += np.array([far * self.rng.uniform(-1, 1), 0, 0.3 * self.scale])
         out = f'name="{name}" pos="{" ".join(f"{x:.4g}" for x in pos)}"'
         out += m(0.3, "euler", lambda: self.vector(90))

@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeLimit
 
-from gasil_envs import pictures, registry, wrappers
+from gasil_envs import pictures, registry, user_code, wrappers
 from gasil_envs.base import Env
 
 _NAMESPACE = "gasil_envs"
@@ -105,6 +105,16 @@ def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax
 
 def _key(generator: np.random.Generator) -> jax.Array:
     return jax.random.key(int(generator.integers(2**32)))
+
+
+def _where(mask: jax.Array, new: Any, old: Any) -> Any:
+    """Return the states of a batch, new where the mask (batch,) is True."""
+
+    def choose(new: jax.Array, old: jax.Array) -> jax.Array:
+        at = mask.reshape((-1,) + (1,) * (old.ndim - 1))
+        return jnp.where(at, new, old).astype(old.dtype)
+
+    return jax.tree.map(choose, new, old)
 
 
 class GymnasiumEnv(gymnasium.Env):
@@ -276,22 +286,37 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             fresh = resets(jax.random.split(key, num_envs))
             stepped = jax.vmap(env.step)(state, action)
 
-            def choose(new: jax.Array, old: jax.Array) -> jax.Array:
-                at = over.reshape((-1,) + (1,) * (old.ndim - 1))
-                return jnp.where(at, new, old).astype(old.dtype)
+            return _where(over, fresh, stepped)
 
-            return jax.tree.map(choose, fresh, stepped)
-
+        self._where = jax.jit(_where)
         self._reset = jax.jit(lambda key: resets(jax.random.split(key, num_envs)))
         self._step = jax.jit(step)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode in each and return the observations, (num_envs, obs)."""
+        """Start an episode in each and return the observations, (num_envs, obs).
+
+        With ``options={"reset_mask": mask}``, bool (num_envs,), the others go on.
+
+        Raises:
+          ResetNeeded: if a mask is given before any reset.
+          ValueError: if the mask has another shape or type, or no environment is in it.
+        """
         _refuse_fork()
+        mask = None if options is None else options.get("reset_mask")
+        if mask is not None:
+            mask = np.asarray(mask)
+            if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
+                raise ValueError(
+                    f"reset_mask is {user_code.shown(mask)}: it must be "
+                    f"{self.num_envs} bools, one or more of them True"
+                )
+            if self._state is None:
+                raise gymnasium.error.ResetNeeded("reset_mask needs a reset before it")
         super().reset(seed=seed)
-        self._state = self._reset(_key(self.np_random))
+        fresh = self._reset(_key(self.np_random))
+        self._state = fresh if mask is None else self._where(mask, fresh, self._state)
         return np.array(self._state.obs), self._info()
 
     def step(

@@ -4,6 +4,7 @@ Mistakes that would stop training with a long trace are reported in one line bef
 """
 
 import inspect
+import logging
 import numbers
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -15,6 +16,8 @@ import numpy as np
 from gasil_envs import user_code, wrappers
 from gasil_envs.base import Env
 from gasil_envs.errors import shown
+
+_LOGGER = logging.getLogger(__name__)
 
 #: The attributes of Brax's interface that training uses.
 INTERFACE = ("reset", "step", "observation_size")
@@ -115,6 +118,15 @@ def _check_action_range(name: str, env: Env) -> None:
         raise ValueError(
             f"env {name!r} has action_range {given!r}: it must be the lowest and the "
             "highest action, each a number or one for each dimension"
+        )
+    half = 0.5 * (high - low)
+    if np.any((half > 10) | (half < 0.1)):
+        _LOGGER.warning(
+            "env %r has actions from %.4g to %.4g, and an untrained policy's have "
+            "standard deviation 1: scale them to some -1 to 1, or set --initial-std",
+            name,
+            low.min(),
+            high.max(),
         )
 
 

@@ -347,6 +347,17 @@ def test_a_fault_of_the_users_environment_is_one_line(
     assert "\n" not in str(refused.value)
 
 
+@pytest.mark.parametrize(("limit", "told"), [(100, True), (1, False)])
+def test_actions_that_are_no_standard_deviation_are_told(
+    limit, told, tmp_path, monkeypatch, caplog
+):
+    module = _OWN + f"    action_range = (-{limit}, {limit})\n"
+    (tmp_path / f"own_range_{limit}.py").write_text(module)
+    monkeypatch.syspath_prepend(tmp_path)
+    gasil_envs.make(f"own_range_{limit}:Env")
+    assert ("has actions from -100 to 100" in caplog.text) is told
+
+
 def test_a_warning_of_mujoco_writes_no_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     env = gasil_envs.make("hopper", physics="mujoco").unwrapped

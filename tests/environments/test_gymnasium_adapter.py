@@ -72,6 +72,26 @@ def test_a_batch_begins_anew_with_the_step_after_the_last():
         assert info["true_reward"].shape == (3,)
 
 
+def test_a_mask_resets_some_of_a_batch():
+    env = gymnasium.make_vec("gasil_envs/point_mass", num_envs=3)
+    mask = np.array([False, True, False])
+    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset before it"):
+        env.reset(options={"reset_mask": mask})
+    env.reset(seed=1)
+    for _ in range(3):
+        before = env.step(env.action_space.sample())[0]
+    after, _ = env.reset(seed=2, options={"reset_mask": mask})
+    np.testing.assert_array_equal(after[~mask], before[~mask])
+    assert not np.array_equal(after[1], before[1])
+    # The others still end after 50 steps.
+    for _ in range(47):
+        *_, truncated, _ = env.step(env.action_space.sample())
+    np.testing.assert_array_equal(truncated, ~mask)
+    for wrong in (mask[:2], ~mask & mask, mask.astype(float)):
+        with pytest.raises(ValueError, match="must be 3 bools, one or more of them"):
+            env.reset(options={"reset_mask": wrong})
+
+
 def episode(env, num_steps):
     """The rewards given and earned, and whether it was truncated at its end alone."""
     env.reset(seed=0)

@@ -1,5 +1,6 @@
 """Robots that are none of the package's tasks, on the fast physics."""
 
+import dataclasses
 import pathlib
 import re
 
@@ -20,6 +21,9 @@ ARM = """<mujoco>{top}<worldbody>{world}<body name="arm">
 <joint name="hinge" axis="0 1 0" {joint}/><geom type="capsule" size="0.05" {geom}
 fromto="0 0 0 0 0 1"/>{body}</body></worldbody>
 <actuator><motor joint="hinge" {motor}/></actuator></mujoco>"""
+
+
+CYLINDER = '<geom type="cylinder" size="0.1 0.1"/>'
 
 
 def arm(motor='ctrlrange="-1 1"', **parts):
@@ -135,6 +139,23 @@ def test_fields_about_a_base_that_does_not_move_are_mjxs(caplog):
         ({"joint": 'damping="1 2 3"'}, "nonlinear damping"),
         ({"motor": 'ctrlrange="-1 1" damping="3"'}, "actuators with damping"),
         ({"motor": 'ctrlrange="-1 1" armature="3"'}, "actuators with armature"),
+        (
+            {"geom": 'fluidshape="ellipsoid"', "top": '<option density="9"/>'},
+            "fluidshape",
+        ),
+        ({"top": '<option integrator="discrete"/>'}, "integrator"),
+        ({"top": '<option><flag override="enable"/></option>'}, "the flag override"),
+        (
+            {"world": '<geom type="box" size="1 1 1"/>', "body": CYLINDER},
+            "CYLINDER",
+        ),
+        (
+            {
+                "motor": 'ctrlrange="-1 1"/><dcmotor joint="hinge" motorconst="1" '
+                'resistance="1" ctrlrange="-1 1"'
+            },
+            "DCMOTOR",
+        ),
         ({"top": '<option noslip_iterations="3"/>'}, "noslip_iterations"),
         ({"top": '<option integrator="implicit"/>'}, "IMPLICIT"),
     ],
@@ -147,10 +168,51 @@ def test_what_mjx_lacks_is_refused_and_c_mujoco_takes_it(parts, what):
         state = jax.eval_shape(env.reset, jax.random.key(0))
         jax.eval_shape(env.step, state, jnp.zeros(1))
 
-    with pytest.raises(ValueError, match="not support this model: .*" + what) as told:
-        one_step("mjx")
-    assert "\n" not in str(told.value)
+    for physics in ("jax", "mjx"):
+        message = f"physics '{physics}' does not support this model: .*{what}"
+        with pytest.raises(ValueError, match=message) as told:
+            one_step(physics)
+        assert "\n" not in str(told.value)
     one_step("mujoco")
+
+
+SENSORS = """<sensor><jointpos joint="hinge"/><touch site="s"/><e_kinetic/>
+<clock/><subtreecom body="arm"/><contact body1="arm" data="found"/></sensor>"""
+
+
+@pytest.mark.parametrize("flag", ["energy", "fwdinv"])
+@pytest.mark.parametrize("physics", ["jax", "mjx", "mujoco"])
+def test_sensors_and_flags_that_move_nothing_are_taken(physics, flag):
+    top = f'<option><flag {flag}="enable"/></option>{SENSORS}'
+    xml = arm(top=top, body='<site name="s"/>')
+    env = Locomotion(Task(xml=xml, frame_skip=1, hidden_positions=0), physics=physics)
+    assert env.backend == physics
+
+
+KEYS = """<keyframe><key name="up" qpos="0.5" qvel="2"/><key qpos="1"/></keyframe>"""
+
+
+def test_an_episode_starts_from_a_keyframe():
+    for keyframe, expected in ((None, [0, 0]), ("up", [0.5, 2]), (1, [1, 0])):
+        task = Task(
+            xml=arm(top=KEYS),
+            frame_skip=1,
+            hidden_positions=0,
+            reset_noise=0.0,
+            keyframe=keyframe,
+        )
+        start = Locomotion(task).reset(jax.random.key(0))
+        np.testing.assert_allclose(start.obs, expected)
+    with pytest.raises(ValueError, match="keyframe is 'down': it must be one of up, "):
+        Locomotion(dataclasses.replace(task, keyframe="down"))
+
+
+def test_a_ball_starts_with_a_quaternion_of_length_1():
+    ball = '<body pos="0 0 1"><joint type="ball"/><geom size="0.1"/></body>'
+    task = Task(xml=arm(body=ball), frame_skip=1, hidden_positions=0, reset_noise=0.3)
+    start = Locomotion(task).reset(jax.random.key(0))
+    assert abs(start.obs[0]) > 0.01
+    np.testing.assert_allclose(jnp.linalg.norm(start.obs[1:5]), 1.0, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -171,6 +233,15 @@ def test_what_mjx_lacks_is_refused_and_c_mujoco_takes_it(parts, what):
             },
             "the model has actuators with activations: its state must be",
         ),
+        (
+            {"xml": arm().replace("<motor", '<pid kp="1"')},
+            "the model has actuators with several controls, such as pid",
+        ),
+        (
+            {"xml": arm(top='<option><flag sleep="enable"/></option>')},
+            "the model has the flag sleep: it must be disabled",
+        ),
+        ({"ls_iterations": 0}, "ls_iterations is 0: it must be 1 or more"),
         ({"frame_skip": 0}, "frame_skip is 0: it must be 1 or more"),
         ({"frame_skip": 2.5}, "frame_skip is 2.5: it must be 1 or more"),
         ({"solver_iterations": 0}, "solver_iterations is 0: it must be 1 or more"),

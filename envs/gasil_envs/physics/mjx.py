@@ -143,8 +143,9 @@ class MjxPhysics:
             raise Unsupported(what)
         without = copy.copy(model)
         without.opt.enableflags &= ~_WITHOUT_EFFECT
-        # Sensors move nothing, and MJX lacks many.
+        # Sensors move nothing, and MJX refuses many though they are disabled.
         without.opt.disableflags |= _DISABLE.mjDSBL_SENSOR
+        without.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
         try:
             self._model = mjx.put_model(without)
             self._blank_data = mjx.make_data(without)

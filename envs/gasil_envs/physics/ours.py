@@ -41,8 +41,8 @@ def ours_or_mjx(
         physics = MjxPhysics(model, fields, iterations, ls_iterations)
     except Unsupported as error:
         raise ValueError(
-            f"physics 'jax' does not support this model: {reason}; physics 'mjx' "
-            f"neither: {error.part} (use physics 'mujoco')"
+            f"physics 'jax' does not support this model: {reason}; nor does 'mjx': "
+            f"{error.part} (use physics 'mujoco')"
         ) from None
     _LOGGER.warning(
         "physics 'mjx' is used, some ten times slower than 'jax', because of a part of "
