@@ -137,6 +137,7 @@ def test_the_papers_protocol_has_the_appendix_s_values():
         "ppo": 4,
         "ppo+bc": 16,
         "ppo+sil": 16,
+        "ppo+bonus": 16,
         "ppo+gasil": 32,
     }.items():
         points = search.paper_points(agent)
