@@ -23,7 +23,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 from gymnasium.wrappers import TimeLimit
 
-from gasil_envs import pictures, registry, user_code, wrappers
+from gasil_envs import errors, pictures, registry, wrappers
 from gasil_envs.base import Env
 
 _NAMESPACE = "gasil_envs"
@@ -309,7 +309,7 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
             mask = np.asarray(mask)
             if mask.shape != (self.num_envs,) or mask.dtype != bool or not mask.any():
                 raise ValueError(
-                    f"reset_mask is {user_code.shown(mask)}: it must be "
+                    f"reset_mask is {errors.shown(mask)}: it must be "
                     f"{self.num_envs} bools, one or more of them True"
                 )
             if self._state is None:
