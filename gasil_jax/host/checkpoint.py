@@ -28,7 +28,6 @@ from typing import Any, NamedTuple, TypedDict
 import jax
 import jax.numpy as jnp
 import numpy as np
-import orbax.checkpoint as ocp
 
 from gasil_jax.host import json_files, output_file
 
@@ -62,6 +61,9 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     other path means anything. What fails in Orbax's threads is raised once, and not
     logged.
     """
+    # Commands that read no checkpoint, such as --help, start sooner without it.
+    import orbax.checkpoint as ocp
+
     logger, before = logging.getLogger("absl"), sys.unraisablehook
     level = logger.level
     logger.setLevel(logging.CRITICAL)
