@@ -261,7 +261,10 @@ def validate_config(config: Config) -> None:
     for name in ("num_envs", "minibatch_size"):
         size, batch_steps = getattr(config, name), config.batch_steps
         if batch_steps % size:
-            divisors = [n for n in range(1, batch_steps + 1) if batch_steps % n == 0]
+            # Up to the root, or a large batch would take minutes.
+            root = math.isqrt(batch_steps)
+            small = [n for n in range(1, root + 1) if batch_steps % n == 0]
+            divisors = sorted([*small, *(batch_steps // n for n in small)])
             raise ValueError(
                 f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
                 f"the nearest that does is {min(divisors, key=lambda n: abs(n - size))}"

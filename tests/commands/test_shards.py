@@ -19,14 +19,10 @@ from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
 from gasil_jax.host import programs, ray_launcher
 from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.points import completed
 from gasil_jax.host.programs import Training
 from gasil_jax.host.sweep import Sweep, parse_shard
 from gasil_jax.host.tables import TableWriter
-
-
-def sweep_of(points, seeds, algorithm=None):
-    algorithm = algorithm or gasil_jax.algorithm()
-    return Sweep("point_mass", algorithm, seeds).grown(points)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
@@ -63,8 +59,9 @@ def test_points_that_differ_in_traced_numbers_alone_share_a_program(tmp_path):
         {"alpha": 0.3},
     ]
     algorithm = gasil_jax.algorithm(alpha=0.3)
-    requested = sweep_of(points, [7, 8], algorithm)
-    assert len(requested.points) == 4
+    every = completed([{}, *points], algorithm)
+    assert len(every) == 4
+    requested = Sweep("point_mass", algorithm, [7, 8], every)
     first, *others = requested.unfinished(tmp_path)
     assert first.labels == {"point": (0, 0, 2, 2), "seed": (7, 8, 7, 8)}
     numbers = [(x["alpha"], x["gamma"]) for x in first.hyperparameters]
