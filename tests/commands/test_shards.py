@@ -19,6 +19,7 @@ from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
 from gasil_jax.host import programs, ray_launcher
 from gasil_jax.host.interruption import Interrupted
+from gasil_jax.host.points import completed
 from gasil_jax.host.programs import Training
 from gasil_jax.host.sweep import Sweep, parse_shard
 from gasil_jax.host.tables import TableWriter
@@ -26,7 +27,8 @@ from gasil_jax.host.tables import TableWriter
 
 def sweep_of(points, seeds, algorithm=None):
     algorithm = algorithm or gasil_jax.algorithm()
-    return Sweep("point_mass", algorithm, seeds).grown(points)
+    every = completed([{}, *points], algorithm)
+    return Sweep("point_mass", algorithm, seeds, points=every)
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)
