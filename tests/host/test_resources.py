@@ -1,6 +1,8 @@
 """Memory and disk are estimated before a run; memory during one: test_resume.py."""
 
 import re
+import shutil
+from unittest import mock
 
 import jax
 import numpy as np
@@ -11,6 +13,7 @@ import gasil_jax
 from gasil_jax import run
 from gasil_jax.host import resources
 from gasil_jax.host.members import make_members
+from gasil_jax.host.programs import Program
 
 
 @pytest.mark.parametrize(
@@ -39,6 +42,12 @@ def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     assert 0.5 < 3 * resources.need(env, algorithm).memory / total < 2.0
 
 
+def full(monkeypatch, free):
+    """Leave these bytes on every disk."""
+    usage = mock.Mock(total=10**12, free=free)
+    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
+
+
 def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
     arguments = [*FLAGS, "--seeds", "3", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
@@ -48,20 +57,17 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
     assert len(error.splitlines()) == 1
 
     monkeypatch.setattr(resources, "available", lambda devices: None)
-    monkeypatch.setattr(resources, "_free_disk", lambda folder: 10_000)
+    full(monkeypatch, 10_000)
     assert run.main(arguments) == 2
     error = capsys.readouterr().err
-    assert "3 checkpoints of 3 seeds (over all points), and one that is" in error
+    assert "3 checkpoints of each run, and one that is being written" in error
     assert not (tmp_path / "out").exists()
 
     # Those of all points stay on the disk.
-    state = resources.need(
-        gasil_jax.make_env("point_mass"), gasil_jax.algorithm()
-    ).state
-    monkeypatch.setattr(resources, "_free_disk", lambda folder: 9 * state)
-    resources.check_disk([(state, 2)], tmp_path, 3)
-    with pytest.raises(ValueError, match="3 checkpoints of 4 seeds"):
-        resources.check_disk([(state, 2), (state, 2)], tmp_path, 3)
+    full(monkeypatch, 9000)
+    resources._check_disk([2000], tmp_path, 3, [])
+    with pytest.raises(ValueError, match=r"need 0\.01 MB"):
+        resources._check_disk([2000, 2000], tmp_path, 3, [])
 
 
 @pytest.mark.parametrize(
@@ -100,24 +106,24 @@ def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
     algorithm = gasil_jax.algorithm(agent, **changes)
     one = resources.need(gasil_jax.make_env("point_mass"), algorithm)
     with pytest.raises(ValueError, match=f"most is for {re.escape(part)}"):
-        resources.check_memory(one, algorithm.config, 1, jax.devices()[:1])
+        resources.check_memory(one, algorithm, 1, jax.devices()[:1])
 
 
 def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
     state = 1000
-    monkeypatch.setattr(resources, "_free_disk", lambda folder: state)
-    with pytest.raises(ValueError, match="3 checkpoints of 1 seeds"):
-        resources.check_disk([(state, 1)], tmp_path, 3)
-    for iteration in ("10", "20", "30"):
-        folder = tmp_path / "checkpoints" / iteration / "state"
+    full(monkeypatch, state)
+    with pytest.raises(ValueError, match="3 checkpoints of each run"):
+        resources._check_disk([state], tmp_path / "new", 3, [])
+    for name in ("10", "20", "30", "40.damaged"):
+        folder = tmp_path / "checkpoints" / name / "state"
         folder.mkdir(parents=True)
         (folder / "array").write_bytes(bytes(state))
-    written = resources.size_of_checkpoints(tmp_path)
-    assert written == 3 * state
-    resources.check_disk([(state, 1)], tmp_path, 3, written=written)
-    assert resources.size_of_checkpoints(tmp_path / "none") == 0
+    resources._check_disk([state], tmp_path, 3, [Program((), tmp_path)])
+    with pytest.raises(ValueError, match="4 checkpoints of each run"):
+        resources._check_disk([state], tmp_path, 4, [Program((), tmp_path)])
     # The checkpoints of folders below do not count.
-    assert resources.size_of_checkpoints(tmp_path.parent) == 0
+    with pytest.raises(ValueError, match="3 checkpoints of each run"):
+        resources._check_disk([state], tmp_path, 3, [Program((), tmp_path.parent)])
 
 
 def test_a_container_has_what_others_in_it_leave(tmp_path):
@@ -161,9 +167,9 @@ def test_members_have_equal_shares_of_the_devices_that_are_used():
     devices = [Device(20_000), *[Device(10_000)] * 7]
     assert resources.available(devices) == 8 * 80_000
     assert resources.available(devices[1:2]) == 90_000
-    config = gasil_jax.algorithm().config
+    algorithm = gasil_jax.algorithm()
     fits = lambda size, count: resources.check_memory(
-        resources.Need(0, size, "networks"), config, count, devices
+        resources.Need(0, size, "networks"), algorithm, count, devices
     )
     fits(80_000, 8)
     fits(40_000, 16)
