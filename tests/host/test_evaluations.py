@@ -191,19 +191,6 @@ def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
     assert_same_tables(out, whole)
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (("--evaluate-every", "640"), "evaluate_every was 600, is 640"),
-        (("--evaluate-episodes", "4"), "evaluate_episodes was 3, is 4"),
-    ],
-)
-def test_evaluations_may_not_change_on_the_way(more, message, evaluated, capsys):
-    assert run.main(["--resume", "--out", str(evaluated[0]), *more]) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.splitlines()) == 1
-
-
 def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
     out, _ = evaluated
     root, by_iteration = program_of(out) / "checkpoints", means(out)
