@@ -89,6 +89,20 @@ MODELS = {
             'frictionloss="0.4"'
         ),
     ),
+    **{
+        f"{flag} disabled": arms(
+            option=f'viscosity="1"><flag {flag}="disable"/></option><option',
+            a='frictionloss="1" range="-2 1" limited="true" damping="1"',
+            b='stiffness="3"',
+            actuator='<motor joint="b" ctrlrange="-1 1"/>',
+            world='<geom type="plane" size="1 1 1" pos="0 0 -0.1"/>',
+            more=ROW.format('joint1="a" joint2="b"', "0.2 1 0 0 0"),
+        )
+        for flag in (
+            *("constraint", "contact", "limit", "equality", "frictionloss"),
+            *("spring", "damper", "gravity", "actuation", "clampctrl"),
+        )
+    },
     "trees far apart": arms(
         option='integrator="RK4"',
         world="""<body pos="100 0 0"><freejoint/>

@@ -113,7 +113,6 @@ def test_a_task_s_own_functions_make_its_episodes():
         ({"world": '<geom type="box" size="1 1 1"/>'}, "contacts of capsule and box"),
         ({"top": '<option integrator="implicitfast"/>'}, "neither Euler nor RK4"),
         ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),
-        ({"top": '<option><flag clampctrl="disable"/></option>'}, "are disabled"),
     ],
 )
 def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):

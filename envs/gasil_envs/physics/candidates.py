@@ -35,7 +35,9 @@ class Candidates(NamedTuple):
 
 def candidates(model: mujoco.MjModel) -> Candidates:
     """Return all pairs, in MJX's order: by condim, then types, as these first occur."""
-    rows = [(g1, g2, i) for g1, g2, i in _pairs(model)]
+    flags = mujoco.mjtDisableBit
+    none = model.opt.disableflags & (flags.mjDSBL_CONSTRAINT | flags.mjDSBL_CONTACT)
+    rows = [] if none else list(_pairs(model))
     parameters = [_parameters(model, *row) for row in rows]
     kinds = [
         (x[0], *model.geom_type[[g1, g2]])

@@ -81,7 +81,7 @@ class Impedance(struct.PyTreeNode):
             damping,
             np.where(is_flat, mean, lowest),
             np.where(is_flat, mean, highest),
-            np.where(is_flat, 1.0, width),
+            np.where(width <= mujoco.mjMINVAL, 1.0, width),
             midpoint,
             np.maximum(power, 1.0),
         )
@@ -262,8 +262,8 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `layout` can't describe this model, or None if it can."""
     if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
         return "its friction cones are elliptic"
-    joints = model.eq_type == mujoco.mjtEq.mjEQ_JOINT
-    if not (joints | (model.eq_type == mujoco.mjtEq.mjEQ_TENDON)).all():
+    allowed = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
+    if not np.isin(model.eq_type[model.eq_active0.astype(bool)], allowed).all():
         return "it has equality constraints of bodies"
     span = model.jnt_range[:, 1] - model.jnt_range[:, 0]
     scalar = model.jnt_limited.astype(bool) & (model.jnt_type != tree.BALL)
@@ -272,15 +272,6 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     both.append(model.tendon_limited.astype(bool) & (span <= 2 * model.tendon_margin))
     if np.concatenate(both).any():
         return "it has joints or tendons whose two limits act at once"
-    flags = mujoco.mjtDisableBit
-    if model.opt.disableflags & (
-        flags.mjDSBL_CONSTRAINT
-        | flags.mjDSBL_CONTACT
-        | flags.mjDSBL_LIMIT
-        | flags.mjDSBL_EQUALITY
-        | flags.mjDSBL_FRICTIONLOSS
-    ):
-        return "its constraints are disabled"
     if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
         return "its contact parameters are overridden"
     return collision.unsupported(model, candidates.candidates(model).geoms)
@@ -383,6 +374,10 @@ def _group(
     for i in range(1, model.nbody):
         moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
     is_body = np.eye(model.nbody) * (np.arange(model.nbody) > 0)
+
+    def at(x: np.ndarray) -> np.ndarray:
+        return x[index].astype(np.float32)
+
     friction = contact.friction[index, : max(1, condim - 1)].astype(np.float32)
     if flat or (friction == friction[:, :1]).all():
         friction = friction[:, :1]
@@ -396,9 +391,10 @@ def _group(
         floor = floor * 2 * sliding**2 / model.opt.impratio
     # Without friction an edge would weigh 1e10 times as much as what it moves.
     floor = np.maximum(floor, moved / _MOST_STIFFNESS)
-
-    def at(x: np.ndarray) -> np.ndarray:
-        return x[index].astype(np.float32)
+    impedance = Impedance.of(model, at(contact.solref), at(contact.solimp))
+    highest = impedance.highest[:, 0].astype(np.float64)
+    if (inverse_weight * (1 - highest) > floor * highest).all():
+        floor = np.full(1, mujoco.mjMINVAL)  # It is not reached.
 
     constants = Constants(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
@@ -407,7 +403,7 @@ def _group(
         margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
         least_resistance=_constant(floor),
-        impedance=Impedance.of(model, at(contact.solref), at(contact.solimp)),
+        impedance=impedance,
     )
     return Group(edges, pairs, constants)
 

@@ -7,6 +7,7 @@ linear system is solved in `solver`. Every array has the batch as its last axis.
 Shape letters: N bodies, V degrees of freedom, B batch.
 """
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -53,8 +54,37 @@ _STIFF = 300.0
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
 
+_FLAGS = mujoco.mjtDisableBit
+
+
+def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return the model without what its flags disable, but for contacts."""
+    off = model.opt.disableflags
+    if off & _FLAGS.mjDSBL_CONSTRAINT:
+        off |= _FLAGS.mjDSBL_EQUALITY | _FLAGS.mjDSBL_FRICTIONLOSS
+        off |= _FLAGS.mjDSBL_LIMIT
+    names = {
+        _FLAGS.mjDSBL_EQUALITY: ("eq_active0",),
+        _FLAGS.mjDSBL_FRICTIONLOSS: ("dof_frictionloss", "tendon_frictionloss"),
+        _FLAGS.mjDSBL_LIMIT: ("jnt_limited", "tendon_limited"),
+        _FLAGS.mjDSBL_SPRING: ("jnt_stiffness", "tendon_stiffness"),
+        _FLAGS.mjDSBL_DAMPER: ("dof_damping", "tendon_damping"),
+        _FLAGS.mjDSBL_CLAMPCTRL: ("actuator_ctrllimited",),
+        _FLAGS.mjDSBL_ACTUATION: ("actuator_gainprm", "actuator_biasprm"),
+    }
+    disabled = [name for flag, x in names.items() if off & flag for name in x]
+    if disabled or off & _FLAGS.mjDSBL_GRAVITY:
+        model = copy.copy(model)
+        for name in disabled:
+            getattr(model, name)[:] = 0
+        if off & _FLAGS.mjDSBL_GRAVITY:
+            model.opt.gravity[:] = 0.0
+    return model
+
+
 def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
     """Return why `make` does not support this model and fields; None if it does."""
+    model = _enabled(model)
     integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
     if model.opt.integrator not in integrators:
         return "its integrator is neither Euler nor RK4"
@@ -82,6 +112,7 @@ def make(
     ls_iterations: int = 4,
 ) -> Dynamics:
     """Compute what does not depend on the state, for a supported model."""
+    model = _enabled(model)
     return Dynamics(
         model,
         constraints.layout(model),
@@ -229,9 +260,8 @@ def step(
     control = actuation = jnp.clip(control, *own.control_range)
     if own.are_motors:
         motor = (own.transmission.of_qvel.T * own.gain[:, 0]).astype(np.float32)
-        actuation = jnp.zeros_like(state.qvel)
-        if dynamics.model.nu:
-            actuation = total(jnp.asarray(motor)[..., None] * control, 1)
+        moved = total(jnp.asarray(motor)[..., None] * control, 1)
+        actuation = moved if dynamics.model.nu else jnp.zeros_like(state.qvel)
     is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
     integrate = _euler if is_euler else _runge_kutta
     one = functools.partial(integrate, dynamics, actuation)

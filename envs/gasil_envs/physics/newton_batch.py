@@ -161,7 +161,9 @@ class _Batch:
 
     def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
         of_limits, of_groups, friction = self._parts(rows)
-        result = add([self._sign * of_limits, *friction])
+        result = self._sign * of_limits
+        for of_friction in friction:
+            result = result + of_friction
         if self._basis is None:
             return result
         along = [
@@ -180,7 +182,9 @@ class _Batch:
     def _gram(self, weights: list[jax.Array]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""
         of_limits, of_groups, friction = self._parts(weights)
-        diagonal = add([self._sign**2 * of_limits, *friction])
+        diagonal = self._sign**2 * of_limits
+        for of_friction in friction:
+            diagonal = diagonal + of_friction
         result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
         if self._basis is None:
             return result

@@ -62,12 +62,10 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
         return "it has wind or the ellipsoid model of fluids"
     flags = mujoco.mjtDisableBit
-    if model.opt.disableflags & (
-        flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER | flags.mjDSBL_GRAVITY
-    ):
-        return "its springs, dampers or gravity are disabled"
-    if model.opt.disableflags & (flags.mjDSBL_CLAMPCTRL | flags.mjDSBL_ACTUATION):
-        return "its actuators or the limits of their controls are disabled"
+    passive = flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER
+    medium = model.opt.density > 0 or model.opt.viscosity > 0
+    if model.opt.disableflags & passive == passive and medium:
+        return "its medium is disabled with its springs and dampers"
     return None
 
 
