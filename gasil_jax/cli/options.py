@@ -166,12 +166,6 @@ def read(
         parser.add_fields(model, model.switch, own.get(model, model()))
     values = parser.read(arguments, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
-    if stored is not None:
-        for name, now in (("agent", options.agent), ("preset", options.preset)):
-            if now != (before := getattr(default, name)):
-                raise InputError(
-                    f"{name} is {now!r}: {options.out} was begun with {before!r}"
-                )
     switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
     on = [switch for switch, is_on in switches.items() if is_on]
     changes = [parser.fields(values, title) for title in ("training", "agent", *on)]

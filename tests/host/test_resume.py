@@ -190,8 +190,8 @@ def copy(whole, tmp_path):
         ("--obs-noise 0.2 --num-epochs 3", "num_epochs was 1, is 3"),
         ("--seeds 2", "seeds were [0, 1, 2]"),
         ("--total-steps 100", "total_steps was 51200"),
-        ("--agent ppo", "agent is 'ppo': "),
-        ("--preset paper", "preset is 'paper': "),
+        ("--agent ppo", "agent was ppo+bc, is ppo"),
+        ("--preset paper", "preset was tuned, is paper"),
     ],
 )
 def test_changed_settings_are_refused(arguments, message, whole, capsys):
