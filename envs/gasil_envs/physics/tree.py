@@ -231,8 +231,8 @@ def kinematics(
             own_mass = moving * own if (moving * own).any() else mass * own
             centres[root] = centre(own_mass) if own_mass.any() else xipos[root]
         com = stacked([centres[root] for root in model.body_rootid])
-    of_dof = com if com.ndim == 2 else take(com, model.dof_bodyid)
     xipos, com = materialize((xipos, com))
+    of_dof = com if com.ndim == 2 else take(com, model.dof_bodyid)
     cinert = _inertia(model, columns, xipos - com, mass=mass)
     axis, anchor, translation = map(stacked, zip(*dofs, strict=True))
     turning = _cross(axis, of_dof - anchor)
