@@ -38,7 +38,7 @@ from experiments.comparisons import interval
 from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
-from gasil_jax import presets
+from gasil_jax import checks, presets
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.host import driver
@@ -284,7 +284,8 @@ def training_row(
     algorithm, used = _algorithm(env_name, options), jax.devices()[:devices]
     num_envs, batch_steps = algorithm.config.num_envs, algorithm.config.batch_steps
     with input_checked():
-        batch = make_members(env, algorithm, range(seeds), devices=used)
+        checks.check(env, algorithm)
+    batch = make_members(env, algorithm, range(seeds), devices=used)
     began = time.perf_counter()
     states, advance = batch.compile()
     compile_seconds = time.perf_counter() - began

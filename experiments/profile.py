@@ -24,7 +24,7 @@ import gasil_envs
 from experiments import measured
 from experiments.options import Options, Parser, at_least
 from gasil_envs.registry import Settings
-from gasil_jax import presets
+from gasil_jax import checks, presets
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.host import devices, tables
 from gasil_jax.host.members import make_members
@@ -147,9 +147,10 @@ def run(options: Options) -> None:
     with input_checked():
         algorithm = presets.preset(options.env, options.agent, options.preset)
         env = gasil_envs.make(options.env)
-        members = make_members(
-            env, algorithm, range(options.seeds), devices=jax.devices()[:1]
-        )
+        checks.check(env, algorithm)
+    members = make_members(
+        env, algorithm, range(options.seeds), devices=jax.devices()[:1]
+    )
     states, compiled = members.compile()
     advance: Any = compiled  # Its declared type lacks `as_text`.
     newest, seconds = [states], []

@@ -11,7 +11,7 @@ from environment_contract import check_reset_and_step
 
 import gasil_envs
 from gasil_envs import pictures, worlds, wrappers
-from gasil_jax import render
+from gasil_jax.cli import render
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
