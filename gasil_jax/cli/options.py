@@ -264,9 +264,7 @@ def _defaults(
                 reward_delay=first.reward_delay,
                 action_size=_action_size(first.env, preset),
             )
-    taken = {
-        f.name for each in (SweepOptions, Settings) for f in dataclasses.fields(each)
-    }
+    taken = {*names(SweepOptions), *names(Settings)}
     for setting in names(agent):
         if setting in taken:
             raise InputError(

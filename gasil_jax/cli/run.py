@@ -9,6 +9,7 @@ from gasil_jax.cli import train
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.host import environments
+from gasil_jax.host.results import speed_in_words
 
 
 @reports_errors
@@ -25,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in ("final_return", "final_evaluation")
         if name in results.finals
     }
-    speed = train.speed_in_words(results.trainings)
+    speed = speed_in_words(results.trainings)
     print(f"{statistics.in_words(scores)}, {speed}, in {folder}")
     quoted = shlex.quote(str(folder))
     commands = [f"evaluate {quoted}", f"plot {quoted}"]

@@ -82,5 +82,6 @@ def _launch(
         ray_launcher.run_on_ray(_PROGRAM, jobs, options.devices)
     requested = requested.continued_from(options.out)
     with folders.lock(options.out, seconds=60.0):
-        results = train.write(options.out, requested, training.make_env(requested))
+        trained, env = requested.trained(options.out), training.make_env(requested)
+        results = train.write(options.out, requested, env, trained)
     train.tell(options.out, results)

@@ -3,7 +3,7 @@
 import pathlib
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,8 +21,6 @@ from gasil_jax.host.progress import announced
 from gasil_jax.host.results import Results, speed_in_words
 from gasil_jax.host.sweep import Sweep
 
-__all__ = ["speed_in_words", "tell", "train"]
-
 
 def train(
     options: Options, requested: Sweep, program: str, *, shard: tuple[int, int] = (1, 1)
@@ -34,8 +32,7 @@ def train(
       missing; and the environment.
     """
     runs = requested.part(*shard)
-    place = options.out or NOWHERE
-    needed = requested.unfinished(place, runs)
+    needed = requested.unfinished(options.out or NOWHERE, runs)
     with input_checked():
         env = training.prepare(
             requested,
@@ -69,7 +66,7 @@ def train(
         if requested.missing(trained):
             return folder, None, env
         with folders.lock(folder, seconds=60.0):
-            told = write(folder, requested, env, list(zip(needed, outcomes)))
+            told = write(folder, requested, env, trained, zip(needed, outcomes))
         for outcome in outcomes:
             if outcome.unsaved is not None:
                 raise outcome.unsaved
@@ -82,14 +79,15 @@ def write(
     folder: pathlib.Path,
     requested: Sweep,
     env: Any,
-    outcomes: Sequence[tuple[Program, Outcome]] = (),
+    trained: Sequence[Program],
+    outcomes: Iterable[tuple[Program, Outcome]] = (),
 ) -> Results:
     """Write the results of a sweep whose runs are all trained, and return them."""
     with announced(requested.env, "writing the results"):
-        told = results.read(requested, requested.trained(folder))
+        told = results.read(requested, trained)
         best = results.write(folder, told)["best_by_mean"] or 0
         try:
-            states = saved.states_of(folder, requested, env, best, outcomes)
+            states = saved.states_of(folder, requested, env, best, list(outcomes))
         except InputError as error:
             note(f"policy.npz is not written: {error}")
         else:
@@ -106,9 +104,8 @@ def write(
 
 
 def tell(folder: pathlib.Path, told: Results) -> None:
-    """Print what a sweep found."""
-    summary = results.summary(told)
-    print(*results.in_words(told, summary), sep="\n")
+    """Print the best points of a sweep, its speed, and commands to go on with."""
+    print(*results.in_words(told), sep="\n")
     print(f"{speed_in_words(told.trainings)}, in {folder}")
     quoted = shlex.quote(str(folder))
     print(

@@ -256,6 +256,7 @@ def unfinished(
     A program that is continued trains all of its runs, so one with members that nobody
     asked for is not.
     """
-    begun = [x for x in stored if not (x.is_finished or x.others)]
-    held = {run for x in stored if x.is_finished or not x.others for run in x.runs}
+    finished = [x for x in stored if x.is_finished]
+    begun = [x for x in stored if x not in finished and not x.others]
+    held = {run for x in (*finished, *begun) for run in x.runs}
     return begun, [run for run in requested if run not in held]

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import functools
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -50,6 +51,11 @@ class Results:
     def diverged(self) -> np.ndarray:
         """Whether an update was undone, bool (points, seeds)."""
         return self.faults["skipped_updates"] > 0
+
+    @functools.cached_property
+    def summary(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        return _summary(self)
 
     def best(self, scores: np.ndarray) -> int | None:
         """Return the point with the highest score, (points,), None if there is none.
@@ -128,7 +134,7 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     curves |= {f"evaluation_{name}": x for name, x in results.evaluations.items()}
     with output_file.atomic(folder / "curves.npz") as partial:
         np.savez_compressed(partial, **curves)
-    told = summary(results)
+    told = results.summary
     json_files.write(folder / "summary.json", told)
     best = told["best_by_mean"]
     shown = 0 if best is None else best
@@ -187,7 +193,7 @@ def _write_results(path: pathlib.Path, results: Results) -> None:
                 writer.writerow([index, seed, *point.values(), *cells, *faults])
 
 
-def summary(results: Results) -> dict[str, Any]:
+def _summary(results: Results) -> dict[str, Any]:
     """Return the content of summary.json."""
     final = results.finals["final_return"]
     trainings, sweep = results.trainings, results.sweep
@@ -255,9 +261,9 @@ def speed_in_words(trainings: Sequence[Training]) -> str:
     return f"{f'{steps:,.0f} steps/s ' if steps else ''}on {speed['device']}"
 
 
-def in_words(results: Results, summary: Mapping[str, Any]) -> list[str]:
+def in_words(results: Results) -> list[str]:
     """Return the lines that are printed of several points."""
-    lines = []
+    lines, summary = [], results.summary
     for key, name in (("mean", "best mean"), ("worst_seed", "best worst seed")):
         told = "none, because every point has a seed that diverged or in which no "
         told += "episode ended"

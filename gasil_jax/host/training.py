@@ -87,8 +87,6 @@ def train_programs(
     configs = [each.algorithm.config for each in programs for _ in each.runs]
     total_steps = sum(x.num_iterations * x.batch_steps for x in configs)
     outcomes: list[Outcome] = []
-    if not programs:
-        return outcomes
     steps_before = 0
     points = {run.experiment for each in programs for run in each.runs}
     called = "seeds" if len(points) == 1 else "runs"

@@ -74,7 +74,7 @@ def differences(model: mujoco.MjModel) -> list[str]:
     solimps = [model.geom_solimp, model.pair_solimp, model.jnt_solimp]
     solimps += [model.eq_solimp, model.dof_solimp]
     frictions = np.append(model.geom_friction[geoms, 0], model.pair_friction[:, 0])
-    found = {
+    differences = {
         "friction of steep capsules on planes": (
             constraints.motion_normal(model, geoms) is None
             and (on_plane & capsule[:, 1] & (dim > 1)).any()
@@ -93,7 +93,7 @@ def differences(model: mujoco.MjModel) -> list[str]:
         ),
         f"contacts that {' or '.join(_MJX_NUMERICS)} leaves out": any(numerics),
     }
-    return [what for what, differs in found.items() if differs]
+    return [what for what, differs in differences.items() if differs]
 
 
 class Unsupported(ValueError):
