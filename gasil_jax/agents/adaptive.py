@@ -74,15 +74,13 @@ def follow_return(
     *,
     return_: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of the policy's returns after a batch's episodes.
+    """Return the first two arguments, as in `Adaptive`, after a batch's episodes.
 
     Args:
-      policy_return: float32 (), the mean before the batch.
-      has_episodes: bool (), whether there were episodes before the batch; whether there
-        are after it is returned too.
+      policy_return: float32 (), the moving mean before the batch.
+      has_episodes: bool (), whether an episode was counted before the batch.
       completed: bool (time, env), whether a whole episode ended with this step.
-      return_: float32 (time, env), the episode's return up to this step; NaN if it does
-        not count.
+      return_: float32 (time, env), its return; NaN if it does not count.
     """
     counted = completed & jnp.isfinite(return_)
     count = jnp.sum(counted)
@@ -130,18 +128,14 @@ class PPOGASILAdaptive(SelfImitatingAgent):
         self, state: Adaptive, context: Context, key: jax.Array
     ) -> tuple[Adaptive, jax.Array, Metrics]:
         """Train the discriminator, and return both streams, (time, env, 2)."""
-        discriminator, bonus, metrics = self.update_and_score(
-            state.discriminator, self.source(state.buffer), context, key
-        )
+        discriminator, bonus, metrics = self.update_and_score(state, context, key)
         batch = context.rollout
         normalizer = reward_normalization.update(
             state.bonus_normalizer, bonus, batch.ended, gamma=context.config.gamma
         )
+        past = (state.policy_return, state.has_episodes)
         policy_return, has_episodes = follow_return(
-            state.policy_return,
-            state.has_episodes,
-            batch.completed,
-            return_=self.ranked_by(batch),
+            *past, batch.completed, return_=self.ranked_by(batch)
         )
         metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
         metrics |= self.buffer_metrics(state.buffer)

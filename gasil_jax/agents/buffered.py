@@ -58,11 +58,7 @@ class BufferedAgent(Agent):
     ) -> GoodTrajectories:
         """Return the buffer with the whole episodes that ended in a batch.
 
-        Args:
-          buffer: the buffer before the batch.
-          context: the iteration's data.
-          return_: float32 (time, env), what an episode that ends with the step is
-            ranked by.
+        An episode that ends with a step is ranked by `return_`, (time, env).
         """
         batch, history = context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.

@@ -118,8 +118,7 @@ def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
         agent, context = algorithm.agent, example_context(ENV, algorithm, key)
         state = agent.remember(gasil_jax.init(ENV, algorithm, key).agent, context)
         _, rewards, _ = agent.update_and_reward(state, context, key)
-        source = agent.source(state.buffer)
-        _, bonus, _ = agent.update_and_score(state.discriminator, source, context, key)
+        _, bonus, _ = agent.update_and_score(state, context, key)
         return state.buffer.size, context.rollout.reward, bonus, rewards
 
     size, reward, bonus, rewards = first(jax.random.key(0))

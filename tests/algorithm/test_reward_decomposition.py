@@ -32,9 +32,9 @@ MODEL = gasil_jax.Decompose(
 _windows = jax.jit(decomposition.windows)
 
 
-def windows_of(*arguments):
+def windows_of(history):
     """The windows of a history, in NumPy."""
-    return jax.tree.map(np.asarray, _windows(*arguments))
+    return jax.tree.map(np.asarray, _windows(history))
 
 
 def random_batches(seed, num_batches, delay=5):
@@ -147,8 +147,7 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
             cut_short=False,
         )
         history = good_trajectories.record(history, steps)
-        recorded = np.int32((batch + 1) * NUM_STEPS)
-        windows = windows_of(history, recorded)
+        windows = windows_of(history)
         most = max(most, int(windows.ends.sum()))
         assert (windows.length[windows.ends] == LIMIT).all()
     assert most == complete
@@ -181,9 +180,7 @@ def test_the_length_of_the_history_follows_the_agent_and_the_models():
 def test_windows_of_the_history_are_those_of_a_plain_loop():
     batches = list(random_batches(0, 9))
     steps = []
-    for batch, (state, history, _, _) in zip(
-        batches, decompose_all(batches), strict=True
-    ):
+    for batch, (_, history, _, _) in zip(batches, decompose_all(batches), strict=True):
         unknown = batch.faulty | batch.cut_short
         payout = np.where(unknown, np.nan, batch.reward)
         steps += zip(payout, batch.ended, strict=True)
@@ -199,7 +196,7 @@ def test_windows_of_the_history_are_those_of_a_plain_loop():
                         position = ring - len(steps) + t
                         expected[env, position] = (payout[env], t + 1 - begin)
                     begin = t + 1
-        result = windows_of(history, state.recorded_steps)
+        result = windows_of(history)
         ends = np.nonzero(np.asarray(result.ends))
         assert set(zip(*ends, strict=True)) == set(expected)
         for place, (payout, length) in expected.items():
@@ -233,7 +230,7 @@ def test_in_the_history_every_window_has_what_it_paid():
     """Also one that began in an earlier batch, for a replay of whole episodes."""
     begin_before = 0
     for state, history, _, _ in decompose_all(random_batches(1, 9)):
-        complete = windows_of(history, state.recorded_steps)
+        complete = windows_of(history)
         reward = np.asarray(history.in_time(state.reward))
         for env, end in zip(*np.nonzero(np.asarray(complete.ends)), strict=True):
             begin = end + 1 - int(complete.length[env, end])
@@ -256,17 +253,10 @@ def test_a_failed_update_leaves_the_network_and_nothing_else():
         jax.tree.leaves(before.network), jax.tree.leaves(after.network), strict=True
     ):
         np.testing.assert_array_equal(old, new)
-    for (left, history, _, _), (right, _, reward, _) in zip(usual, failed, strict=True):
+    for (left, *_), (right, _, reward, _) in zip(usual, failed, strict=True):
         assert np.isfinite(reward).all()
-        assert left.recorded_steps == right.recorded_steps
         np.testing.assert_array_equal(left.open_steps, right.open_steps)
         np.testing.assert_array_equal(left.rates.mean, right.rates.mean)
-        for mine, other in zip(
-            windows_of(history, left.recorded_steps),
-            windows_of(history, right.recorded_steps),
-            strict=True,
-        ):
-            np.testing.assert_array_equal(mine, other)
 
 
 def test_fit_is_r_squared_of_the_windows_that_count():
