@@ -1,12 +1,11 @@
 """The good-trajectory buffer: the steps of the top-K episodes, in fixed arrays.
 
 Paper, section 4.1. An episode is offered to the buffer as a whole once it has ended. It
-is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, or the
-undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
-steps that were ever offered are ordered by (return descending, episode, time), and the
-first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
-a tie the older episode stays. All functions are pure and work under jit, vmap and
-shard_map; an empty buffer is a normal state.
+is ranked by the return of the environment's own reward, R = sum_t gamma^t r_t. The
+capacity is in steps: all steps that were ever offered are ordered by (return
+descending, episode, time), and the first `capacity` of them are kept. So the last
+episode in the buffer may be cut, and on a tie the older episode stays. All functions
+are pure and work under jit, vmap and shard_map; an empty buffer is a normal state.
 """
 
 import chex

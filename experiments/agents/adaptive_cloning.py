@@ -51,7 +51,7 @@ class PPOBCAdaptive(gasil_jax.PPOBC):
     ) -> AdaptiveCloningState:
         """Insert a batch's episodes into the buffer, and follow the policy's return."""
         batch, past = context.rollout, (state.policy_return, state.has_episodes)
-        return_ = self.ranked_by(batch)
+        return_ = batch.discounted_return
         followed = follow_return(*past, batch.completed, return_=return_)
         buffer = self.insert(state.buffer, context, return_)
         return AdaptiveCloningState(buffer, *followed)

@@ -48,22 +48,13 @@ RULES: Mapping[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 
 
 class Adaptive(struct.PyTreeNode):
-    """The state of the agent.
-
-    Attributes:
-      discriminator: the discriminator D.
-      bonus_normalizer: normalizes the bonus, so that the targets of its value have the
-        same scale as those of a normalized reward's.
-      policy_return: float32 (), moving mean of the returns of the policy's latest
-        episodes, discounted as the buffer ranks them; 0 before the first episode.
-      has_episodes: bool (), whether an episode has been counted.
-      buffer: the good-trajectory buffer.
-    """
+    """The state of the agent."""
 
     discriminator: Learner
+    # The targets of the bonus's value have the scale of a normalized reward's.
     bonus_normalizer: reward_normalization.RewardNormalizer
-    policy_return: jax.Array
-    has_episodes: jax.Array
+    policy_return: jax.Array  # float32 (), moving mean over the latest whole episodes
+    has_episodes: jax.Array  # bool (), whether an episode has been counted
     buffer: GoodTrajectories
 
 
@@ -135,7 +126,7 @@ class PPOGASILAdaptive(SelfImitatingAgent):
         )
         past = (state.policy_return, state.has_episodes)
         policy_return, has_episodes = follow_return(
-            *past, batch.completed, return_=self.ranked_by(batch)
+            *past, batch.completed, return_=batch.discounted_return
         )
         metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
         metrics |= self.buffer_metrics(state.buffer)

@@ -101,15 +101,10 @@ class Source(NamedTuple):
 
 
 class Imitation(struct.PyTreeNode):
-    """The state of an adversarial agent.
+    """The state of an adversarial agent."""
 
-    Attributes:
-      discriminator: D.
-      buffer: the good-trajectory buffer, B in the paper; None if the agent has none.
-    """
-
-    discriminator: Learner
-    buffer: GoodTrajectories | None = None
+    discriminator: Learner  # D
+    buffer: GoodTrajectories | None = None  # B in the paper; GAIL has none
 
 
 class AdversarialAgent(Agent):
@@ -265,7 +260,8 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
     """An agent whose discriminator learns from the buffer, `state.buffer`."""
 
     def remember(self, state: Any, context: Context) -> Any:
-        buffer = self.insert(state.buffer, context, self.ranked_by(context.rollout))
+        return_ = context.rollout.discounted_return
+        buffer = self.insert(state.buffer, context, return_)
         return state.replace(buffer=buffer)
 
     def good_trajectories(self, state: Any) -> GoodTrajectories:

@@ -7,9 +7,8 @@ import jax
 from gasil_jax import buffer as good_trajectories
 from gasil_jax.agents.interface import Agent
 from gasil_jax.buffer import GoodTrajectories
-from gasil_jax.config import count, switch
+from gasil_jax.config import count
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.rollout import Rollout
 
 
 class BufferedAgent(Agent):
@@ -21,21 +20,18 @@ class BufferedAgent(Agent):
       buffer_steps: capacity of the good-trajectory buffer, in steps.
       buffer_episodes: largest number of episodes in the good-trajectory buffer, besides
         its capacity in steps; None for no limit.
-      buffer_discounts: whether the good-trajectory buffer ranks episodes by their
-        discounted return, as the paper does; otherwise by the undiscounted one.
     """
 
     history_episodes: ClassVar[int] = 1
 
     buffer_steps: int = count(1000)
     buffer_episodes: int | None = count(None)
-    buffer_discounts: bool = switch(True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
         return self.init_buffer(sizes)
 
     def remember(self, state: Any, context: Context) -> Any:
-        return self.insert(state, context, self.ranked_by(context.rollout))
+        return self.insert(state, context, context.rollout.discounted_return)
 
     def good_trajectories(self, state: Any) -> GoodTrajectories:
         return state
@@ -45,12 +41,6 @@ class BufferedAgent(Agent):
         return good_trajectories.init_buffer(
             self.buffer_steps, sizes.observation, sizes.action
         )
-
-    def ranked_by(self, batch: Rollout) -> jax.Array:
-        """Return the returns that the buffer ranks episodes by, (time, env)."""
-        if self.buffer_discounts:
-            return batch.discounted_return
-        return batch.undiscounted_return
 
     @jax.named_scope("good_trajectories")
     def insert(

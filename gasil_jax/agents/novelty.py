@@ -40,17 +40,11 @@ _TIE = 1e-3
 
 
 class Visits(struct.PyTreeNode):
-    """How often each cell was visited.
+    """How often each cell was visited; float32."""
 
-    Attributes:
-      count: float32 (counters,), number of visits to the cells of each counter.
-      directions: float32 (obs, directions), random.
-      offset: float32 (directions,), where the cells begin, from 0 to 1.
-    """
-
-    count: jax.Array
-    directions: jax.Array
-    offset: jax.Array
+    count: jax.Array  # (counters,), number of visits to the cells of each counter
+    directions: jax.Array  # (obs, directions), random
+    offset: jax.Array  # (directions,), where the cells begin, from 0 to 1
 
 
 class PPONovelty(Agent):
@@ -119,17 +113,11 @@ class PPONovelty(Agent):
 
 
 class Explorer(struct.PyTreeNode):
-    """The state of PPO+BC+NOVELTY.
-
-    Attributes:
-      buffer: the good-trajectory buffer.
-      visits: the counters.
-      novelty: float32 (env,), sum over the running episode.
-    """
+    """The state of PPO+BC+NOVELTY."""
 
     buffer: GoodTrajectories
     visits: Visits
-    novelty: jax.Array
+    novelty: jax.Array  # float32 (env,), sum over the running episode
 
 
 class PPOBCNovelty(PPONovelty, PPOBC):
@@ -160,7 +148,7 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
         steps = self.novelty(visits, context), batch.ended
         novelty, total = jax.lax.scan(add, state.novelty, steps)
-        return_ = self.ranked_by(batch) + _TIE * total / batch.episode_length
+        return_ = batch.discounted_return + _TIE * total / batch.episode_length
         buffer = self.insert(state.buffer, context, return_)
         return Explorer(buffer, visits, novelty)
 

@@ -38,21 +38,13 @@ _MAX_ADVANTAGE = 1.0
 
 
 class Replay(struct.PyTreeNode):
-    """The last `capacity` steps of ended episodes, as a ring buffer.
+    """The last `capacity` steps of ended episodes, as a ring buffer; float32."""
 
-    Attributes:
-      observation: float32 (capacity, obs), not normalized.
-      action: float32 (capacity, action).
-      return_: float32 (capacity,), discounted return from the step on.
-      priority: float32 (capacity,), 0 where empty.
-      cursor: int32 (), index at which the next step is written.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    return_: jax.Array
-    priority: jax.Array
-    cursor: jax.Array
+    observation: jax.Array  # (capacity, obs), not normalized
+    action: jax.Array  # (capacity, action)
+    return_: jax.Array  # (capacity,), discounted return from the step on
+    priority: jax.Array  # (capacity,), 0 where empty
+    cursor: jax.Array  # int32 (), index at which the next step is written
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:

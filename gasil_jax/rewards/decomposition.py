@@ -46,22 +46,13 @@ _MOST = 2**19
 
 
 class Decomposition(struct.PyTreeNode):
-    """The state of reward decomposition between iterations.
+    """The state of reward decomposition between iterations."""
 
-    Attributes:
-      network: g, parameters and optimizer state of a `networks.StepReward`.
-      rates: moments of payout / length of all windows so far; a normalizer with
-        obs = 1.
-      reward: float32 (N, H), the decomposed rewards of the history's steps.
-      open_reward: float32 (N,), sum of the decomposed rewards of the running window.
-      open_steps: float32 (N,), number of steps of the running window.
-    """
-
-    network: Learner
-    rates: Normalizer
-    reward: jax.Array
-    open_reward: jax.Array
-    open_steps: jax.Array
+    network: Learner  # g, a `networks.StepReward`
+    rates: Normalizer  # moments of payout / length of all windows so far, (1,)
+    reward: jax.Array  # float32 (N, H), the decomposed rewards of the history's steps
+    open_reward: jax.Array  # float32 (N,), their sum over the running window
+    open_steps: jax.Array  # float32 (N,), number of steps of the running window
 
 
 class Windows(NamedTuple):

@@ -163,7 +163,6 @@ def first_update(**changes):
         {"discriminator_updates": 1},
         {"buffer_steps": 150},
         {"buffer_episodes": 1},
-        {"buffer_discounts": False},
     ],
 )
 def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):
@@ -174,5 +173,3 @@ def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):
         assert buffer.size == 150 < before.size
     if "buffer_episodes" in change:
         assert buffer.size == 50 < before.size
-    if "buffer_discounts" in change:
-        assert mean_return(buffer) > 1.02 * mean_return(before)

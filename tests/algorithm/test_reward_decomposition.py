@@ -69,7 +69,6 @@ def random_batches(seed, num_batches, delay=5):
             truncated=np.zeros(shape, bool),
             episode_return=zeros,
             discounted_return=zeros,
-            undiscounted_return=zeros,
             episode_length=np.zeros(shape, np.int32),
             faulty=faulty,
             cut_short=ended & ~faulty & (rng.random(shape) < 0.2),

@@ -203,8 +203,8 @@ def test_a_used_folder_is_left_alone(arguments, message, trained, capsys):
             "gail, not of ppo",
         ),
         (
-            "--env hopper --agent ppo+sil --no-buffer-discounts",
-            "option --no-buffer-discounts is unknown: buffer_discounts is a setting of",
+            "--env hopper --agent ppo+sil --buffer-episodes 3",
+            "option --buffer-episodes is unknown: buffer_episodes is a setting of",
         ),
         ("--env hopper --seeds 0", "seeds is 0: it must be from 1 to"),
         ("--env hopper --seeds 1e30", "must be from 1 to 1,048,576"),
