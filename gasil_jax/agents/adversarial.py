@@ -28,7 +28,6 @@ from gasil_jax import learner, normalization
 from gasil_jax.agents import expert
 from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.agents.interface import Agent
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import Schedule, choice, count, number, schedule, text, widths
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.learner import Learner
@@ -104,7 +103,7 @@ class Imitation(struct.PyTreeNode):
     """The state of an adversarial agent."""
 
     discriminator: Learner  # D
-    buffer: GoodTrajectories | None = None  # B in the paper; GAIL has none
+    buffer: Any = None  # `GoodTrajectories`, B in the paper; GAIL has none
 
 
 class AdversarialAgent(Agent):
@@ -259,14 +258,6 @@ class ShapedRewardAgent(AdversarialAgent):
 class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
     """An agent whose discriminator learns from the buffer, `state.buffer`."""
 
-    def remember(self, state: Any, context: Context) -> Any:
-        return_ = context.rollout.discounted_return
-        buffer = self.insert(state.buffer, context, return_)
-        return state.replace(buffer=buffer)
-
-    def good_trajectories(self, state: Any) -> GoodTrajectories:
-        return state.buffer
-
     def source(self, state: Any, context: Context) -> Source:
         def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
             return good_trajectories.sample(key, state.buffer, num_samples)
@@ -286,8 +277,7 @@ class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
         self, state: Imitation, context: Context, key: jax.Array
     ) -> tuple[Imitation, jax.Array, Metrics]:
         state, reward, metrics = super().update_and_reward(state, context, key)
-        buffer = self.good_trajectories(state)
-        return state, reward, metrics | self.buffer_metrics(buffer)
+        return state, reward, metrics | self.buffer_metrics(state.buffer)
 
 
 class GASIL(PPOGASIL):

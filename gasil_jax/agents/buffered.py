@@ -3,6 +3,7 @@
 from typing import Any, ClassVar
 
 import jax
+from flax import struct
 
 from gasil_jax import buffer as good_trajectories
 from gasil_jax.agents.interface import Agent
@@ -11,10 +12,16 @@ from gasil_jax.config import count
 from gasil_jax.context import Context, Metrics, Sizes
 
 
+class Buffered(struct.PyTreeNode):
+    """The state of an agent that has a buffer and nothing else."""
+
+    buffer: GoodTrajectories
+
+
 class BufferedAgent(Agent):
     """An agent that imitates the steps of the best episodes (paper, section 4.1).
 
-    Its state is the buffer, unless a subclass puts the buffer into another one.
+    A subclass may have another state, with the buffer as its field `buffer`.
 
     Attributes:
       buffer_steps: capacity of the good-trajectory buffer, in steps.
@@ -28,13 +35,11 @@ class BufferedAgent(Agent):
     buffer_episodes: int | None = count(None)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
-        return self.init_buffer(sizes)
+        return Buffered(self.init_buffer(sizes))
 
     def remember(self, state: Any, context: Context) -> Any:
-        return self.insert(state, context, context.rollout.discounted_return)
-
-    def good_trajectories(self, state: Any) -> GoodTrajectories:
-        return state
+        return_ = context.rollout.discounted_return
+        return state.replace(buffer=self.insert(state.buffer, context, return_))
 
     def init_buffer(self, sizes: Sizes) -> GoodTrajectories:
         """Return an empty buffer."""

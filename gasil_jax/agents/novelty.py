@@ -28,7 +28,6 @@ from gasil_jax.agents.interface import Agent
 from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import number
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.ppo import ActorCritic
 
 # The numbers of counters, which cells of the same hash share, and of random directions,
 # each with a prime that the hash multiplies by.
@@ -132,9 +131,6 @@ class PPOBCNovelty(PPONovelty, PPOBC):
             novelty=jnp.zeros(sizes.num_envs),
         )
 
-    def good_trajectories(self, state: Explorer) -> GoodTrajectories:
-        return state.buffer
-
     def visits(self, state: Explorer) -> Visits:
         return state.visits
 
@@ -151,11 +147,3 @@ class PPOBCNovelty(PPONovelty, PPOBC):
         return_ = batch.discounted_return + _TIE * total / batch.episode_length
         buffer = self.insert(state.buffer, context, return_)
         return Explorer(buffer, visits, novelty)
-
-    def update_policy(
-        self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
-    ) -> tuple[Any, ActorCritic, Metrics]:
-        buffer, actor_critic, metrics = super().update_policy(
-            state.buffer, actor_critic, context, key
-        )
-        return state.replace(buffer=buffer), actor_critic, metrics

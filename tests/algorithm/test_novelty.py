@@ -64,8 +64,7 @@ def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
         normalizer=normalization.init(ENV.observation_size),
     )
     for kind, novel in ((agent, True), (PPOBC(buffer_steps=8), False)):
-        state = remembered(kind, context)
-        buffer = state.buffer if novel else state
+        buffer = remembered(kind, context).buffer
         first = np.array(buffer.action[0])
         env = int(np.where((np.array(batch.action) == first).all(-1))[1][0])
         assert buffer.size > 0 and (env == 2) == novel

@@ -387,7 +387,7 @@ def test_agents_and_ppo_see_decomposed_rewards_and_the_buffer_the_environments()
     assert np.isnan(state.history.reward).any()
     assert np.all(metrics["skipped_updates"] == 0)
     assert jnp.nanmean(state.history.reward != 0.0) < 0.1
-    assert state.agent.size > 0
+    assert state.agent.buffer.size > 0
 
 
 def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():
