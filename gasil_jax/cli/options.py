@@ -7,10 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-import jax
-
-from gasil_envs import user_code
-from gasil_jax import algorithms, checks, presets, train
+from gasil_jax import algorithms, presets
 from gasil_jax.agents import PPOGASIL
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli import parsing
@@ -83,6 +80,8 @@ class Options:
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
         learns from the delayed sums, instead of from the delayed reward itself.
+      rewards: your own models of rewards, as MODULE:CLASS; each gets the rewards that
+        the one before it has made, and the package's come after them.
       normalize_rewards: whether to divide PPO's rewards by the standard deviation of
         their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
         that unit, not in the environment's. It has no effect on the agents gasil and
@@ -102,6 +101,7 @@ class Options:
     evaluate_episodes: int | None = None
     log: tuple[str, ...] = ()
     devices: int | None = None
+    rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
     normalize_rewards: bool = False
 
@@ -164,10 +164,13 @@ def read(
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
     for model in REWARD_MODELS:
         parser.add_fields(model, model.switch, own.get(model, model()))
+    for each in algorithm.own_models:
+        parser.add_fields(type(each), each.name, each, all_shown=True)
     values = parser.read(arguments, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
     switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
     on = [switch for switch, is_on in switches.items() if is_on]
+    on += [each.name for each in algorithm.own_models]
     changes = [parser.fields(values, title) for title in ("training", "agent", *on)]
     with input_checked():
         changed = algorithm.replace(**switches).replace(
@@ -214,6 +217,7 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--out", type=pathlib.Path, nargs="?")
     for name in ("env", "agent", "preset"):
         parser.add_argument(f"--{name}", nargs="?")
+    parser.add_argument("--rewards", nargs="*")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
     return parser.parse_known_args(parsing.words(arguments))[0]
@@ -224,9 +228,11 @@ def _defaults(
 ) -> tuple[Algorithm, Options]:
     """Return the algorithm and the options that hold where none are given."""
     if stored is not None:
+        own_models = [model.name for model in stored.algorithm.own_models]
         for name, given, own in (
             ("agent", first.agent, stored.algorithm.agent.name),
             ("preset", first.preset, stored.preset),
+            ("rewards", first.rewards, own_models),
         ):
             if given not in (None, own):
                 raise InputError(
@@ -249,6 +255,7 @@ def _defaults(
                 else recording.evaluate_episodes
             ),
             log=recording.log,
+            rewards=tuple(own_models),
             **_switches(stored.algorithm),
         )
     name = first.agent or Options.agent
@@ -264,11 +271,16 @@ def _defaults(
                 reward_delay=first.reward_delay,
                 action_size=_action_size(first.env, preset),
             )
+        models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
+        rewards = (*models, *algorithm.rewards)
+        algorithm = dataclasses.replace(algorithm, rewards=rewards)
+        algorithms.check(algorithm)
     taken = {*names(SweepOptions), *names(Settings)}
-    for setting in names(agent):
-        if setting in taken:
+    parts: tuple[Any, ...] = (algorithm.agent, *models)
+    for part in parts:
+        for setting in taken.intersection(names(part)):
             raise InputError(
-                f"agent {name!r} has a setting {setting!r}, a name that is taken by an "
+                f"{part.name!r} has a setting {setting!r}, a name that is taken by an "
                 "option: it must be a new one"
             )
     missing: Any = dataclasses.MISSING
@@ -424,20 +436,3 @@ def make_folder(options: Options) -> pathlib.Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
     return folders.create_new(name)
-
-
-def check_agent(env: Any, algorithm: Algorithm) -> None:
-    """Check that the agent can run in the environment; trace an agent of the user's."""
-
-    def begin() -> Any:
-        state = train.init(env, algorithm, jax.random.key(0))
-        return train.train_step(env, algorithm, state)
-
-    with input_checked():
-        checks.check(env, algorithm)
-        if ":" in algorithm.agent.name:
-            package = pathlib.Path(train.__file__).parent
-            what = f"agent {algorithm.agent.name!r} can't be traced"
-            with user_code.refused(what, package):
-                with announced(algorithm.agent.name, "tracing the agent"):
-                    jax.eval_shape(begin)

@@ -40,7 +40,6 @@ def train(
             options.out or pathlib.Path("runs"),
             num_devices=options.devices,
         )
-        options_.check_agent(env, requested.algorithm)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):

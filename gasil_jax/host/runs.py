@@ -33,6 +33,7 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "action_noise": 0.0,
     "policy_components": 1,
+    "rewards": (),
 }
 
 #: Settings that are no more: the settings beside which a run had one, and the value
