@@ -418,6 +418,8 @@ def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
     *_, states = saved.load(out)
     params = states.actor_critic.policy.params
     assert params["params"]["own"]["Conv_0"]["kernel"].shape == (2, 3, 3, 4, 16)
+    action = gasil_jax.load_policy(out, which="best")(np.zeros((3, 400)))
+    assert action.shape == (3,) and action.dtype == np.int32
     assert evaluate.main([str(out), "--episodes", "2"]) == 0
 
 

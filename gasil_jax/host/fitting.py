@@ -83,9 +83,9 @@ def fit(
         keeps nothing. All commands can read it, if a command line can name what was
         trained: an environment from `gasil_jax.make_env`, an agent and models of
         rewards that can be imported, your own before the package's, and schedules of
-        points. Otherwise config.json says why not in "only_python", and `gasil_jax.load_policy`,
-        `gasil_jax.load_reward` with its arguments `env` and `algorithm`, and
-        ``python -m gasil_jax.plot`` can read it.
+        points. Otherwise config.json says why not in "only_python", and
+        `gasil_jax.load_policy` and `gasil_jax.load_reward`, with their arguments `env`
+        and `algorithm`, and ``python -m gasil_jax.plot`` can read it.
       resume: train what is missing in the folder. The algorithm and evaluations must be
         the same, but `total_steps` may be larger, and there may be more seeds and
         points. An environment from `gasil_jax.make_env` is compared by its name and

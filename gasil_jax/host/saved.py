@@ -23,6 +23,7 @@ from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     checkpoint,
     environments,
+    folders,
     programs,
     results,
     sweep,
@@ -278,6 +279,50 @@ def load_policies(
     about = numpy_policy.about(str(folder))
     env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
     return Policies(env, int(env.episode_length), [about["seed"]], [arrays])
+
+
+def load_policy(
+    path: str | pathlib.Path,
+    seed: int | None = None,
+    *,
+    which: str = "last",
+    point: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
+) -> Callable[..., jax.Array]:
+    """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
+
+    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
+    float32. It clips actions to their range. Without a key the action is the policy's
+    mean, or that of a mixture's most probable Gaussian; with a key it is drawn from the
+    policy. The key is consumed. Discrete actions are int32 (...), without a key the
+    most probable ones.
+
+    Args:
+      path: the folder of a run or a sweep; a file ``policy.npz``; or "zoo:NAME", one of
+        the policies that come with the package. In a folder policy.npz is read if it
+        has what is asked for, and a checkpoint otherwise.
+      seed: number of the seed; default the one with the highest final return.
+      which: see `load`.
+      point: see `load`.
+      env: see `load`; only for checkpoints of an environment that was made in Python.
+      algorithm: see `load`; only for checkpoints of what was made in Python.
+
+    Raises:
+      ValueError: if it is not a saved policy, or has no such seed; and as `load` does.
+    """
+    if not isinstance(path, str | pathlib.PurePath):
+        raise refusal("path", path, "a string or a pathlib.Path")
+    folder = pathlib.Path(path)
+    has_file = not folders.has_config(folder) or (folder / "policy.npz").exists()
+    if has_file and which == "last" and point is None:
+        return policy.make(numpy_policy.read(path, seed))
+    if seed is None:
+        seed = best_seed(folder, point)
+    env, _, _, states = load(
+        folder, which, point, seed=seed, env=env, algorithm=algorithm
+    )
+    return policy.from_state(member(states, 0), env)
 
 
 def load_reward(
