@@ -342,6 +342,11 @@ def test_the_python_of_the_documentation_runs(finished_hopper):
     assert names["scores"]["episode_return"].shape == (10,)
     assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
     assert names["tried"].metrics["episode_return"].shape == (2, 5, 2)
+    # Of the copies, the networks are one and the numbers that they draw are not.
+    copies = names["population"]
+    first, second = copies.actor_critic.policy.params["params"]["log_std"]
+    np.testing.assert_array_equal(first, second)
+    assert len(np.unique(jax.vmap(jax.random.uniform)(copies.key))) == 2
     result = names["result"]
     assert result.metrics["episode_return"].shape == (10, 2)
     # The untrained policy and the last one.
