@@ -53,7 +53,9 @@ class Options:
         --list-envs prints all names.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
-        settings: this help shows those of the one that is named beside it.
+        settings: this help shows those of the one that is named beside it. Several,
+        separated by commas, are trained side by side, each from its own preset: the
+        points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule of PPO for all continuous tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -153,7 +155,8 @@ def read(
                 f"out is {first.out}, which holds no run to continue: to begin one "
                 "there, give --env"
             )
-    algorithm, default = _defaults(kind, first, stored)
+    every, default = _defaults(kind, first, stored)
+    algorithm = every[0]
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
     settings = Settings() if stored is None else stored.settings
@@ -166,20 +169,27 @@ def read(
         parser.add_fields(model, model.switch, own.get(model, model()))
     for each in algorithm.own_models:
         parser.add_fields(type(each), each.name, each, all_shown=True)
+    for other in every[1:]:
+        parser.add_fields(type(other.agent), other.agent.name, other.agent)
     values = parser.read(arguments, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
-    switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
-    on = [switch for switch, is_on in switches.items() if is_on]
-    on += [each.name for each in algorithm.own_models]
-    changes = [parser.fields(values, title) for title in ("training", "agent", *on)]
+    given = {name: getattr(values, name) for name in parser.given(arguments)}
+    switches = [model.switch for model in REWARD_MODELS]
+
+    def changed(algorithm: Algorithm) -> Algorithm:
+        """Return an algorithm with those of the given values that it has."""
+        on_or_off = {x: value for x, value in given.items() if x in switches}
+        algorithm = algorithm.replace(**on_or_off)
+        own = {x: value for x, value in given.items() if x in algorithm.settings}
+        return algorithm.replace(**own)
+
     with input_checked():
-        changed = algorithm.replace(**switches).replace(
-            **{name: value for part in changes for name, value in part.items()}
-        )
+        algorithms_ = [changed(each) for each in every]
     requested = Sweep(
         options.env,
-        changed,
+        algorithms_[0],
         _seeds(options, stored),
+        others=algorithms_[1:],
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(
             options.checkpoint_every,
@@ -199,7 +209,7 @@ def read(
         options,
         requested,
         default=algorithm,
-        off={x: parser.fields(values, x) for x in switches if x not in on},
+        off={x: parser.fields(values, x) for x in switches if not getattr(values, x)},
     )
     return options, requested
 
@@ -225,12 +235,12 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 def _defaults(
     kind: type[Options], first: argparse.Namespace, stored: Sweep | None
-) -> tuple[Algorithm, Options]:
-    """Return the algorithm and the options that hold where none are given."""
+) -> tuple[Sequence[Algorithm], Options]:
+    """Return the agents' algorithms and the options that hold where none are given."""
     if stored is not None:
         own_models = [model.name for model in stored.algorithm.own_models]
         for name, given, own in (
-            ("agent", first.agent, stored.algorithm.agent.name),
+            ("agent", first.agent, stored.agent),
             ("preset", first.preset, stored.preset),
             ("rewards", first.rewards, own_models),
         ):
@@ -240,9 +250,9 @@ def _defaults(
                     "out or name another folder"
                 )
         recording = stored.recording
-        return stored.algorithm, kind(
+        return stored.algorithms, kind(
             env=stored.env,
-            agent=stored.algorithm.agent.name,
+            agent=stored.agent,
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
@@ -258,23 +268,36 @@ def _defaults(
             rewards=tuple(own_models),
             **_switches(stored.algorithm),
         )
-    name = first.agent or Options.agent
-    preset = first.preset or presets.DEFAULT
+    agents = (first.agent or Options.agent).split(",")
+    for name in agents:
+        if agents.count(name) > 1:
+            raise InputError(f"agent has {name!r} twice: name it once")
     with input_checked():
-        agent = descriptions.find_agent(name)
-        algorithm = Algorithm(agent())
-        if first.env is not None:
-            algorithm = presets.preset(
-                first.env,
-                agent,
-                preset,
-                reward_delay=first.reward_delay,
-                action_size=_action_size(first.env, preset),
-            )
-        models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
-        rewards = (*models, *algorithm.rewards)
-        algorithm = dataclasses.replace(algorithm, rewards=rewards)
-        algorithms.check(algorithm)
+        every = [_default(name, first) for name in agents]
+    missing: Any = dataclasses.MISSING
+    return every, kind(
+        env=missing,
+        agent=",".join(agents),
+        preset=first.preset or presets.DEFAULT,
+        **_switches(every[0]),
+    )
+
+
+def _default(name: str, first: argparse.Namespace) -> Algorithm:
+    """Return the algorithm from which an agent starts."""
+    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
+    algorithm = Algorithm(agent())
+    if first.env is not None:
+        algorithm = presets.preset(
+            first.env,
+            agent,
+            preset,
+            reward_delay=first.reward_delay,
+            action_size=_action_size(first.env, preset),
+        )
+    models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
+    algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
+    algorithms.check(algorithm)
     taken = {*names(SweepOptions), *names(Settings)}
     parts: tuple[Any, ...] = (algorithm.agent, *models)
     for part in parts:
@@ -283,10 +306,7 @@ def _defaults(
                 f"{part.name!r} has a setting {setting!r}, a name that is taken by an "
                 "option: it must be a new one"
             )
-    missing: Any = dataclasses.MISSING
-    return algorithm, kind(
-        env=missing, agent=name, preset=preset, **_switches(algorithm)
-    )
+    return algorithm
 
 
 def _switches(algorithm: Algorithm) -> dict[str, Any]:
@@ -335,29 +355,35 @@ def _seeds(options: Options, stored: Sweep | None) -> Sequence[int]:
 
 def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sweep:
     """Return the sweep with the points that the options name."""
-    if not isinstance(options, SweepOptions):
-        return (
-            requested
-            if stored is None
-            else dataclasses.replace(requested, points=stored.points)
-        )
-    new = bool(options.grid) or options.random is not None
-    if not new and options.points_file is None:
-        if stored is None:
-            raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or "
-                "--points-file"
+    named: Sequence[points.Point] | None = None
+    if isinstance(options, SweepOptions):
+        new = bool(options.grid) or options.random is not None
+        if new or options.points_file is not None:
+            named = points.make_points(
+                options.grid,
+                options.random,
+                options.points_file,
+                seed=options.first_seed,
+                algorithms=requested.algorithms,
             )
+        elif stored is None and not requested.others:
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random, "
+                "--points-file or several agents"
+            )
+    if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
-    named = points.make_points(
-        options.grid,
-        options.random,
-        options.points_file,
-        seed=options.first_seed,
-        algorithm=requested.algorithm,
-    )
-    points.check(named, requested.algorithm)
-    every = points.completed(named, requested.algorithm)
+    named = named or [{}]
+    if requested.others:
+        agents = [each.agent.name for each in requested.algorithms]
+        named = [
+            {"agent": agent, **point}
+            for agent in agents
+            for point in named
+            if point.get("agent", agent) == agent
+        ]
+    points.check(named, *requested.algorithms)
+    every = points.completed(named, *requested.algorithms)
     return dataclasses.replace(requested, points=every)
 
 
@@ -366,7 +392,8 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        algorithms.check(requested.algorithm)
+        for each in requested.algorithms:
+            algorithms.check(each)
         trackers.check(options.log)
     check_minimum(
         options,
@@ -416,17 +443,19 @@ def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
 
     Other presets refuse an agent or a task that they have nothing for.
     """
-    lacking = presets.describe_lack(
-        options.env,
-        requested.algorithm.agent.name,
-        presets.DEFAULT,
-        reward_delay=requested.settings.reward_delay,
-    )
-    if options.preset == presets.DEFAULT and lacking is not None and not options.resume:
-        more = ""
-        if environments.is_discrete(env):
-            more = " (--preset gymnax has one setting for discrete actions)"
-        note(f"{lacking}: options that are not given have their defaults{more}")
+    for each in requested.algorithms:
+        lacking = presets.describe_lack(
+            options.env,
+            each.agent.name,
+            presets.DEFAULT,
+            reward_delay=requested.settings.reward_delay,
+        )
+        default = options.preset == presets.DEFAULT and not options.resume
+        if default and lacking is not None:
+            more = ""
+            if environments.is_discrete(env):
+                more = " (--preset gymnax has one setting for discrete actions)"
+            note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

@@ -58,7 +58,7 @@ def train(
                 env,
                 needed,
                 requested.recording,
-                title=f"{requested.env} {requested.algorithm.agent.name}",
+                title=f"{requested.env} {requested.agent}",
                 interruption=interruption,
             )
         trained = requested.trained(folder)
@@ -104,7 +104,7 @@ def write(
 
 def tell(folder: pathlib.Path, told: Results) -> None:
     """Print the best points of a sweep, its speed, and commands to go on with."""
-    print(*results.in_words(told), sep="\n")
+    print(*results.best_in_words(told), sep="\n")
     print(f"{speed_in_words(told.trainings)}, in {folder}")
     quoted = shlex.quote(str(folder))
     print(

@@ -33,6 +33,7 @@ from gasil_jax.host import (
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.members import member
 from gasil_jax.host.output_file import note
+from gasil_jax.host.points import in_words
 from gasil_jax.host.programs import Program
 from gasil_jax.host.sweep import Sweep
 
@@ -51,8 +52,8 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
       InputError: if it is no such folder, or has no such point.
     """
     described = sweep.described(folder)
-    agent = str(described["algorithm"].get("agent"))
     chosen = _choose_point(folder, described["points"], point)
+    agent = described["points"][chosen].get("agent", described["algorithm"]["agent"])
     if described["only_python"] is None:
         return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
     return described["env"], agent, programs.labelled(folder / "programs", chosen)
@@ -89,8 +90,9 @@ def _choose_point(
                 f"to {last}"
             )
         if point <= last:
-            values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
-            note(f"{folder}: point {point}, the best by mean ({values})")
+            note(
+                f"{folder}: point {point}, the best by mean ({in_words(points[point])})"
+            )
     point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
