@@ -21,6 +21,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
+    saved,
     sweep,
     trackers,
 )
@@ -45,6 +46,8 @@ COMMON = frozenset(
 class Options:
     """Train an agent on an environment, many seeds at once.
 
+    In a checkout, python -m experiments trains the figures of the documentation.
+
     Attributes:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
         humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
@@ -68,6 +71,10 @@ class Options:
       resume: train what is missing in the folder `out`, with its settings. total_steps
         and seeds may grow; checkpoint_every, keep_checkpoints, devices and log may
         differ. If the folder holds nothing yet, training begins.
+      config: the config.json of another run: what it holds is used for all options that
+        are not given.
+      init_from: folder of a run, whose best seed's policy, values and normalizer of
+        observations training starts from, instead of new ones.
       checkpoint_every: environment steps per seed between two checkpoints; by
         default a checkpoint is written every ten minutes.
       keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
@@ -97,6 +104,8 @@ class Options:
     first_seed: int = 0
     out: pathlib.Path | None = None
     resume: bool = False
+    config: pathlib.Path | None = None
+    init_from: pathlib.Path | None = None
     checkpoint_every: int | None = None
     keep_checkpoints: int = 2
     evaluate_every: int | None = None
@@ -139,7 +148,7 @@ def read(
     """Return the options of a command line, and what they train.
 
     With --resume, options that are not given are those of the sweep in the folder,
-    whose points come first; otherwise they are the preset's.
+    whose points come first; with --config those of a file; otherwise the preset's.
     """
     if "--list-envs" in parsing.words(arguments):
         print(*environments.names(), sep="\n")
@@ -150,12 +159,18 @@ def read(
             raise InputError("resume needs --out and the folder to continue")
         if folders.has_config(first.out):
             stored = sweep.read(first.out)
-        elif first.env is None:
+        elif first.env is None and first.config is None:
             raise InputError(
                 f"out is {first.out}, which holds no run to continue: to begin one "
                 "there, give --env"
             )
-    every, default = _defaults(kind, first, stored)
+    is_begun, origin = stored is not None, f"out is {first.out}"
+    if first.config is not None and stored is None:
+        origin = f"config is {first.config}"
+        if not first.config.is_file():
+            raise InputError(f"{origin}: it must be the config.json of a run")
+        stored = sweep.read(first.config)
+    every, default = _defaults(kind, first, stored, origin)
     algorithm = every[0]
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
@@ -184,7 +199,7 @@ def read(
         return algorithm.replace(**own)
 
     with input_checked():
-        algorithms_ = [changed(each) for each in every]
+        algorithms_ = tuple(map(changed, every))
     requested = Sweep(
         options.env,
         algorithms_[0],
@@ -199,11 +214,15 @@ def read(
             options.log,
         ),
         preset=options.preset if stored is None else stored.preset,
+        start=None if stored is None else stored.start,
     )
+    if options.init_from is not None:
+        requested = dataclasses.replace(
+            requested, start=saved.find_start(options.init_from)
+        )
     _check(options, requested)
     requested = _with_points(options, requested, stored)
-    if stored is not None:
-        assert options.out is not None
+    if is_begun and options.out is not None:
         requested = requested.continued_from(options.out)
     _note_without_effect(
         options,
@@ -224,7 +243,8 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
             return 1
 
     parser = Parser("gasil_jax", "", Options)
-    parser.add_argument("--out", type=pathlib.Path, nargs="?")
+    for name in ("out", "config"):
+        parser.add_argument(f"--{name}", type=pathlib.Path, nargs="?")
     for name in ("env", "agent", "preset"):
         parser.add_argument(f"--{name}", nargs="?")
     parser.add_argument("--rewards", nargs="*")
@@ -234,7 +254,7 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
 
 
 def _defaults(
-    kind: type[Options], first: argparse.Namespace, stored: Sweep | None
+    kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
 ) -> tuple[Sequence[Algorithm], Options]:
     """Return the agents' algorithms and the options that hold where none are given."""
     if stored is not None:
@@ -246,8 +266,8 @@ def _defaults(
         ):
             if given not in (None, own):
                 raise InputError(
-                    f"out is {first.out}, where {name} was {own}, is {given}: leave it "
-                    "out or name another folder"
+                    f"{origin}, where {name} was {own}, is {given}: leave it "
+                    "out or name another one"
                 )
         recording = stored.recording
         return stored.algorithms, kind(
@@ -450,7 +470,8 @@ def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
             presets.DEFAULT,
             reward_delay=requested.settings.reward_delay,
         )
-        default = options.preset == presets.DEFAULT and not options.resume
+        default = options.preset == presets.DEFAULT
+        default &= not options.resume and options.config is None
         if default and lacking is not None:
             more = ""
             if environments.is_discrete(env):

@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(
             prog=f"python -m {program}",
             usage=f"python -m {program} {usage}",
-            description=(inspect.getdoc(kind) or "").partition("\n\n")[0],
+            description=(inspect.getdoc(kind) or "").partition("\n\nAttributes:")[0],
             epilog=None if shown is None else "--help-all shows all options.",
             add_help=False,
             allow_abbrev=False,

@@ -40,6 +40,7 @@ def train(
             options.out or pathlib.Path("runs"),
             num_devices=options.devices,
         )
+        start = requested.start and saved.load_start(requested.start, env, needed)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):
@@ -54,6 +55,8 @@ def train(
     try:
         with noted(how), Interruption() as interruption:
             needed = requested.unfinished(folder, runs)
+            if start is not None:
+                saved.begin(start, env, needed)
             outcomes = training.train_programs(
                 env,
                 needed,

@@ -59,6 +59,21 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True)
+class Start:
+    """The trained policy that runs start from.
+
+    Attributes:
+      run: the folder of its run.
+      seed: its seed.
+      sha256: hash of its checkpoint.
+    """
+
+    run: str
+    seed: int
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Sweep:
     """The points and seeds of a folder.
 
@@ -67,6 +82,7 @@ class Sweep:
       algorithm: the algorithm that the points change.
       others: those of further agents, which are trained beside it. Then each point has
         its "agent".
+      start: the trained policy that all runs start from; None starts from scratch.
       seeds: absolute seed numbers.
       points: changed settings, by name; all have the same names.
       settings: settings of the environment.
@@ -85,6 +101,7 @@ class Sweep:
     preset: str | None = None
     only_python: str | None = None
     others: Sequence[Algorithm] = ()
+    start: Start | None = None
 
     @property
     def algorithms(self) -> tuple[Algorithm, ...]:
@@ -101,8 +118,9 @@ class Sweep:
         """The run of each (index of the point, seed)."""
         every = [points.algorithm_of(x, self.algorithms) for x in self.points]
         changed = [algorithm.replace(**values) for algorithm, values in every]
+        start = None if self.start is None else self.start.sha256
         return {
-            (index, seed): Run(self.env, algorithm, seed, self.settings)
+            (index, seed): Run(self.env, algorithm, seed, self.settings, start=start)
             for index, algorithm in enumerate(changed)
             for seed in self.seeds
         }
@@ -167,6 +185,7 @@ class Sweep:
             "seeds": list(self.seeds),
             "recording": self.recording,
             "preset": self.preset,
+            "start": self.start,
             "only_python": self.only_python,
             "expert_sha256": _expert_hash(self),
         }
@@ -188,7 +207,7 @@ class Sweep:
                 "devices and log may differ"
             )
         every = points.completed([*stored["points"], *self.points], *self.algorithms)
-        return dataclasses.replace(self, points=every)
+        return dataclasses.replace(self, points=every, start=stored.get("start"))
 
 
 class Config(TypedDict, total=False):
@@ -203,12 +222,13 @@ class Config(TypedDict, total=False):
     recording: Required[Recording]
     preset: Required[str | None]
     only_python: Required[str | None]
+    start: Start | None
     expert_sha256: str | None
 
 
 def described(folder: pathlib.Path) -> Config:
     """Return the content of config.json, also of what only Python can make."""
-    path = folder / folders.CONFIG
+    path = folder if folder.is_file() else folder / folders.CONFIG
     try:
         content: Config = json_files.read(path, Config)
     except (FileNotFoundError, NotADirectoryError):
@@ -245,7 +265,10 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
         every = points.completed(stored["points"], algorithm, *others)
     names = ("env", "settings", "seeds", "recording", "preset", "only_python")
     fields: dict[str, Any] = {name: stored[name] for name in names}  # type: ignore[literal-required]
-    return Sweep(algorithm=algorithm, others=others, points=every, **fields)
+    start = stored.get("start")
+    return Sweep(
+        algorithm=algorithm, others=others, points=every, start=start, **fields
+    )
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
@@ -282,6 +305,9 @@ def _differences(before: Config, now: Sweep) -> list[str]:
         changes.append(f"total_steps was {old[0]['total_steps']}")
     if not set(before["seeds"]) <= set(now.seeds):
         changes.append(f"seeds were {shown(list(before['seeds']))}")
+    start = before.get("start")
+    if now.start and (start is None or start.sha256 != now.start.sha256):
+        changes.append(f"init_from was {start and start.run}, is {now.start.run}")
     if before.get("expert_sha256") != _expert_hash(now):
         changes.append("the trajectories of the expert were others")
     return changes
