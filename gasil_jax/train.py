@@ -221,10 +221,19 @@ def collect(
     model_keys = _keys(keys.rewards, len(algorithm.rewards))
     with jax.named_scope("rewards"):
         for model, before, key in zip(algorithm.rewards, state.rewards, model_keys):
-            after, context, is_sound, own = model.update(before, context, key)
+            after, context, learned, own = call(
+                model,
+                "update",
+                before,
+                context,
+                key,
+                state=before,
+                context=context,
+                learned=jnp.bool_(True),
+            )
             states.append(after)
-            healthy &= is_sound
-            metrics = merge_metrics(type(model).__name__, metrics, own)
+            healthy &= learned
+            metrics = merge_metrics(f"model of rewards {model.name!r}", metrics, own)
     return Experience(
         batch, context, environments, history, tuple(states), healthy, metrics
     )
@@ -286,13 +295,13 @@ def learn(
             "skipped_updates": ~(healthy & experience.healthy),
         },
         rollout.metrics(batch),
-        experience.metrics,
         agent_metrics,
         ppo_metrics,
         value_metrics,
         mix_metrics,
         policy_metrics,
     )
+    metrics = merge_metrics("a model of rewards", metrics, experience.metrics)
     return state.replace(
         actor_critic=actor_critic,
         # Observations are normalized with the same numbers in acting and in learning,

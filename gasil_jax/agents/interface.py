@@ -132,11 +132,11 @@ class Agent(struct.PyTreeNode):
         return None
 
 
-def call(agent: Agent, function: str, *arguments: Any, **like: Any) -> Any:
-    """Call a function of an agent, and return the values that it returns.
+def call(part: Any, function: str, *arguments: Any, **like: Any) -> Any:
+    """Call a function of an agent or a model of rewards, and return its values.
 
     Args:
-      agent: the agent.
+      part: the agent or the model.
       function: the function's name.
       *arguments: its arguments.
       **like: what it returns by name, as arrays of the same shapes and dtypes, in
@@ -145,8 +145,9 @@ def call(agent: Agent, function: str, *arguments: Any, **like: Any) -> Any:
     Raises:
       ValueError: if it returns anything else. The loop would broadcast or convert it.
     """
-    what = f"{function} of agent {agent.name!r}"
-    outputs = getattr(agent, function)(*arguments)
+    kind = "agent" if isinstance(part, Agent) else "model of rewards"
+    what = f"{function} of {kind} {part.name!r}"
+    outputs = getattr(part, function)(*arguments)
     names = [*like, *["metrics"] * (function != "remember")]
     outputs = (outputs,) if len(names) == 1 else outputs
     if not isinstance(outputs, tuple | list) or len(outputs) != len(names):
@@ -159,7 +160,9 @@ def call(agent: Agent, function: str, *arguments: Any, **like: Any) -> Any:
     if not isinstance(metrics := returned.pop("metrics", {}), Mapping):
         raise ValueError(f"{what} returns metrics {metrics!r}: they must be a dict")
     # Leaves may be Python's numbers until their shapes are evaluated.
-    if change := user_code.first_change(*jax.eval_shape(lambda: (like, returned))):
+    with user_code.refused(f"{what} returns what is no array"):
+        shapes = jax.eval_shape(lambda: (like, returned))
+    if change := user_code.first_change(*shapes):
         path, expected, given = change
         path = path.replace("['", "", 1).replace("']", "", 1)
         raise ValueError(
