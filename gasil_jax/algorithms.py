@@ -49,10 +49,10 @@ class Algorithm:
     def settings(self) -> dict[str, Any]:
         """Every setting by name, and the switches of the models of rewards."""
         have = {model.switch for model in self.rewards}
-        switches = sorted(have.union(model.switch for model in REWARD_MODELS))
+        switches = have.union(model.switch for model in REWARD_MODELS)
         return {
             **{name: getattr(x, name) for x in self.parts for name in names(x)},
-            **{name: name in have for name in switches},
+            **{name: name in have for name in sorted(switches)},
         }
 
     @property
@@ -150,8 +150,7 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
 
     Args:
       agent: name of one of the package's agents.
-      **settings: settings of the agent, of PPO and of models of rewards, by name. Those
-        that are not given have their defaults.
+      **settings: as in `Algorithm.replace`; the others have their defaults.
 
     Raises:
       ValueError: if a name is unknown.
@@ -181,9 +180,8 @@ def check(algorithm: Algorithm) -> None:
         raise refusal("config", config, "a gasil_jax.Config")
     if not isinstance(agent, Agent):
         raise refusal("agent", agent, "an instance of a class from gasil_jax.Agent")
-    if not isinstance(rewards, tuple) or not all(
-        isinstance(model, RewardModel) for model in rewards
-    ):
+    models = rewards if isinstance(rewards, tuple) else (None,)
+    if not all(isinstance(model, RewardModel) for model in models):
         raise refusal("rewards", rewards, "a tuple of models of rewards")
     validate_config(config)
     taken = {*_COLUMNS, *names(Config)}
@@ -197,7 +195,7 @@ def check(algorithm: Algorithm) -> None:
                 )
         taken.update(names(part))
     for part in (agent, *rewards):
-        validate(part, config.total_steps)
+        validate(part)
     if agent.num_streams > 1 and type(agent).mix is Agent.mix:
         raise ValueError(
             f"agent {agent.name!r} has {agent.num_streams} reward streams: it must "
@@ -219,4 +217,4 @@ def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> N
                 f"{name} is not traced: change it with algorithm.replace instead"
             )
     for part in algorithm.replace(**hyperparameters).parts:
-        validate(part, algorithm.config.total_steps)
+        validate(part)
