@@ -366,7 +366,7 @@ def test_the_caption_of_the_film_has_the_score_of_its_policy():
         assert image.n_frames > 50
     policy = re.search(r"render (zoo:\S+) --out", TEXT)[1]
     score = re.search(r"policy scores ([\d,]+ ± \d+)", " ".join(TEXT.split()))[1]
-    (row,) = re.findall(rf"\| `{policy}` \|.*", (DOCS / "zoo.md").read_text())
+    (row,) = re.findall(rf"\| `{policy}` \|.*", (DOCS / "data.md").read_text())
     assert f"| {score} |" in row
 
 
