@@ -290,8 +290,6 @@ _EQUAL_PAIRS = [
 
 #: The tasks on which some seeds learn a delayed task and others do not.
 _BIMODAL = ("hopper", "walker2d")
-#: Forty seeds were planned on halfcheetah too, and a machine's time ended after these.
-_TIME_ENDED = {("halfcheetah-delayed", "ppo"): 22}
 
 
 def _paper_panel(
@@ -299,10 +297,15 @@ def _paper_panel(
 ) -> Panels:
     """Return agents on a task under the paper's protocol, each with its search there.
 
-    Where outcomes are bimodal, the agents whose comparison decides have more seeds.
+    Where outcomes are bimodal, the agents whose comparison decides have more seeds. On
+    halfcheetah, where the sign depends on the unit of rewards, all agents have.
     """
-    bimodal = delay > 1 and env in _BIMODAL
     panel = name_of(env, delay) if normalize else f"{name_of(env, delay)} (raw)"
+
+    def has_more(agent: str) -> bool:
+        decides = env in _BIMODAL and agent != "ppo+bc"
+        return delay > 1 and (decides or env == "halfcheetah")
+
     return joined(
         grid(
             (env,),
@@ -310,9 +313,7 @@ def _paper_panel(
             (delay,),
             panel=panel,
             base=functools.partial(PaperSearch, normalize_rewards=normalize),
-            seeds=40
-            if bimodal and agent != "ppo+bc"
-            else _TIME_ENDED.get((panel, agent), 10),
+            seeds=40 if has_more(agent) else 10,
             total_steps=PAPER_STEPS_OF.get(env, STEPS),
         )
         for agent in agents
@@ -372,6 +373,74 @@ _CONTROL_PAIRS = [
     ("ppo (sees the phase)", "ppo"),
     ("ppo+gasil (sees the phase)", "ppo (sees the phase)"),
 ]
+
+
+#: The tasks, delays and bonuses of the study of what delayed MuJoCo measures. A delay
+#: of 1000 steps is an episode. A constant bonus and PPO+GASIL's have the same sizes.
+_STUDIED, _STUDIED_DELAYS, _BONUSES = TASKS[:5], (1, DELAY, 100, 1000), (0.02, 0.1)
+_BONUS_OF, _GASIL_OF = "ppo+bonus ({:g})", "ppo+gasil ({:g})"
+#: A network that stays untrained, near 0: each step has the same share of a payout.
+_EQUAL_SHARES = Arm("ppo (equal shares)", "ppo", {"decomposition_learning_rate": 1e-12})
+
+
+def _study(env: str) -> Panels:
+    """Return all explanations of a delayed task, with one setting and batch layout.
+
+    One panel has the agents as they are, the other those that see the delay's phase.
+    """
+    shared, decomposed = (
+        # Clipping at 10 deviations would ruin rewards that come once an episode.
+        {**presets.scaled(presets.ACTION_SIZES[env], x), "reward_clip": 1e9}
+        for x in (False, True)
+    )
+    arms = [
+        Arm("ppo", "ppo"),
+        *(Arm(_BONUS_OF.format(x), "ppo+bonus", {"alpha": x}) for x in _BONUSES),
+        Arm("ppo+sil", "ppo+sil"),
+        *(Arm(_GASIL_OF.format(x), "ppo+gasil", {"alpha": x}) for x in _BONUSES),
+        Arm(_CENTERED.name, "ppo+gasil", {"bonus": "centered", "alpha": _BONUSES[1]}),
+    ]
+    shares = [Arm("ppo (decomposed)", "ppo"), _EQUAL_SHARES]
+    one = functools.partial(grid, (env,), curve="{arm}-{delay}", base=None, seeds=20)
+    seeing = {"panel": "{env} (phase seen)", "settings": {"observe_phase": True}}
+    return joined(
+        one(own, delays, changes=changes, **clock)
+        for clock, first in (({"panel": "{env}"}, 0), (seeing, 1))
+        for own, changes, delays in (
+            (arms, shared, _STUDIED_DELAYS[first:]),
+            (shares, decomposed, _STUDIED_DELAYS[1:]),
+        )
+    )
+
+
+def _explanations(panels: Panels) -> Comparisons:
+    """Compare each explanation with PPO, and PPO+GASIL with a constant bonus."""
+    pairs = [
+        *((name.format(x), "ppo") for name in (_BONUS_OF, _GASIL_OF) for x in _BONUSES),
+        *((_GASIL_OF.format(x), _BONUS_OF.format(x)) for x in _BONUSES),
+        (_CENTERED.name, "ppo"),
+        ("ppo+sil", "ppo"),
+        (_EQUAL_SHARES.name, "ppo"),
+        ("ppo (decomposed)", _EQUAL_SHARES.name),
+    ]
+    named = [
+        [f"{x}-{delay}" for x in pair] for delay in _STUDIED_DELAYS for pair in pairs
+    ]
+    compared: dict[tuple[str, ...], Terms] = {
+        (panel, *pair): difference(panel, *pair)
+        for panel, curves in panels.items()
+        for pair in named
+        if curves.keys() >= {*pair}
+    }
+    for env in _STUDIED:
+        for delay in _STUDIED_DELAYS[1:]:
+            seen = f"{env} (phase seen)"
+            key = (env, f"ppo-{delay} (phase seen)", f"ppo-{delay}")
+            compared[key] = (1.0, seen, f"ppo-{delay}"), (-1.0, env, f"ppo-{delay}")
+    return compared
+
+
+_STUDY = joined(map(_study, _STUDIED))
 
 
 _LIMITED = [f"{agent} (terminal limits)" for agent in PAIR]
@@ -558,6 +627,19 @@ FIGURES: Mapping[str, Figure] = {
             for name, curve in curves.items()
             if curve.search and name in ("ppo+bonus", _CENTERED.name)
         },
+    ),
+    "delayed_mujoco": Figure(
+        "What delayed MuJoCo measures",
+        "",
+        _STUDY,
+        over=("reward_delay", "delay"),
+        favourite=_GASIL_OF.format(0.1),
+        comparisons=_explanations(_STUDY),
+        shown=(
+            *("ppo", _BONUS_OF.format(0.1), _GASIL_OF.format(0.1)),
+            *("ppo (decomposed)", _EQUAL_SHARES.name),
+        ),
+        floor=True,
     ),
     "time_limits": Figure(
         "The paper's own protocol with terminal time limits",

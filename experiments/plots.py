@@ -241,7 +241,7 @@ def _draw_rows(axes: Any, rows: Sequence[Row], null: float) -> None:
                 axes.plot(end, y, "|", color="0.3", markersize=6, markeredgewidth=0.8)
     if null == 0.5:
         axes.set_xlim(-0.03, 1.03)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
+    axes.set_ylim(max(len(rows), 1) - 0.5, -0.5)
     axes.tick_params(axis="x", labelsize=7)
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)

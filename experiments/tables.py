@@ -89,10 +89,13 @@ def curves(results: Results, kind: str = "") -> str:
 def forest(results: Results, kind: str = "") -> str:
     """Return the picture of what is compared, with the numbers folded."""
     words = "differences with their intervals, and the verdict on each task"
-    return f"{_shown('forest', results, kind, words)}\n\n{numbers(results, kind)}"
+    shown = _shown("forest", results, kind, words)
+    return f"{shown}\n\n{numbers(results, kind)}" if results.curves else shown
 
 
 def _shown(slot: str, results: Results, kind: str, words: str) -> str:
+    if not results.curves:
+        return "Not trained yet."
     return f"![{words}]({picture(results.name, slot, kind)})"
 
 
@@ -104,8 +107,6 @@ def numbers(results: Results, kind: str = "") -> str:
     over these seeds.
     """
     panels = [x for x in results.figure.of_kind(kind) if _measured(results, x)]
-    if not panels:
-        return "Not trained yet."
     rows = [
         [name, *(_cell(results, panel, name) for panel in panels)]
         for name in results.figure.names(panels)
@@ -115,13 +116,9 @@ def numbers(results: Results, kind: str = "") -> str:
     if any(floors):
         rows.append(["doing nothing", *(number(x.mean) if x else "" for x in floors)])
     head = ["", *(x.removeprefix("sparse:") for x in panels)]
-    asked = [
-        x for p, _, x in results.figure.curves() if p in results.figure.of_kind(kind)
-    ]
-    stored = sum(
-        len(x.records) for key, x in results.curves.items() if key[0] in panels
-    )
-    total = sum(curve.seeds for curve in asked)
+    asked = results.figure.of_kind(kind)
+    total = sum(x.seeds for panel, _, x in results.figure.curves() if panel in asked)
+    stored = sum(len(x.records) for key, x in results.curves.items() if key[0] in asked)
     lacking = f"Not trained yet: {total - stored} of {total} runs." * (stored < total)
     parts = [lacking, markdown_table(head, rows)]
     parts.append(_compared(results.forest(kind), results))
@@ -156,7 +153,7 @@ def _compared(rows: Sequence[Row], results: Results, *, sooner: bool = False) ->
     lines = []
     for row in rows:
         one = row.compared
-        words = in_words(*(null + x for x in (one.middle, one.low, one.high)), spec)
+        words = in_words(null + one.middle, null + one.low, null + one.high, spec)
         lines.append([row.name, words, number(one.visible, spec), one.verdict])
     return markdown_table(["", what, "visible from", "verdict"], lines)
 

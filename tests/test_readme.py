@@ -330,8 +330,7 @@ def run_python(path):
 def test_the_python_of_the_readme_runs(finished_hopper):
     names = run_python(README)
     assert names["returns"].shape == (4, 2, 2)  # alphas, seeds, iterations
-    assert names["state"].iteration.shape == ()
-    assert names["action"].shape == (2,) == names["act"](names["observation"]).shape
+    assert names["action"].shape == (2,)
 
 
 def test_the_python_of_the_documentation_runs(finished_hopper):

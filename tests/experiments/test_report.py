@@ -356,6 +356,7 @@ def test_seeds_in_words():
 _SETTINGS = (
     *("walker2d", "`[^`]*`", "[Ff]igures? [2-8](?: (?:and|to) [2-8])?", r"\dM steps"),
     *("table 1", r"to 0\.02 at 3M", "is 0 until", '"from-2M"', r"\b20 steps", "95%"),
+    *("delay 10*", "delay of 1000", "delay 20", r"alpha 0\.02", "32\\s+environments"),
     *("30,000 steps", "128 drawn", "1,000 steps", "buffer of 500", "1: PPO"),
 )
 _NOTES = {x.stem: x.read_text() for x in sorted(report.NOTES.glob("*.md"))}
