@@ -296,14 +296,13 @@ def learn(
             "skipped_updates": ~(is_finite & healthy),
         },
         rollout.metrics(steps),
-        model_metrics,
         agent_metrics,
         ppo_metrics,
         value_metrics,
         mix_metrics,
         policy_metrics,
     )
-    metrics = merge_metrics("a model of rewards", metrics, experience.metrics)
+    metrics = merge_metrics("a model of rewards", metrics, model_metrics)
     return state.replace(
         actor_critic=actor_critic,
         # Observations are normalized with the same numbers in acting and in learning,
