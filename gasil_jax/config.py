@@ -61,6 +61,60 @@ _COUNT = Range(1, _LARGEST_COUNT, whole=True)
 Check = Range | Callable[[str, Any], None]
 
 
+def validate_switch(name: str, value: Any) -> None:
+    """Raise `ValueError` unless a value is true or false."""
+    if not isinstance(value, bool):
+        raise refusal(name, value, "True or False")
+
+
+def validate_number(name: str, value: Any, allowed: Range) -> None:
+    """Raise `ValueError` unless a value is a number in the range, or traced."""
+    if shape := getattr(value, "shape", ()):
+        raise ValueError(
+            f"{name} has shape {shape}: it must be a single number (to train with "
+            "several, use jax.vmap)"
+        )
+    if isinstance(value, jax.core.Tracer):
+        return
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
+        value = value.item()
+    if value not in allowed:
+        raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
+
+
+def _validate_widths(name: str, value: Any) -> None:
+    if not isinstance(value, tuple):
+        raise refusal(name, value, "a tuple of sizes")
+    for size in value:
+        validate_number(name, size, _COUNT)
+
+
+def _validate_text(name: str, value: Any) -> None:
+    if not isinstance(value, str | None):
+        raise refusal(name, value, "a string or None")
+
+
+def _validate_schedule(name: str, schedule: Any) -> None:
+    """Check points, or the factor of a function at the start of training."""
+    if callable(schedule):
+        what = f"{name} gives no number at step 0"
+        with user_code.refused(what), jax.ensure_compile_time_eval():
+            factor = schedule(jax.numpy.float32(0))
+            factor = factor if isinstance(factor, jax.core.Tracer) else float(factor)
+        validate_number(f"{name}(0)", factor, Range(0.0))
+        return
+    form = "(steps, factor) points, steps increasing"
+    pairs = schedule if isinstance(schedule, tuple) else (None,)
+    if not all(isinstance(point, tuple) and len(point) == 2 for point in pairs):
+        raise refusal(name, schedule, form)
+    for number in (number for point in pairs for number in point):
+        validate_number(name, number, Range(0.0))
+    steps = [point[0] for point in pairs]
+    if steps != sorted(set(steps)):
+        raise refusal(name, schedule, form)
+
+
 def number(
     default: float,
     low: float,
@@ -248,57 +302,3 @@ def validate_config(config: Config) -> None:
                 f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
                 f"the nearest that does is {nearest}"
             )
-
-
-def validate_switch(name: str, value: Any) -> None:
-    """Raise `ValueError` unless a value is true or false."""
-    if not isinstance(value, bool):
-        raise refusal(name, value, "True or False")
-
-
-def validate_number(name: str, value: Any, allowed: Range) -> None:
-    """Raise `ValueError` unless a value is a number in the range, or traced."""
-    if shape := getattr(value, "shape", ()):
-        raise ValueError(
-            f"{name} has shape {shape}: it must be a single number (to train with "
-            "several, use jax.vmap)"
-        )
-    if isinstance(value, jax.core.Tracer):
-        return
-    is_array = isinstance(value, np.ndarray | jax.Array)
-    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
-        value = value.item()
-    if value not in allowed:
-        raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
-
-
-def _validate_widths(name: str, value: Any) -> None:
-    if not isinstance(value, tuple):
-        raise refusal(name, value, "a tuple of sizes")
-    for size in value:
-        validate_number(name, size, _COUNT)
-
-
-def _validate_text(name: str, value: Any) -> None:
-    if not isinstance(value, str | None):
-        raise refusal(name, value, "a string or None")
-
-
-def _validate_schedule(name: str, schedule: Any) -> None:
-    """Check points, or the factor of a function at the start of training."""
-    if callable(schedule):
-        what = f"{name} gives no number at step 0"
-        with user_code.refused(what), jax.ensure_compile_time_eval():
-            factor = schedule(jax.numpy.float32(0))
-            factor = factor if isinstance(factor, jax.core.Tracer) else float(factor)
-        validate_number(f"{name}(0)", factor, Range(0.0))
-        return
-    form = "(steps, factor) points, steps increasing"
-    pairs = schedule if isinstance(schedule, tuple) else (None,)
-    if not all(isinstance(point, tuple) and len(point) == 2 for point in pairs):
-        raise refusal(name, schedule, form)
-    for number in (number for point in pairs for number in point):
-        validate_number(name, number, Range(0.0))
-    steps = [point[0] for point in pairs]
-    if steps != sorted(set(steps)):
-        raise refusal(name, schedule, form)
