@@ -48,12 +48,16 @@ class Algorithm:
     @property
     def settings(self) -> dict[str, Any]:
         """Every setting by name, and the switches of the models of rewards."""
-        have = {model.switch for model in self.rewards}
-        switches = have.union(model.switch for model in REWARD_MODELS)
+        have = {type(model) for model in self.rewards}
         return {
             **{name: getattr(x, name) for x in self.parts for name in names(x)},
-            **{name: name in have for name in sorted(switches)},
+            **{model.switch: model in have for model in REWARD_MODELS},
         }
+
+    @property
+    def own_models(self) -> tuple[RewardModel, ...]:
+        """The models of rewards that are not the package's."""
+        return tuple(x for x in self.rewards if type(x) not in REWARD_MODELS)
 
     @property
     def hyperparameters(self) -> dict[str, Any]:
@@ -91,8 +95,8 @@ class Algorithm:
             return self
         if is_on:
             later = REWARD_MODELS[REWARD_MODELS.index(model) :]
-            before = [x for x in others if not isinstance(x, later)]
-            others = [*before, model(), *others[len(before) :]]
+            places = [i for i, x in enumerate(others) if isinstance(x, later)]
+            others.insert(min(places, default=len(others)), model())
         return dataclasses.replace(self, rewards=tuple(others))
 
     def why_not(self, name: str) -> str:
@@ -186,7 +190,7 @@ def check(algorithm: Algorithm) -> None:
     validate_config(config)
     taken = {*_COLUMNS, *names(Config)}
     taken.update(x for model in REWARD_MODELS for x in (model.switch, *names(model)))
-    for part in (agent, *(x for x in rewards if type(x) not in REWARD_MODELS)):
+    for part in (agent, *algorithm.own_models):
         for name in names(part):
             if name in taken:
                 raise ValueError(

@@ -7,7 +7,7 @@ the settings; a flag overrides a row.
 environments and the normalization of rewards that it ran with. Alpha suits only that
 normalization. Where the agent returns more with the learning rate, lambda, gamma and
 initial std that PPO's or PPO+GASIL's search chose, it has those
-(experiments/results/ppo_values.md). The rows of locomotion tasks, and those of PPO and
+(docs/results/ablations.md). The rows of locomotion tasks, and those of PPO and
 PPO+GASIL on the dense point mass, are from the stored searches; the other rows of the
 point mass are from earlier ones. Adaptive imitation has one setting for all tasks of
 MuJoCo but ant and humanoid with delayed rewards, where what its searches chose returns
@@ -21,7 +21,7 @@ for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy 
 
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
-each task (experiments/results/paper_protocol.md), and the defaults where we did not
+each task (docs/results/paper_figures.md), and the defaults where we did not
 search. Rewards are normalized.
 """
 
@@ -105,10 +105,10 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     """Return settings of PPO that depend on the dimension of an action.
 
     The searches suggest that the learning rate and the exploration must be smaller for
-    actions with more dimensions (experiments/results/matrix.md). Noise in more
+    actions with more dimensions (docs/results/paper_figures.md). Noise in more
     dimensions also makes the returns after an action vary more, so lambda falls too.
     All three fall linearly from two dimensions to eight; more dimensions have the
-    values of eight (experiments/results/action_dimension.md).
+    values of eight (docs/results/ablations.md).
     """
     share = min(max((action_size - 2) / 6, 0.0), 1.0)
 

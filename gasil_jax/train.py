@@ -248,10 +248,10 @@ def collect(
     model_keys = _keys(keys.rewards, len(algorithm.rewards))
     with jax.named_scope("rewards"):
         for model, before, key in zip(algorithm.rewards, state.rewards, model_keys):
-            after, context, is_finite, own = model.update(before, context, key)
+            after, context, is_finite, own = call(model, "update", before, context, key)
             rewards.append(after)
             healthy &= is_finite
-            metrics = merge_metrics(type(model).__name__, metrics, own)
+            metrics = merge_metrics(f"model of rewards {model.name!r}", metrics, own)
     state = state.replace(
         environments=environments, history=history, rewards=tuple(rewards)
     )
@@ -296,13 +296,13 @@ def learn(
             "skipped_updates": ~(is_finite & healthy),
         },
         rollout.metrics(steps),
-        model_metrics,
         agent_metrics,
         ppo_metrics,
         value_metrics,
         mix_metrics,
         policy_metrics,
     )
+    metrics = merge_metrics("a model of rewards", metrics, model_metrics)
     return state.replace(
         actor_critic=actor_critic,
         # Observations are normalized with the same numbers in acting and in learning,

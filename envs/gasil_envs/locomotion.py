@@ -570,7 +570,8 @@ class Locomotion(Env):
     def reset(self, rng: jax.Array) -> State:
         """Start as the task says, or at rest with noise on positions and velocities."""
         if self.task.start is not None:
-            return self.state_at(*self.task.start(rng))
+            qpos, qvel = self.task.start(rng)
+            return self.state_at(_with_unit_quaternions(self.model, qpos), qvel)
         scale = self.task.reset_noise
         position_key, velocity_key = jax.random.split(rng)
         noise = jax.random.uniform(

@@ -128,20 +128,24 @@ class Agent(struct.PyTreeNode):
         return advantages[..., 0], {}
 
 
-def call(agent: Agent, function: str, *arguments: Any) -> Any:
-    """Call a function of an agent, and return what it returns.
+def call(part: Any, function: str, *arguments: Any) -> Any:
+    """Call a function of an agent or a model of rewards, and return what it returns.
 
     Raises:
       ValueError: if that has other shapes or dtypes than the interface says. The loop
         would broadcast or convert it.
     """
-    what = f"{function} of agent {agent.name!r}"
-    outputs = getattr(agent, function)(*arguments)
-    reward = next(x for x in arguments if isinstance(x, Context)).rollout.reward
-    streams = [reward] * agent.num_streams
+    kind = "agent" if isinstance(part, Agent) else "model of rewards"
+    what = f"{function} of {kind} {part.name!r}"
+    outputs = getattr(part, function)(*arguments)
+    context = next(x for x in arguments if isinstance(x, Context))
+    reward = context.rollout.reward
     # Arrays of the shapes and dtypes that are expected, by name.
     like = {"advantage": reward} if function == "mix" else {"state": arguments[0]}
+    if function == "update":
+        like |= {"context": context, "learned": jnp.bool_(True)}
     if function == "update_and_reward":
+        streams = [reward] * part.num_streams
         like["rewards"] = jnp.stack(streams, -1) if len(streams) > 1 else reward
     if function == "update_policy":
         like["actor_critic"] = arguments[1]
@@ -157,7 +161,9 @@ def call(agent: Agent, function: str, *arguments: Any) -> Any:
     if not isinstance(metrics := values.pop("metrics", {}), Mapping):
         raise ValueError(f"{what} returns metrics {metrics!r}: they must be a dict")
     # Leaves may be Python's numbers until their shapes are evaluated.
-    if change := user_code.first_change(*jax.eval_shape(lambda: (like, values))):
+    with user_code.refused(f"{what} returns what is no array"):
+        shapes = jax.eval_shape(lambda: (like, values))
+    if change := user_code.first_change(*shapes):
         path, expected, given = change
         path = path.replace("['", "", 1).replace("']", "", 1)
         raise ValueError(

@@ -33,6 +33,7 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "action_noise": 0.0,
     "policy_components": 1,
+    "rewards": (),
 }
 
 #: Settings that are no more: the settings beside which a run had one, and the value
@@ -62,7 +63,8 @@ def removed(settings: Mapping[str, Any]) -> dict[str, Any]:
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The physics engine and the device are not among them, because they compute the same
+    `start` is the hash of the policy that it starts from, if that is a trained one. The
+    physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -71,6 +73,7 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
+    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -101,6 +104,7 @@ class Run:
                     del group[name]
         return {
             "env": self.env,
+            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": {

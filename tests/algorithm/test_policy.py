@@ -112,6 +112,9 @@ def test_a_batch_of_states_is_no_policy(trained_point_mass):
     assert gasil_jax.member(states, -1).iteration.shape == ()
     with pytest.raises(IndexError, match="index is 3: there are 3 states"):
         gasil_jax.member(states, 3)
+    for none in (0, b"x", None, {"a": np.zeros(2), "b": 1.0}):
+        with pytest.raises(ValueError, match=r"states is .*: it must be arrays with"):
+            gasil_jax.member(none, 0)
     with pytest.raises(ValueError, match="state is a batch of 3 states"):
         policy.from_state(states, env)
 

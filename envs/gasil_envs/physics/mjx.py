@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics import candidates, collision, constraints
+from gasil_envs.physics import candidates, collision, constraints, tree
 from gasil_envs.physics.interface import Fields, PhysicsState
 from gasil_envs.precision import full_precision
 
@@ -95,7 +95,8 @@ def differences(model: mujoco.MjModel) -> list[str]:
         ),
         f"contacts that {' or '.join(_MJX_NUMERICS)} leaves out": any(numerics),
     }
-    return [what for what, differs in differences.items() if differs]
+    named = [what for what, differs in differences.items() if differs]
+    return named + tree.rounding(model)
 
 
 def _mjx() -> Any:
