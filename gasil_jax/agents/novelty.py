@@ -25,7 +25,6 @@ from flax import struct
 from gasil_jax import normalization
 from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.interface import Agent
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import number
 from gasil_jax.context import Context, Metrics, Sizes
 
@@ -46,6 +45,14 @@ class Visits(struct.PyTreeNode):
     offset: jax.Array  # (directions,), where the cells begin, from 0 to 1
 
 
+class Explorer(struct.PyTreeNode):
+    """The state of an agent that seeks what is new; the last two to clone as well."""
+
+    visits: Visits
+    buffer: Any = None  # `GoodTrajectories`
+    novelty: Any = None  # float32 (env,), sum over the running episode
+
+
 class PPONovelty(Agent):
     """PPO on the environment's reward plus the centred novelty of where a step leads.
 
@@ -60,7 +67,7 @@ class PPONovelty(Agent):
     novelty_cell: float = number(0.5, 0.0, excludes_low=True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
-        return self.init_visits(key, sizes)
+        return Explorer(self.init_visits(key, sizes))
 
     def init_visits(self, key: jax.Array, sizes: Sizes) -> Visits:
         """Return counters of no visits; consumes the key."""
@@ -70,10 +77,6 @@ class PPONovelty(Agent):
             directions=jax.random.normal(key, (sizes.observation, _DIRECTIONS)),
             offset=jax.random.uniform(offset_key, (_DIRECTIONS,)),
         )
-
-    def visits(self, state: Any) -> Visits:
-        """Return the counters in a state."""
-        return state
 
     def count(self, visits: Visits, context: Context) -> Visits:
         """Return the counters with a batch's visits."""
@@ -100,23 +103,15 @@ class PPONovelty(Agent):
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
     def remember(self, state: Any, context: Context) -> Any:
-        return self.count(state, context)
+        return state.replace(visits=self.count(state.visits, context))
 
     def update_and_reward(
         self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Any, jax.Array, Metrics]:
-        novelty = self.novelty(self.visits(state), context)
+        novelty = self.novelty(state.visits, context)
         bonus = self.novelty_coefficient * (novelty - jnp.mean(novelty))
         metrics = {"novelty": jnp.mean(novelty)}
         return state, context.rollout.reward + bonus, metrics
-
-
-class Explorer(struct.PyTreeNode):
-    """The state of PPO+BC+NOVELTY."""
-
-    buffer: GoodTrajectories
-    visits: Visits
-    novelty: jax.Array  # float32 (env,), sum over the running episode
 
 
 class PPOBCNovelty(PPONovelty, PPOBC):
@@ -126,13 +121,10 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
     def init(self, key: jax.Array, sizes: Sizes) -> Explorer:
         return Explorer(
+            self.init_visits(key, sizes),
             buffer=self.init_buffer(sizes),
-            visits=self.init_visits(key, sizes),
             novelty=jnp.zeros(sizes.num_envs),
         )
-
-    def visits(self, state: Explorer) -> Visits:
-        return state.visits
 
     def remember(self, state: Explorer, context: Context) -> Explorer:
         batch, visits = context.rollout, self.count(state.visits, context)
@@ -146,4 +138,4 @@ class PPOBCNovelty(PPONovelty, PPOBC):
         novelty, total = jax.lax.scan(add, state.novelty, steps)
         return_ = batch.discounted_return + _TIE * total / batch.episode_length
         buffer = self.insert(state.buffer, context, return_)
-        return Explorer(buffer, visits, novelty)
+        return Explorer(visits, buffer, novelty)
