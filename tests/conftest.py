@@ -196,25 +196,3 @@ def untrained_hopper(tmp_path_factory):
 def untrained_point_mass(tmp_path_factory):
     """The folder of a run on the point mass."""
     return _untrained(tmp_path_factory.mktemp("point_mass") / "run", "point_mass")
-
-
-@pytest.fixture(scope="session")
-def trained_point_mass():
-    """The environment, algorithm and states (3,) after a little training."""
-    import jax
-    import numpy as np
-
-    import gasil_jax
-
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    algorithm = gasil_jax.algorithm(
-        "ppo+gasil",
-        total_steps=1024,
-        num_envs=4,
-        batch_steps=512,
-        hidden_sizes=(16, 8),
-        num_epochs=1,
-    )
-    train = gasil_jax.make_train(env, algorithm)
-    keys = jax.vmap(jax.random.key)(np.arange(3))
-    return env, algorithm, jax.jit(jax.vmap(train))(keys)[0]

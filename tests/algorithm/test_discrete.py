@@ -118,23 +118,6 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
     np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
 
 
-def test_a_file_with_another_number_of_actions_is_refused(tmp_path):
-    env, _, states, _ = train("ppo")
-    path = tmp_path / "policy.npz"
-    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
-    arrays = dict(np.load(path))
-    np.savez(path, **{**arrays, "num_actions": np.int32(4)})
-    with pytest.raises(ValueError, match=r"kernel_1 has the shape .*, 4\)"):
-        gasil_jax.load_policy(path)
-    del arrays["num_actions"]
-    np.savez(path, **arrays)
-    with pytest.raises(ValueError, match="log_std is missing"):
-        gasil_jax.load_policy(path)
-    continuous = numpy_policy.read("zoo:hopper")
-    with pytest.raises(ValueError, match="actions are not discrete"):
-        numpy_policy.probabilities(continuous, np.zeros(11))
-
-
 FLAGS = (
     *("--env", "corridor:Corridor", "--agent", "ppo+gasil", "--num-envs", "8"),
     *("--batch-steps", "256", "--minibatch-size", "64", "--hidden-sizes", "16"),
@@ -260,9 +243,3 @@ class None_(Corridor):
 def test_actions_of_no_kind_or_of_both_are_refused(env, message):
     with pytest.raises(ValueError, match=message):
         gasil_jax.make_train(env, gasil_jax.algorithm("ppo"))
-
-
-def test_the_rule_for_dimensions_is_refused(capsys):
-    command = ["--env", "corridor:Corridor", "--agent", "ppo", "--preset", "scaled"]
-    assert run.main(command) == 2
-    assert "preset is 'scaled', a rule for the dimension" in capsys.readouterr().err

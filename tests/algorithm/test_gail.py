@@ -169,22 +169,3 @@ def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):
     assert "the trajectories of the expert were others" in error
     np.savez(path, **own)
     assert main(continued) == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "expert is missing"),
-        ("--expert nowhere.npz", "it must be an .npz file"),
-        ("--expert minari:nothing/there-v0", "minari:nothing/there-v0"),
-    ],
-)
-def test_no_expert_is_one_line_and_status_2(
-    arguments, message, capsys, tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    command = ["--env", "point_mass", "--agent", "gail", *arguments.split()]
-    assert main(command) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.splitlines()) == 1
-    assert list(tmp_path.iterdir()) == []

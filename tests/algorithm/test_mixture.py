@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from corridor import Corridor
 from flax import linen as nn
-from small_training import SETTINGS
+from small_training import SETTINGS, drawn_policies
 
 import gasil_jax
-from gasil_jax import evaluation, normalization, numpy_policy, policy, run, sweep
+from gasil_jax import evaluation, normalization, numpy_policy, policy
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
 from gasil_jax.host import policy_file
 from gasil_jax.networks import MixturePolicy
@@ -189,18 +189,7 @@ def random_policies():
     """Return the environment and the states of two policies with random layers."""
     env = gasil_jax.make_env("point_mass")
     algorithm = gasil_jax.algorithm("ppo", **SETTINGS, policy_components=3)
-    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    # Shapes, of which all that is a policy's is drawn here.
-    states = jax.eval_shape(init, np.arange(2, dtype=np.uint32))
-    rng = np.random.default_rng(0)
-    draw = lambda x: (0.5 * rng.normal(size=x.shape)).astype(x.dtype)
-    learner = states.actor_critic.policy
-    learner = learner.replace(params=jax.tree.map(draw, learner.params))
-    states = states.replace(
-        actor_critic=states.actor_critic.replace(policy=learner),
-        normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
-    )
-    return env, states
+    return env, drawn_policies(env, algorithm, 2)
 
 
 def save(path):
@@ -246,25 +235,6 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
         np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(variance), rtol=0.03)
 
 
-@pytest.mark.parametrize(
-    ("changes", "reason"),
-    [
-        ({"policy_components": np.int32(2)}, r"kernel_1 has the shape .*, 6\)"),
-        ({"policy_components": np.int32(-3)}, "kernel_1 has the shape"),
-        ({"policy_components": np.ones(2)}, "policy_components has the shape"),
-        ({"policy_components": np.float32(np.nan)}, "policy_components has numbers"),
-        ({"policy_components": None}, r"kernel_1 has the shape .*, 2\)"),
-    ],
-)
-def test_a_file_with_another_number_of_components_is_refused(tmp_path, changes, reason):
-    path = tmp_path / "policy.npz"
-    save(path)
-    arrays = {**np.load(path), **changes}
-    np.savez(path, **{name: x for name, x in arrays.items() if x is not None})
-    with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
-        gasil_jax.load_policy(path)
-
-
 class Own(gasil_jax.PPO):
     """Its policy is one layer."""
 
@@ -286,14 +256,3 @@ def test_what_can_be_no_mixture_is_refused(env, agent, reason):
     message = f"^policy_components is 4: it must be 1, {reason}$"
     with pytest.raises(ValueError, match=message):
         gasil_jax.make_train(env, algorithm)
-
-
-def test_a_command_refuses_it_before_anything_compiles(tmp_path, capsys):
-    out = tmp_path / "run"
-    flags = ("--env", "sparse:key_grid", "--agent", "ppo", "--out", str(out))
-    assert run.main([*flags, "--policy-components", "4"]) == 2
-    assert "policy_components is 4: it must be 1, the" in capsys.readouterr().err
-    grid = ("--grid", "policy_components=1,4")
-    assert sweep.main([*flags, *grid]) == 2
-    assert "policy_components is 4: it must be 1, the" in capsys.readouterr().err
-    assert not out.exists()

@@ -1,12 +1,9 @@
 """Decomposition of delayed rewards against plain loops, and its use in training."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs import State
 from test_train import SMALL
 
 import gasil_jax
@@ -328,34 +325,13 @@ def test_it_learns_the_reward_behind_the_payouts(delay):
         assert np.nanmean(fits[-30:]) > 0.9
 
 
-class Line:
-    """Stay near 0; every step has a reward that is not 0."""
-
-    observation_size = 1
-    action_size = 1
-    episode_length = 20
-
-    def reset(self, rng):
-        position = jax.random.uniform(rng, (1,))
-        return State(position, position, jnp.float32(0), jnp.float32(0))
-
-    def step(self, state, action):
-        position = state.pipeline_state + 0.1 * action
-        reward = -1.0 - position[0] ** 2
-        return state.replace(pipeline_state=position, obs=position, reward=reward)
-
-
 def test_where_every_step_pays_it_changes_nothing():
-    run = lambda **changes: jax.jit(
-        gasil_jax.make_train(Line(), SMALL["ppo"].replace(**changes))
-    )(jax.random.key(0))
-    (plain, _), (state, metrics) = run(), run(decompose_rewards=True)
-    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-6)
-    jax.tree.map(close, state.actor_critic, plain.actor_critic)
-    # The network learns nothing: no window has more than one step.
-    assert np.all(np.isnan(metrics["decomposition_fit"]))
-    (model,) = state.rewards
-    assert np.all(model.network.optimizer_state.count == 0)
+    batches = list(random_batches(3, 4, delay=1))
+    for batch, (state, _, reward, metrics) in zip(batches, decompose_all(batches)):
+        np.testing.assert_array_equal(reward, batch.reward)
+        # The network learns nothing: no window has more than one step.
+        assert np.isnan(metrics["decomposition_fit"])
+        assert state.network.optimizer_state.count == 0
 
 
 def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
@@ -366,17 +342,14 @@ def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
     model = gasil_jax.Decompose(
         decomposition_minibatch_size=16, decomposition_hidden_sizes=(32,)
     )
+    train = gasil_jax.make_train(
+        env, gasil_jax.Algorithm(gasil_jax.PPO(), (model,), config)
+    )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
-
-    def late(*rewards):
-        algorithm = gasil_jax.Algorithm(gasil_jax.PPO(), rewards, config)
-        train = gasil_jax.make_train(env, algorithm)
-        metrics = jax.jit(jax.vmap(train))(keys)[1]
-        return np.asarray(metrics["episode_return"])[:, -5:].mean()
-
-    with_it, without = late(model), late()
-    print("returns:", with_it, without)
-    assert with_it > without + 2.0
+    returns = jax.jit(jax.vmap(train))(keys)[1]["episode_return"]
+    print("returns:", returns[:, -5:].mean(axis=1))
+    # Without the model they are 20.0 and 16.6.
+    assert (returns[:, -5:].mean(axis=1) > 22.5).all()
 
 
 class Look(gasil_jax.PPOBC):

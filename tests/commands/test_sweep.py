@@ -82,49 +82,6 @@ def test_points_from_a_file(tmp_path):
             points_of("--points-file", str(path))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("--grid alhpa=1", "did you mean 'alpha'"),
-        ("--agent ppo --grid alpha=1", "gail, not of ppo. What can vary: batch_steps"),
-        (
-            "--agent ppo+sil --grid buffer_steps=9",
-            "buffer_steps is a setting of ppo+bc, ppo+bc+novelty, gasil, "
-            "ppo+gasil, ppo+gasil-adaptive, not of ppo+sil",
-        ),
-        (
-            "--grid decomposition_learning_rate=1e-3,1e-4",
-            "decomposition_learning_rate has no effect: decompose_rewards is off",
-        ),
-        ("--grid num_envs=1,2", "'num_envs' can't vary: it must be one of batch_steps"),
-        ("--grid foo=1", "'foo' can't vary: it must be one of batch_steps"),
-        ("--grid alpha=1,big", "it must be numbers, like alpha=0.1,0.2"),
-        ("--grid buffer_steps=1.5", "whole numbers, like buffer_steps=10,20"),
-        ("--grid alpha=0.1,-1", "alpha is -1.0"),
-        ("--grid minibatch_size=64,60", "minibatch_size is 60"),
-        ("--grid alpha=0.02,0.1 alpha=0.2", "grid has alpha twice"),
-        ("--grid alpha=1 --points-file x", "points_file can't be combined with grid"),
-        ("--agent ppo --random 5", "random is 5: it must be from 1 to 4, of 4 points"),
-        ("--random 0", "random is 0"),
-        ("--random 3 --grid alpha=0.1,0.2,0.1", "it must be from 1 to 2, of 2 points"),
-        ("", "grid is empty"),
-        ("--grid alpha=1 --shard 0/4 --out x", "shard is '0/4'"),
-        ("--grid alpha=1 --shard 5/4 --out x", "shard is '5/4'"),
-        ("--grid alpha=1 --shard 1/2 --out x", "1 runs (points x seeds) make 1"),
-        ("--grid alpha=1 --shard 1/1", "shard needs --out"),
-        ("--grid alpha=1 --shards 3", "shards is 3: it needs --launcher"),
-        ("--grid alpha=1 --launcher rya", "launcher is 'rya': it must be one of"),
-        ("--grid alpha=1 --launcher ray --out x", "None: --launcher needs --shards"),
-        ("--grid alpha=1 --launcher ray --shards 1", "launcher needs --out"),
-        ("--grid alpha=1 --launcher ray --shards 2 --out x", "make 1 shards"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
-    assert sweep.main(["--env", "point_mass", *arguments.split()]) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error
-
-
 def table(folder):
     with (folder / "results.csv").open() as file:
         return list(csv.DictReader(file))
@@ -161,7 +118,16 @@ def test_a_sweep_from_end_to_end(swept):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
-    assert all(curves[name].shape == (4, 2, 4) for name in curves)
+    for name in curves:
+        assert curves[name].shape == (4, 2, 3 if "evaluation" in name else 4), name
+    assert curves["evaluation_env_steps"][3, 1].tolist() == [0, 512, 1024]
+    assert summary["evaluation_seconds"] > 0
+    final = curves["evaluation_mean"][..., -1]
+    written = [float(row["final_evaluation"]) for row in rows]
+    np.testing.assert_allclose(written, final.ravel(), rtol=1e-6)
+    for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
+        assert point["final_evaluation"] == pytest.approx(mean)
+        assert point["final_length"] == 50.0
 
 
 def test_points_equal_single_runs(trained, swept):

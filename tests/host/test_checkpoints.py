@@ -72,10 +72,14 @@ def test_a_checkpoint_is_read_from_a_folder_of_any_name(name, tmp_path):
         assert_same(found.restore(state), state)
 
 
-def test_a_type_of_the_same_size_is_not_taken_for_another(tmp_path):
+@pytest.mark.parametrize(
+    "like",
+    [{"x": jnp.ones(3, jnp.float16)}, {"x": jnp.ones(2, jnp.bfloat16)}, {}],
+)
+def test_another_state_is_not_taken_for_what_is_stored(like, tmp_path):
     checkpoint.save(tmp_path / "state", {"x": jnp.ones(3, jnp.bfloat16)})
-    with pytest.raises(ValueError, match=r"holds another state: \['x'\] differs"):
-        checkpoint.restore(tmp_path / "state", {"x": jnp.ones(3, jnp.float16)})
+    with pytest.raises(ValueError, match=r"holds another state: \['x'\] "):
+        checkpoint.restore(tmp_path / "state", like)
 
 
 def test_what_reads_otherwise_does_not_count_as_written(tmp_path, monkeypatch):

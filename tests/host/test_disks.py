@@ -18,7 +18,7 @@ import pytest
 from brax.envs import State
 from small_training import FLAGS, SETTINGS
 from test_checkpoints import BYTES, NAMES, assert_same
-from test_resume import finish, program_of, start, wait_for
+from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import run, sweep
@@ -228,18 +228,11 @@ def test_the_policies_are_written_even_if_the_last_checkpoint_is_not(
 
 
 def killed_while_writing(path):
-    """Let a process be killed while it writes a file."""
+    """Leave what a process that is killed while it writes a file leaves."""
     path.parent.mkdir(exist_ok=True)
-    program = f"""
-import os, pathlib
-from gasil_jax.host import output_file
-
-with output_file.atomic(pathlib.Path({str(path)!r})) as partial:
-    partial.write_text("{{")
-    os._exit(9)
-"""
-    assert subprocess.run([sys.executable, "-c", program]).returncode == 9
-    assert list(path.parent.glob(f".{path.stem}.*{path.suffix}"))
+    with output_file.atomic(path) as partial:
+        partial.write_text("{")
+    path.rename(partial)
 
 
 def test_a_kill_during_the_first_description_does_not_spoil_the_folder(env, tmp_path):
@@ -255,8 +248,10 @@ def test_a_kill_during_the_first_description_does_not_spoil_the_folder(env, tmp_
     assert (program / "program.json").exists()
 
 
-@pytest.mark.parametrize("name", ["", "metrics.csv", "evaluations.csv"])
-@pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.parametrize(
+    ("name", "replaced"),
+    [("", False), ("", True), ("metrics.csv", False), ("evaluations.csv", True)],
+)
 def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
     out, seen = tmp_path / "out", []
 
@@ -268,38 +263,40 @@ def test_what_is_gone_is_told_at_the_next_write(name, replaced, env, tmp_path):
                 copy = shutil.copy if name else shutil.copytree
                 copy(tmp_path / "moved", seen[0])
 
+    given = {"folder": out, "evaluate_every": 128, "evaluate_episodes": 1}
     with pytest.raises(output_file.WriteError) as told:
-        gasil_jax.fit(
-            env,
-            PPO,
-            folder=out,
-            evaluate_every=128,
-            evaluate_episodes=1,
-            callback=callback,
-        )
+        gasil_jax.fit(env, PPO, **given, callback=callback)
     path = seen[0] if name else seen[0] / "metrics.csv"
     assert str(told.value) == f"{path} was deleted or replaced during training"
     assert len(seen) == 1
 
 
-def test_a_full_disk_is_one_line_that_says_how_to_continue(tmp_path):
-    out = tmp_path / "out"
-    flags = ("--total-steps", str(10**6), "--checkpoint-every", str(500 * 128))
-    child = start(out, *SMALL, *flags)
-    first = lambda: program_of(out) / "checkpoints" / "00000500"
-    wait_for(lambda: first().exists(), child)
-    # No file may grow beyond this: writing fails as on a full disk.
-    table = program_of(out) / "metrics.csv"
-    largest = table.stat().st_size + 20_000
-    resource.prlimit(child.pid, resource.RLIMIT_FSIZE, (largest, largest))
-    status, _, told = finish(child)
-    assert status == 1
+def test_a_full_disk_is_one_line_that_says_how_to_continue(
+    tmp_path, monkeypatch, capsys
+):
+    out, write = tmp_path / "out", checkpoint.write
+    table = lambda: program_of(out) / "metrics.csv"
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+
+    def full(folder, iteration, *arguments):
+        write(folder, iteration, *arguments)
+        # No file may grow beyond this: writing fails as on a full disk.
+        if iteration > 0:
+            size = table().stat().st_size + 1
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
+
+    monkeypatch.setattr(checkpoint, "write", full)
+    try:
+        assert run.main([*SMALL, "--checkpoint-every", "128", "--out", str(out)]) == 1
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    told = capsys.readouterr().err
     loud = r"^(?:error: |Traceback|\w*Error\b|\w*Warning\b|WARN|ERROR).*$"
     (error,) = re.findall(loud, told, re.MULTILINE)
     assert error == told.splitlines()[-1]
     assert error == (
-        f"error: {table} can't be written: File too large; continue with: "
+        f"error: {table()} can't be written: File too large; continue with: "
         f"python -m gasil_jax.run --resume --out {out}"
     )
     newest, errors = checkpoint.latest(program_of(out) / "checkpoints")
-    assert newest.iteration == 500 and errors == []
+    assert newest.iteration == 1 and errors == []

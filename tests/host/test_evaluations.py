@@ -15,7 +15,7 @@ from small_training import FLAGS, SETTINGS
 from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import run, statistics, sweep
+from gasil_jax import run, statistics
 from gasil_jax.cli import plot
 from gasil_jax.evaluation import evaluate as evaluate_directly
 from gasil_jax.host import checkpoint, plotting, saved, tables, trackers
@@ -153,12 +153,16 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     assert_same_tables(out, whole)
 
 
-def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("at", "scored"), [(0, ["0"]), (10, ["0", "640"])])
+def test_an_interrupted_run_continues_with_its_scores(
+    at, scored, evaluated, tmp_path, monkeypatch
+):
+    """Even one that is stopped before it trains scores each policy once."""
     whole, out = evaluated[0], tmp_path / "out"
     score = Evaluation.score
 
     def interrupted(self, states, done):
-        if done == 10:
+        if done == at:
             os.kill(os.getpid(), signal.SIGTERM)
         return score(self, states, done)
 
@@ -166,27 +170,7 @@ def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monke
         patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
-    assert len(rows(out)) == 3 * len(SEEDS)
-    assert run.main(["--resume", "--out", str(out)]) == 0
-    assert_same_tables(out, whole)
-
-
-def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
-    evaluated, tmp_path, monkeypatch
-):
-    whole, out = evaluated[0], tmp_path / "out"
-    score = Evaluation.score
-
-    def interrupted(self, states, done):
-        scores = score(self, states, done)
-        os.kill(os.getpid(), signal.SIGTERM)
-        return scores
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Evaluation, "score", interrupted)
-        status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
-    assert status == 128 + signal.SIGTERM
-    assert {row["env_steps"] for row in rows(out)} == {"0"}
+    assert [row["env_steps"] for row in rows(out)[::3]][: len(scored)] == scored
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert_same_tables(out, whole)
 
@@ -287,35 +271,3 @@ def test_keys_differ_by_seed_and_iteration():
         for iteration in (1, 2)
     }
     assert len(keys) == 6
-
-
-def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
-    out = tmp_path / "sweep"
-    # The points differ in their number of evaluations, and are two programs.
-    arguments = (*SMALL, "--seeds", "2", "--total-steps", "1024", *EVALUATED)
-    grid = ("--grid", "batch_steps=128,256")
-    assert sweep.main([*arguments, *grid, "--out", str(out)]) == 0
-    curves = np.load(out / "curves.npz")
-    steps = curves["evaluation_env_steps"]
-    np.testing.assert_array_equal(steps[0, 0], [0, 640, 1024])
-    np.testing.assert_array_equal(steps[1, 0], [0, 768, 1024])
-    for name in ("mean", "min", "max", "length"):
-        assert curves[f"evaluation_{name}"].shape == (2, 2, 3)
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["evaluation_seconds"] > 0
-    final = curves["evaluation_mean"][:, :, -1]
-    with (out / "results.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert {float(row["final_length"]) for row in table} == {50.0}
-    np.testing.assert_allclose(
-        [float(row["final_evaluation"]) for row in table], final.ravel(), rtol=1e-6
-    )
-    for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
-        assert point["final_evaluation"] == pytest.approx(mean)
-        assert point["final_length"] == 50.0
-    # A sweep's truncated table is reported.
-    path = next((out / "programs").glob("*/evaluations.csv"))
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
-    assert sweep.main(["--resume", "--out", str(out)]) == 2
-    error = capsys.readouterr().err
-    assert "evaluations.csv is damaged: it lacks rows" in error
