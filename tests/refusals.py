@@ -4,7 +4,7 @@
 def rows(text):
     """Return the rows of a table, whose cells are apart by ` | `."""
     lines = text.strip("\n").splitlines()
-    return [[cell.strip() for cell in line.split(" | ")] for line in lines]
+    return [[cell.strip() for cell in f"{x} ".split(" | ")] for x in lines]
 
 
 def refused(capsys, program, *words):

@@ -59,11 +59,6 @@ def test_every_command_tells_its_version_and_its_options(command, capsys):
         assert capsys.readouterr().out.startswith(start)
 
 
-def test_an_algorithm_can_be_made_before_anything_else():
-    make = "import gasil_jax; gasil_jax.algorithm('ppo+gasil').replace(num_envs=8)"
-    subprocess.run([sys.executable, "-c", make], check=True)
-
-
 def test_the_wheel_alone_trains(tmp_path):
     major = int(importlib.metadata.version("setuptools").partition(".")[0])
     if major < 77:

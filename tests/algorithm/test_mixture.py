@@ -11,7 +11,7 @@ from flax import linen as nn
 from small_training import SETTINGS, drawn_policies
 
 import gasil_jax
-from gasil_jax import evaluation, normalization, numpy_policy, policy
+from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
 from gasil_jax.host import policy_file
 from gasil_jax.networks import MixturePolicy
@@ -120,15 +120,10 @@ def test_a_component_is_drawn_by_its_weight():
 
 @pytest.mark.parametrize("components", [2, 5])
 def test_an_untrained_policy_has_the_initial_std_and_components_apart(components):
-    env = gasil_jax.make_env("point_mass")
-    algorithm = gasil_jax.algorithm(
-        "ppo", policy_components=components, initial_std=0.25
-    )
-    init = lambda key: gasil_jax.init(env, algorithm, key)
-    state = jax.jit(init)(jax.random.key(0))
-    network = MixturePolicy((64, 64), 2, components=components)
-    observation = jax.random.normal(jax.random.key(1), (9, env.observation_size))
-    parameters = network.apply(state.actor_critic.policy.params, observation)
+    network = MIXTURE.network((64, 64), 2, components=components)
+    observation = jax.random.normal(jax.random.key(1), (9, 11))
+    params = network.init(jax.random.key(0), observation)
+    parameters = network.apply(MIXTURE.explore(params, 0.25), observation)
     mean, log_std, logits = parameters
     np.testing.assert_allclose(np.exp(log_std), 0.25 * 0.5**0.5, rtol=1e-5)
     np.testing.assert_allclose(mean.std(axis=1), 0.25 * 0.5**0.5, rtol=0.2)
@@ -167,7 +162,7 @@ def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
 
 
 # The other agents use nothing of a policy that this one does not.
-def test_replays_train_it_and_it_is_evaluated():
+def test_replays_train_it():
     env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm("ppo+sil")
     algorithm = algorithm.replace(
         **SETTINGS, policy_components=3, entropy_coefficient=0.01
@@ -177,11 +172,6 @@ def test_replays_train_it_and_it_is_evaluated():
     assert (metrics["skipped_updates"] == 0).all()
     layers = state.actor_critic.policy.params["params"]["MLP_0"]
     assert layers["Dense_1"]["bias"].shape == (3 * (2 + 1),)
-    act, key = policy.from_state(state, env), jax.random.key(1)
-    score = evaluation.run_episodes(
-        env, act, key, num_episodes=2, num_steps=50, deterministic=False
-    )
-    assert (score["episode_length"] == 50).all()
 
 
 @functools.cache

@@ -207,36 +207,6 @@ def test_missing_and_damaged_and_doubled_runs(tmp_path, capsys, jobs_to_train):
     assert continued(tmp_path / "a") == 0 and not jobs_to_train
 
 
-def test_sweeps_of_other_points_and_seeds_become_one(tmp_path, capsys):
-    folders = [tmp_path / name for name in ("a", "b", "c")]
-    train(folders[0], grid=("alpha=0.1,1",))
-    train(folders[1], grid=("alpha=0.5",))
-    train(folders[2], None, "--first-seed", "3", grid=("alpha=0.5,0.1,1",))
-    out = folders[0]
-    for other in folders[1:]:
-        for program in (other / "programs").iterdir():
-            shutil.copytree(program, out / "programs" / program.name)
-    assert continued(out, "--grid", "alpha=0.5", "--seeds", "6") == 0
-    rows = [x.split(",")[:3] for x in (out / "results.csv").read_text().splitlines()]
-    assert rows[1:] == [
-        [str(point), str(seed), alpha]
-        for point, alpha in enumerate(("0.1", "1.0", "0.5"))
-        for seed in range(6)
-    ]
-
-
-def test_shards_with_different_experts_are_refused(tmp_path, capsys):
-    """On each host the expert's file may be another one."""
-    path, out = tmp_path / "expert.npz", tmp_path / "out"
-    more = ["--agent", "gail", "--expert", str(path)]
-    for steps in (5, 6):
-        np.savez(path, observation=np.ones((steps, 4)), action=np.ones((steps, 2)))
-        if steps == 5:
-            train(out, "1/2", *more)
-    message = refused(capsys, out, "--shard", "2/2")
-    assert "the trajectories of the expert were others" in message
-
-
 @pytest.fixture
 def jobs_to_train(monkeypatch):
     """The programs that are trained in a test, where that is interrupted at once."""
@@ -310,39 +280,6 @@ def test_a_shard_continues(tmp_path, capsys, jobs_to_train):
     # A cluster that runs a job again may do so before the job has begun.
     assert sweep.main([*begin, "--out", str(tmp_path / "other"), "--resume"]) == STOPPED
     assert sum(len(job.runs) for job in jobs_to_train) == 6
-
-
-def test_a_shard_keeps_out_of_other_folders(tmp_path, capsys, jobs_to_train):
-    (tmp_path / "thesis").mkdir()
-    (tmp_path / "thesis" / "text.tex").touch()
-    words = [*SMALL, "--grid", *GRID, "--shard", "1/2"]
-    assert sweep.main([*words, "--out", str(tmp_path / "thesis")]) == 2
-    assert "is not empty" in capsys.readouterr().err
-    assert not jobs_to_train
-
-
-def test_two_processes_do_not_train_the_same_program(tmp_path, capsys):
-    begun = train(tmp_path).trained(tmp_path)[0]
-    (begun.path / "training.json").unlink()
-    with begun.opened():
-        assert continued(tmp_path) == 2
-    assert f"{begun.path}, which process" in capsys.readouterr().err
-
-
-def test_shards_need_no_file_of_points_once_one_has_begun(
-    tmp_path, capsys, jobs_to_train
-):
-    path, out = tmp_path / "points.json", tmp_path / "out"
-    path.write_text('[{"alpha": 0.1}, {"num_epochs": 3}]')
-    more = [*SMALL, "--out", str(out), "--points-file", str(path), "--shard"]
-    members = lambda: jobs_to_train.pop().labels
-    assert sweep.main([*more, "1/2"]) == STOPPED
-    assert members() == {"point": (0, 0, 0), "seed": (0, 1, 2)}
-    path.unlink()
-    assert sweep.main([*more, "2/2"]) == 2
-    assert "points.json, which can't be read" in capsys.readouterr().err
-    assert continued(out, "--shard", "2/2") == STOPPED
-    assert members() == {"point": (1, 1, 1), "seed": (0, 1, 2)}
 
 
 def test_a_launcher_resumes_shards_only_on_request(tmp_path, capsys, monkeypatch):

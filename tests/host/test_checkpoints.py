@@ -233,29 +233,6 @@ except checkpoint.WriteError as error:
     assert names(tmp_path) == []
 
 
-def test_what_failed_first_is_told_where_cleaning_up_fails_too(tmp_path):
-    with pytest.raises(OSError, match="File too large"):
-        with checkpoint._orbax(tmp_path / "state"):
-            try:
-                raise ValueError(f"writing fails: os_error_code='{errno.EFBIG}'")
-            finally:  # Cleaning up.
-                raise OSError(errno.ENOTEMPTY, "Directory not empty")
-    with pytest.raises(OSError, match="Directory not empty"):
-        with checkpoint._orbax(tmp_path / "state"):
-            raise OSError(errno.ENOTEMPTY, "Directory not empty")
-
-
-def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(sys, "unraisablehook", told.append)
-    (tmp_path / "state").mkdir()
-    with pytest.raises(ValueError, match="already exists"):
-        checkpoint.save(tmp_path / "state", {"x": np.ones(3)})
-    for text in ("Event loop is closed", "mine"):
-        sys.unraisablehook(mock.Mock(exc_value=RuntimeError(text)))
-    assert [str(unraisable.exc_value) for unraisable in told] == ["mine"]
-
-
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
     broken = mock.Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO)))
     monkeypatch.setattr(os, "fsync", broken)

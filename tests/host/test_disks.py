@@ -122,12 +122,6 @@ def test_windows_is_refused_in_a_line():
     )
 
 
-def test_a_full_disk_has_a_hint(tmp_path):
-    with pytest.raises(output_file.WriteError, match="left on device: make room there"):
-        with output_file.errors_named(tmp_path):
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 def test_rows_that_could_not_be_written_are_not_written_later(tmp_path):
     path = tmp_path / "metrics.csv"
     writer = tables.TableWriter(path, {"seed": [0]}, columns=("env_steps",))
