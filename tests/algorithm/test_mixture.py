@@ -94,18 +94,6 @@ def test_the_bound_is_below_the_entropy_of_draws(spread):
     assert bound > GAUSSIAN.entropy(given((mean, log_std))) - 1e-4
 
 
-def test_the_bound_rises_with_deviation_distance_and_even_weights():
-    mean, log_std, logits = given(draw())
-
-    def bound(deviation, distance, evenness):
-        parameters = distance * mean, log_std + deviation, logits / evenness
-        return MIXTURE.entropy(parameters).sum()
-
-    slopes = jax.jit(jax.grad(bound, argnums=(0, 1, 2)))
-    for distance in (0.3, 1.0, 3.0):
-        assert all(slope > 0.0 for slope in slopes(0.0, distance, 1.0))
-
-
 def test_a_component_is_drawn_by_its_weight():
     mean = np.array([[-50.0, 5.0], [50.0, 5.0], [0.0, -80.0]])
     log_std, logits = np.log([0.5, 2.0]), np.log([0.5, 0.3, 0.2])

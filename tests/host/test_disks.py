@@ -21,7 +21,7 @@ from test_checkpoints import BYTES, NAMES, assert_same
 from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import run, sweep
+from gasil_jax import run
 from gasil_jax.cli import reporting
 from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, folders, output_file, saved, tables
@@ -35,17 +35,12 @@ def env():
     return gasil_jax.make_env("point_mass")
 
 
-def test_runs_sweeps_and_fit_take_folders_of_any_name(env, tmp_path):
-    out = tmp_path / "".join(NAMES[:3])
-    assert run.main([*SMALL, "--stagger-episodes", f"--out={out}"]) == 0
+@pytest.mark.parametrize("name", ["".join(NAMES), f"-{BYTES}"], ids=["text", "bytes"])
+def test_a_folder_has_any_name(name, tmp_path):
+    out = tmp_path / name
+    assert run.main([*SMALL, f"--out={out}"]) == 0
     states = saved.load(out)[-1]
-    folder = tmp_path / "".join(NAMES[3:])
-    assert_same(gasil_jax.fit(env, PPO, folder=folder).states, states)
-    arguments = [*SMALL, f"--out={folder}{BYTES}", "--grid", "gamma=0.9,0.99"]
-    for shard in ("1/2", "2/2"):
-        assert sweep.main([*arguments, "--shard", shard]) == 0
-    state = saved.load(tmp_path / f"{folder}{BYTES}", point=1)[-1]
-    np.testing.assert_array_equal(state.iteration, [PPO.config.num_iterations])
+    np.testing.assert_array_equal(states.iteration, [PPO.config.num_iterations])
 
 
 def test_a_name_that_the_terminal_cannot_show_is_printed(monkeypatch):
@@ -204,21 +199,10 @@ def test_the_policies_are_written_even_if_the_last_checkpoint_is_not(
     assert (out / "summary.json").exists()
     action = gasil_jax.load_policy(out)(np.zeros(env.observation_size))
 
-    folder = tmp_path / "fit"
-    with pytest.raises(checkpoint.WriteError, match="Function not implemented"):
-        gasil_jax.fit(env, PPO, folder=folder)
-    same = gasil_jax.load_policy(folder)(np.zeros(env.observation_size))
-    np.testing.assert_array_equal(action, same)
-
-    # One of several programs is the only one to have its policies.
-    out = tmp_path / "sweep"
-    arguments = [*SMALL, "--out", str(out), "--grid", "num_epochs=1,2"]
-    assert sweep.main(arguments) == 1
-    told = capsys.readouterr().err.splitlines()[-1]
-    assert told.endswith(f"python -m gasil_jax.sweep --resume --out {out}")
     monkeypatch.undo()
-    assert sweep.main(["--resume", "--out", str(out)]) == 0
-    assert saved.load(out, point=0)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    same = gasil_jax.load_policy(out)(np.zeros(env.observation_size))
+    np.testing.assert_array_equal(action, same)
 
 
 def killed_while_writing(path):
@@ -229,17 +213,16 @@ def killed_while_writing(path):
     path.rename(partial)
 
 
-def test_a_kill_during_the_first_description_does_not_spoil_the_folder(env, tmp_path):
-    killed_while_writing(tmp_path / "run" / "config.json")
-    assert run.main([*SMALL, "--resume", "--out", str(tmp_path / "run")]) == 0
-    killed_while_writing(tmp_path / "fit" / "config.json")
-    assert gasil_jax.fit(env, PPO, folder=tmp_path / "fit").metrics
+def test_a_kill_during_the_first_description_does_not_spoil_the_folder(tmp_path):
+    out = tmp_path / "run"
+    killed_while_writing(out / "config.json")
+    assert run.main([*SMALL, "--resume", "--out", str(out)]) == 0
     # A program without a description counts as none.
-    program = program_of(tmp_path / "fit")
-    (program / "program.json").unlink()
-    killed_while_writing(program / "program.json")
-    assert gasil_jax.fit(env, PPO, folder=tmp_path / "fit", resume=True).metrics
-    assert (program / "program.json").exists()
+    description = program_of(out) / "program.json"
+    description.unlink()
+    killed_while_writing(description)
+    assert run.main(["--resume", "--out", str(out)]) == 0
+    assert description.exists()
 
 
 @pytest.mark.parametrize(

@@ -15,10 +15,9 @@ from small_training import FLAGS, SETTINGS
 from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import run, statistics
-from gasil_jax.cli import plot
+from gasil_jax import run
 from gasil_jax.evaluation import evaluate as evaluate_directly
-from gasil_jax.host import checkpoint, plotting, saved, tables, trackers
+from gasil_jax.host import checkpoint, saved, tables, trackers
 from gasil_jax.host.evaluations import Evaluation, evaluation_key
 from gasil_jax.host.members import make_members
 
@@ -206,29 +205,6 @@ def test_the_tracker_is_given_the_scores(evaluated):
     assert set(given) == set(expected)
     for step, scores in given.items():
         np.testing.assert_allclose(scores, expected[step], rtol=1e-5)
-
-
-def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
-    out, _ = evaluated
-    curves = plot.read(out)
-    assert curves.evaluations["mean"].shape == (3, 6)
-    plot.draw([curves], tmp_path / "x.png")
-    plotting.learning_curve(
-        tmp_path / "y.png",
-        curves.env_steps,
-        curves.returns,
-        title="title",
-        evaluations=curves.evaluations,
-    )
-    scores = curves.evaluations["mean"]
-    middle = statistics.interquartile_mean(scores, axis=0)
-    assert len(figures) == 2
-    for figure in figures:
-        lines = figure.axes[0].get_lines()
-        (dashed,) = (line for line in lines if line.get_linestyle() == "--")
-        iterations = np.array([0, 5, 10, 15, 20, ITERATIONS])
-        np.testing.assert_allclose(dashed.get_xdata(), 128e-6 * iterations)
-        np.testing.assert_allclose(dashed.get_ydata(), middle)
 
 
 def scored(tmp_path, seeds, devices, times=1):

@@ -15,8 +15,8 @@ from test_checkpoints import assert_same
 from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import Decompose, Normalize, evaluate, plot, render, run
-from gasil_jax.host import checkpoint, driver, fitting, saved
+from gasil_jax import evaluate, plot, render, run
+from gasil_jax.host import checkpoint, fitting, saved
 from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.sweep import Recording
 
@@ -158,16 +158,6 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path, capsys):
     assert_equal_folders(out, commanded)
 
 
-def test_it_continues_what_a_command_began(env, tmp_path, monkeypatch):
-    with monkeypatch.context() as patch:
-        stop = lambda *arguments: os.kill(os.getpid(), signal.SIGTERM)
-        patch.setattr(driver, "log", stop)
-        arguments = [*FLAGS, "--seeds", "2", "--out", str(tmp_path)]
-        assert run.main(arguments) == 128 + signal.SIGTERM
-    result = gasil_jax.fit(env, PPO, seeds=2, folder=tmp_path, resume=True)
-    assert_same(result.states, gasil_jax.fit(env, PPO, seeds=2).states)
-
-
 def test_more_seeds_and_points_are_trained_and_no_others(env, tmp_path):
     """What is there is not trained again, and longer training continues."""
     folder = tmp_path / "out"
@@ -235,22 +225,6 @@ def test_points_are_trained_beside_each_other(env):
     jax.tree.map(close, params(result.states), params(one.states))
     assert result.metrics["policy_loss"].shape == (2, 1, 2)
     assert not np.allclose(*result.metrics["policy_loss"], rtol=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({"clip_epsilon_schedule": lambda steps: 1.0}, "a schedule that is a function"),
-        ({"rewards": (Normalize(), Decompose())}, "a model of rewards without a name"),
-        ({}, None),
-    ],
-)
-def test_it_is_told_what_no_command_line_can_name(env, changes, why):
-    algorithm = PPO.replace(**{x: y for x, y in changes.items() if x != "rewards"})
-    if "rewards" in changes:
-        algorithm = dataclasses.replace(PPO, **changes)
-    told = fitting._describe(env, algorithm, [0], Recording()).only_python
-    assert told == why if why is None else why in told
 
 
 def test_what_no_command_line_can_name_is_read_where_it_can_be(own, tmp_path, capsys):
