@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from small_training import DISCRIMINATOR, SETTINGS
 
 import gasil_jax
 from gasil_jax.algorithms import schedule_factor
@@ -38,14 +39,10 @@ def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
 
 
 def test_a_run_follows_its_schedules():
-    algorithm = gasil_jax.algorithm(
-        total_steps=1024,
-        batch_steps=256,
-        num_envs=4,
-        num_epochs=1,
-        hidden_sizes=(8,),
-        alpha_schedule=((256, 0.0), (512, 1.0)),
-        learning_rate_schedule=((0, 1.0), (256, 0.0)),
+    algorithm = gasil_jax.algorithm("ppo+gasil", **SETTINGS, **DISCRIMINATOR).replace(
+        total_steps=512,
+        alpha_schedule=((128, 0.0), (256, 1.0)),
+        learning_rate_schedule=((0, 1.0), (128, 0.0)),
     )
     env = gasil_jax.make_env("point_mass")
     _, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))

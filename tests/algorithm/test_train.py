@@ -88,7 +88,6 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
     ("hyperparameters", "message"),
     [
         (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),
-        (np.ones(3), r"hyperparameters is array\(.*: it must be numbers by name"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"learning_rate": -jnp.ones(())}, "rate is -1.0"),
         ({"alpha": np.ones(3)}, r"alpha has shape \(3,\): .*vmap"),
@@ -103,13 +102,12 @@ def test_hyperparameters_that_are_not_allowed_are_refused(hyperparameters, messa
 
 
 def test_the_shape_of_a_traced_hyperparameter_is_checked():
+    """jit traces all its arguments; under vmap each run has one number."""
     train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), PPO_GASIL)
-    # jit traces all its arguments; under vmap each run has one number.
-    many = {"alpha": jnp.ones(3)}
+    many, key = {"alpha": jnp.ones(3)}, jax.random.key(0)
     with pytest.raises(ValueError, match="alpha has shape"):
-        jax.eval_shape(train, jax.random.key(0), many)
-    trained = jax.vmap(train, in_axes=(None, 0))
-    _, metrics = jax.eval_shape(trained, jax.random.key(0), many)
+        jax.eval_shape(train, key, many)
+    _, metrics = jax.eval_shape(jax.vmap(train, in_axes=(None, 0)), key, many)
     assert metrics["env_steps"].shape[0] == 3
 
 
