@@ -40,7 +40,7 @@ _AS_FOR_USERS = "compiled_as_for_users"
 _LONG = {
     "test_examples",
     "test_figures",
-    "test_point_mass_figures",
+    "test_ray",
     "test_readme",
     "test_sweep",
 }

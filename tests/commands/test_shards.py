@@ -26,7 +26,7 @@ from gasil_jax.host.sweep import Sweep, parse_shard
 from gasil_jax.host.tables import TableWriter
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     updates=st.lists(st.integers(1, 9), min_size=1, max_size=6, unique=True),
     num_seeds=st.integers(1, 4),

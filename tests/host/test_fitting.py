@@ -89,6 +89,8 @@ def test_it_gives_the_numbers_of_the_command_line(fitted, commanded):
     assert result.evaluations["mean"].shape == (2, 4)
     np.testing.assert_array_equal(result.states.iteration, [ITERATIONS] * 2)
     assert_same(result.states, saved.load(commanded)[-1])
+    with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
+        gasil_jax.load_reward(folder)
 
     sizes = [progress.metrics["policy_loss"].shape[1] for progress in seen]
     assert sum(sizes) == ITERATIONS and max(sizes) <= CHUNK
@@ -99,15 +101,6 @@ def test_it_gives_the_numbers_of_the_command_line(fitted, commanded):
     np.testing.assert_allclose(
         [x["mean"] for x in scores], result.evaluations["mean"].T[1:], rtol=1e-6
     )
-
-
-def test_all_commands_read_its_folder(fitted, tmp_path, capsys):
-    for command, name in ((plot, "x.png"), (evaluate, "x.csv"), (render, "x.gif")):
-        assert command.main([str(fitted[1]), "--out", str(tmp_path / name)]) == 0
-        assert (tmp_path / name).stat().st_size > 0
-    assert "point_mass, ppo" in capsys.readouterr().out
-    with pytest.raises(ValueError, match="of agent 'ppo': it has no discriminator"):
-        gasil_jax.load_reward(fitted[1])
 
 
 def test_it_stops_early_and_goes_on(env, commanded, tmp_path, capsys):

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from small_training import FLAGS, SETTINGS
 from test_checkpoints import assert_same
-from test_resume import finish, start
 
 import gasil_jax
 from gasil_jax import evaluate, run
@@ -81,18 +80,3 @@ def test_a_program_of_which_some_runs_are_asked_for(parent, tmp_path, capsys):
     longer = dataclasses.replace(one, algorithm=one.algorithm.replace(total_steps=384))
     (program,) = longer.unfinished(out)
     assert program.seeds == (2,) and not program.path.exists()
-
-
-def test_two_processes_resume_one_folder_at_once(tmp_path):
-    """One trains, and the other one is told so, or finds everything done."""
-    out, alone = tmp_path / "out", tmp_path / "alone"
-    children = [start(out, *SMALL, "--resume") for _ in range(2)]
-    assert run.main([*SMALL, "--out", str(alone)]) == 0
-    ended = [finish(child) for child in children]
-    statuses = sorted(status for status, _, _ in ended)
-    assert statuses in ([0, 0], [0, 2]), ended
-    for status, _, err in ended:
-        last = err.splitlines()[-1]
-        assert status == 0 or "is writing to: name another folder or wait" in last
-    for name in ("results.csv", "policy.npz"):
-        assert (out / name).read_bytes() == (alone / name).read_bytes()

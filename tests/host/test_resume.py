@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -26,7 +27,7 @@ from gasil_jax.host import checkpoint, devices, folders
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.members import Members
 
-ITERATIONS = 400
+ITERATIONS = 240
 # Of the states with a buffer PPO+BC's compiles soonest; other agents': below.
 SMALL = (
     *(*FLAGS, "--agent", "ppo+bc", "--seeds", "3", "--devices", "2"),
@@ -52,11 +53,12 @@ def start(out, *arguments, cache=None):
     )
 
 
-def wait_for(condition, child, seconds=120):
-    """Poll until the condition holds; the child must be alive till then."""
+def wait_for(condition, *children, seconds=120):
+    """Poll until the condition holds; a child must be alive till then."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert child.poll() is None, child.communicate()
+        ended = [child.poll() is not None for child in children]
+        assert not all(ended), [child.communicate() for child in children]
         assert time.monotonic() < deadline
         time.sleep(0.005)
 
@@ -90,35 +92,50 @@ def cache(tmp_path_factory):
     return tmp_path_factory.mktemp("cache")
 
 
-@pytest.fixture(scope="module")
-def whole_and_memory(tmp_path_factory, cache):
-    """An undisturbed run without checkpoints on the way, and its memory in MB.
+class Undisturbed(NamedTuple):
+    """A run without checkpoints on the way, which two processes began at once."""
 
-    The memory is that of the process after 80, 200, 300 and 390 iterations.
-    """
-    out = tmp_path_factory.mktemp("whole") / "out"
-    child = start(out, *SMALL, cache=cache)
-    statistics = pathlib.Path(f"/proc/{child.pid}/statm")
-    memory = []
-    for iterations in (80, 200, 300, 390):
-        wait_for(lambda: rows(out) > 3 * iterations, child)  # noqa: B023
-        pages = int(statistics.read_text().split()[1])
+    folder: pathlib.Path
+    #: Memory in MB of the process that trained, as it went on.
+    memory: list[float]
+    #: Status and last line of the other process.
+    other: tuple[int, str]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory, cache):
+    out, memory = tmp_path_factory.mktemp("whole") / "out", []
+    both = [start(out, *SMALL, "--resume", cache=cache) for _ in range(2)]
+    for iterations in (60, 120, 180, 230):
+        wait_for(lambda: rows(out) > 3 * iterations, *both)  # noqa: B023
+        lock = (program_of(out) / ".lock").read_text()
+        pid = int(re.match(r"process (\d+)", lock).group(1))
+        pages = int(pathlib.Path(f"/proc/{pid}/statm").read_text().split()[1])
         memory.append(pages * resource.getpagesize() / 1e6)
+    child, other = sorted(both, key=lambda child: child.pid != pid)
     status, _, err = finish(child)
     assert status == 0, err
-    return out, memory
+    status, _, err = finish(other)
+    return Undisturbed(out, memory, (status, err.splitlines()[-1]))
 
 
 @pytest.fixture(scope="module")
-def whole(whole_and_memory):
+def whole(undisturbed):
     """The folder of the undisturbed run."""
-    return whole_and_memory[0]
+    return undisturbed.folder
 
 
-def test_iterations_take_no_more_memory(whole_and_memory):
-    _, (first, *later) = whole_and_memory
+def test_iterations_take_no_more_memory(undisturbed):
+    first, *later = undisturbed.memory
     print("MB:", first, *later)
     assert max(later) - first < 10.0
+
+
+def test_of_two_processes_that_begin_at_once_one_trains(undisturbed):
+    """The other one is told so, or finds everything done."""
+    status, last = undisturbed.other
+    assert status in (0, 2)
+    assert status == 0 or "is writing to: name another folder or wait" in last
 
 
 def interrupt_at_call(count, number, monkeypatch):
@@ -287,7 +304,7 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     (program_of(out) / "training.json").unlink()
     assert run.main(["--resume", "--out", str(out)]) == 0
     told = capsys.readouterr().err
-    assert f"{last} is damaged" in told and "starts from 00000200" in told
+    assert f"{last} is damaged" in told and f"starts from {ITERATIONS // 2:08d}" in told
     assert metrics(out) == metrics(whole)
     assert checkpoint.latest(root)[0].folder.name == last
     assert (root / f"{last}.damaged").is_dir()
