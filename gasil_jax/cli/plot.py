@@ -12,7 +12,7 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
-from gasil_jax.host import output_file, plotting, saved, tables
+from gasil_jax.host import output_file, plotting, results, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -25,7 +25,7 @@ class Options:
 
     Attributes:
       runs: folders of runs and sweeps. Each is a separate curve, even if they differ
-        only in their seeds.
+        only in their seeds; a sweep over agents is one for each.
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
@@ -174,18 +174,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{len(options.runs)} runs"
         )
     output_file.check(options.out, (".png", ".pdf", ".svg"))
+    read_of: list[tuple[pathlib.Path, Curves]] = []
+    for folder, label in zip(options.runs, labels, strict=True):
+        best = results.best_of_agents(folder) if options.point is None else {}
+        points: list[tuple[str | None, int | None]] = [*best.items()]
+        for agent, point in points or [(None, options.point)]:
+            own = f"{label}, {agent}" if label and agent else label
+            read_of.append((folder, read(folder, own, point)))
+    told = [run.label for _, run in read_of]
     runs = [
-        read(run, label, options.point)
-        for run, label in zip(options.runs, labels, strict=True)
+        run
+        if told.count(run.label) == 1
+        else run._replace(label=f"{run.label} ({folder})")
+        for folder, run in read_of
     ]
-    if not options.labels:
-        every = [run.label for run in runs]
-        runs = [
-            run
-            if every.count(run.label) == 1
-            else run._replace(label=f"{run.label} ({folder})")
-            for run, folder in zip(runs, options.runs, strict=True)
-        ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial)

@@ -19,21 +19,6 @@ ADAPTIVE = SMALL["ppo+gasil-adaptive"]
 ENV = gasil_jax.make_env("point_mass")
 
 
-def test_mix_and_correlation_are_their_formulas():
-    rng = np.random.default_rng(0)
-    first, second = rng.normal(size=(2, 50, 4))
-    second += 0.7 * first
-    standard = lambda x: (x - x.mean()) / x.std()
-    first, second = standard(first), standard(second)
-    both = jnp.stack([jnp.array(first), jnp.array(second)], axis=-1)
-    expected = np.corrcoef(first.ravel(), second.ravel())[0, 1]
-    assert 0.3 < expected < 0.9
-    np.testing.assert_allclose(adaptive.correlation(both), expected, rtol=1e-4)
-    np.testing.assert_allclose(
-        adaptive.mix(both, 0.3), 0.7 * first + 0.3 * second, rtol=1e-4, atol=1e-5
-    )
-
-
 @pytest.mark.parametrize(
     ("good", "policy", "expected"),
     [(100.0, 90.0, 0.4), (100.0, 60.0, 1.0), (100.0, 110.0, 0.0), (-8.0, -9.0, 0.5)],
@@ -165,17 +150,10 @@ def learned(**changes):
     return first(longer_context())
 
 
-@pytest.mark.parametrize(
-    "change", [{"discriminator_updates": 1}, {"sample_by_return": True}]
-)
-def test_an_option_of_the_discriminator_changes_what_is_learned(change):
-    (_, plain), (_, params) = learned(), learned(**change)
-    assert np.all(np.isfinite(params))
-    assert not np.allclose(plain, params, atol=1e-7)
-
-
-def test_options_of_the_buffer_change_what_is_kept():
-    plain, _ = learned()
+def test_options_of_buffer_and_discriminator_change_what_is_kept_and_learned():
+    plain, params = learned()
+    _, fewer = learned(discriminator_updates=1)
+    assert np.all(np.isfinite(fewer)) and not np.allclose(params, fewer, atol=1e-7)
     assert learned(buffer_steps=150).size == 150 < plain.size
     assert learned(buffer_episodes=1).size == 50 < plain.size
     undiscounted = learned(buffer_discounts=False)

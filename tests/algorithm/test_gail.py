@@ -129,7 +129,6 @@ def test_a_minari_data_set_is_an_expert(data_set, tmp_path, monkeypatch):
         ("h5py", "needs the package minari"),
     ):
         monkeypatch.setitem(sys.modules, package, None)
-        expert_module._load.cache_clear()
         with pytest.raises(ValueError, match=message) as refusal:
             expert_module.load("minari:test/expert-v0")
         assert "\n" not in str(refusal.value)
@@ -142,8 +141,6 @@ def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
         np.savez(path, **arrays)
         observation, action = expert_module.load(path)
         assert len(observation) == len(action) == length
-        with pytest.raises(ValueError, match="read-only"):
-            action[0] = 0.0
 
 
 def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):

@@ -99,6 +99,9 @@ def test_a_seed_or_an_observation_of_another_size_is_refused(saved, tmp_path):
 def test_a_batch_of_states_is_no_policy(saved):
     env, _, states, _ = saved
     states = states.replace(iteration=np.zeros(3, np.int32))
+    for none in (0, b"x", None, {"a": np.zeros(2), "b": 1.0}):
+        with pytest.raises(ValueError, match=r"states is .*: it must be arrays with"):
+            gasil_jax.member(none, 0)
     with pytest.raises(ValueError, match="state is a batch of 3 states"):
         policy.from_state(states, env)
 

@@ -1,8 +1,10 @@
 """The command line: a run from end to end, and refusals before anything compiles."""
 
 import csv
+import dataclasses
 import json
 import math
+import pathlib
 import re
 import shutil
 import signal
@@ -11,9 +13,11 @@ import sys
 import types
 
 import brax.envs
+import jax
 import numpy as np
 import pytest
 from refusals import refused, rows
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_envs import user_code
@@ -21,7 +25,8 @@ from gasil_jax import run
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.reporting import HelpShown, reports_errors
-from gasil_jax.host import training
+from gasil_jax.host import checkpoint, saved, training
+from gasil_jax.host import sweep as sweep_
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -153,7 +158,9 @@ def test_a_refusal_starts_no_device_and_does_not_load_the_plots(tmp_path):
     # Both take seconds, and nothing compiles without a device.
     code = """
 import sys
-status = main(["--env", "hoper"])
+import gasil_jax; gasil_jax.algorithm("ppo+gasil").replace(num_envs=8)
+from gasil_jax import run
+status = run.main(["--env", "hoper"])
 from jax._src import xla_bridge
 print(status, xla_bridge.backends_are_initialized(), "matplotlib" in sys.modules)
 """
@@ -290,3 +297,47 @@ def test_an_environment_that_brax_itself_breaks_is_refused(
     told = refused(capsys, run, "--env", "brax:broken", "--out", out)
     assert "env 'brax:broken' fails within Brax" in told and "KeyError: 'a_min'" in told
     assert not out.exists()
+
+
+def test_training_starts_from_another_runs_policy(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    begin = ("--agent", "ppo", "--seeds", "2", "--out", "first")
+    assert run.main([*FLAGS, *begin]) == 0
+    more = ("--agent", "ppo+sil", "--init-from", "first", "--evaluate-every", "128")
+    keep = ("--keep-checkpoints", "3")
+    assert run.main([*FLAGS, *more, *keep, "--out", "second"]) == 0
+    (stored,) = (path.parent for path in tmp_path.glob("second/**/00000000"))
+    begun = checkpoint.read(stored / "00000000")
+    *_, trained = saved.load(pathlib.Path("first"))
+    best = saved.find_start(pathlib.Path("first")).seed
+    *_, last = saved.load(pathlib.Path("second"))
+    first = gasil_jax.member(begun.restore(jax.eval_shape(lambda: last)), 0)
+    expected = gasil_jax.member(trained, best)
+    for part in (lambda x: x.actor_critic.policy.params, lambda x: x.normalizer):
+        jax.tree.map(np.testing.assert_array_equal, part(first), part(expected))
+    assert int(first.iteration) == 0
+    # It is not the run that starts from scratch, and other policies are refused.
+    (one,) = sweep_.read(pathlib.Path("second")).runs.values()
+    assert one.key != dataclasses.replace(one, start=None).key
+    assert run.main(["--resume", "--out", "first", "--total-steps", "384"]) == 0
+    for words, why in (
+        (("--resume", "--out", "second", "--seeds", "2"), "has been trained since"),
+        ((*FLAGS, "--init-from", "first", "--layer-norm"), "has another form: "),
+        ((*FLAGS, "--init-from", "nowhere"), "nowhere, which does not exist"),
+    ):
+        assert run.main([*words]) == 2
+        assert why in capsys.readouterr().err
+    assert not pathlib.Path("runs").exists()
+
+
+def test_the_settings_of_a_config_are_taken(trained, tmp_path, capsys):
+    config = ("--config", str(trained.folder / "config.json"))
+    _, requested = options_.read(Options, [*config, "--alpha", "0.3"], "x")
+    before = sweep_.read(trained.folder)
+    assert requested.algorithm == before.algorithm.replace(alpha=0.3)
+    same = dataclasses.replace(requested, algorithm=before.algorithm)
+    assert same == dataclasses.replace(before, algorithm=before.algorithm)
+    assert run.main([*config, "--agent", "ppo"]) == 2
+    assert "where agent was ppo+gasil, is ppo: leave it out" in capsys.readouterr().err
+    assert run.main(["--config", "nowhere.json"]) == 2
+    assert "config is nowhere.json: it must be the config" in capsys.readouterr().err

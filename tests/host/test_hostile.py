@@ -383,77 +383,34 @@ def test_a_foreign_archive_is_refused_and_never_unpickled(content, tmp_path):
     assert not hasattr(builtins, "exploded")
 
 
-NOTHING = np.float32(np.nan)
-
-
-@pytest.mark.parametrize(
-    ("name", "array", "reason"),
-    [
-        ("seeds", np.int32(5), "seeds has the shape"),
-        ("seeds", np.array(["0", "1"]), "seeds holds no numbers"),
-        ("final_return", np.array(["a", "b"]), "final_return holds no numbers"),
-        ("mean", np.full((2, 3), 1e300), "mean has numbers that aren't finite"),
-        ("scale", np.ones((2, 4)), "scale has the shape"),
-        ("scale", np.zeros((2, 3)), "scale has numbers that aren't positive"),
-        ("log_std", np.zeros((1, 1)), "log_std has the shape"),
-        ("log_std", None, "log_std is missing"),
-        ("low", np.zeros(2), "low has the shape"),
-        ("low", np.full(1, np.nan), "low isn't below high"),
-        ("high", np.full(1, -2.0), "low isn't below high"),
-        ("kernel_0", np.full((2, 3, 4), np.nan), "kernel_0 has numbers that aren't"),
-        ("kernel_1", np.zeros((2, 3, 1)), "kernel_1 has the shape"),
-        ("kernel_1", np.zeros((2, 4, 2)), "kernel_1 has the shape"),
-        ("kernel_7", np.zeros((2, 4, 1)), "kernel_2 is missing"),
-        ("bias_0", np.zeros((2, 4, 1)), "bias_0 has the shape"),
-        ("norm_scale_0", np.ones((2, 4)), "norm_bias_0 is missing"),
-        ("num_actions", np.int32(4), r"kernel_1 has the shape .*, 4\)"),
-        ("policy_components", np.int32(2), r"kernel_1 has the shape .*, 4\)"),
-        ("policy_components", np.int32(-3), "kernel_1 has the shape"),
-        ("policy_components", np.ones(2), "policy_components has the shape"),
-        ("policy_components", NOTHING, "policy_components has numbers"),
-    ],
-)
-def test_a_file_of_policies_is_refused_with_its_reason(name, array, reason, tmp_path):
-    changed = {**POLICY, name: array}
-    np.savez(
-        tmp_path / "policy.npz", **{x: y for x, y in changed.items() if y is not None}
-    )
-    with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}") as told:
+@pytest.mark.parametrize("name", ["seeds", "final_return", "mean", "scale", "kernel_0"])
+def test_a_file_of_policies_without_one_of_its_arrays_is_refused(name, tmp_path):
+    np.savez(tmp_path / "policy.npz", **{x: y for x, y in POLICY.items() if x != name})
+    with pytest.raises(ValueError, match=rf"is not a saved policy \({name} is missing"):
         gasil_jax.load_policy(tmp_path)
-    assert "\n" not in str(told.value)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("arrays", "use"), [(POLICY, act_of), (EXPERT, load)])
-def test_a_randomly_altered_archive_is_read_or_refused(arrays, use, tmp_path):
+def test_a_randomly_altered_expert_is_read_or_refused(tmp_path):
     told = 0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for number, content in enumerate(altered(arrays, 350)):
+        for number, content in enumerate(altered(EXPERT, 350)):
             path = tmp_path / f"{number}.npz"
             path.write_bytes(content)
             try:
-                use(path)
+                load(path)
             except ValueError as error:
                 told += 1
                 assert str(path) in str(error) and "\n" not in str(error)
     assert 150 < told < 330
 
 
-def test_a_policy_of_another_byte_order_and_with_a_further_array_acts(tmp_path):
+def test_a_policy_of_another_byte_order_acts(tmp_path):
     swapped = {name: x.astype(x.dtype.newbyteorder()) for name, x in POLICY.items()}
-    np.savez(tmp_path / "policy.npz", **swapped, notes=np.array([{}]))
+    np.savez(tmp_path / "policy.npz", **swapped)
     np.savez(tmp_path / "plain.npz", **POLICY)
     observation = np.ones(3, np.float32)
     expected = gasil_jax.load_policy(tmp_path / "plain.npz")(observation)
     assert gasil_jax.load_policy(tmp_path)(observation) == expected
     assert numpy_policy.load(tmp_path)(observation) == expected
-
-
-@pytest.mark.parametrize("about", [None, "{", "[]1", "[1]"])
-def test_a_damaged_policy_of_the_zoo_is_told(about, tmp_path, monkeypatch):
-    monkeypatch.setattr(numpy_policy, "ZOO", tmp_path)
-    entry = {} if about is None else {"about": np.array(about)}
-    np.savez(tmp_path / "mine.npz", **POLICY, **entry)
-    with pytest.raises(ValueError, match=r"mine\.npz is damaged: about can't be read"):
-        numpy_policy.about("zoo:mine")
