@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.envs import Wrapper
+from refusals import refused
 from small_training import drawn_policies
 
 import gasil_jax
@@ -42,8 +43,8 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(
     assert evaluate.main([folder, *flags, "--seed", "6"]) == 0
     assert capsys.readouterr().out.splitlines()[1] == lines[1]
     # Nothing is written over.
-    assert evaluate.main([folder, "--out", str(out)]) == 2
-    assert "which exists: name a new file" in capsys.readouterr().err
+    told = refused(capsys, evaluate, folder, "--out", out)
+    assert "which exists: name a new file" in told
 
 
 @on_trained
@@ -55,9 +56,8 @@ def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
     best = checkpoint.best(root).folder
     (best / "state" / "_METADATA").write_text("{}")
     capsys.readouterr()
-    assert evaluate.main([str(out), "--checkpoint", "best", "--episodes", "1"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{best} is damaged: state/_METADATA is not what was written" in line
+    told = refused(capsys, evaluate, out, "--checkpoint", "best")
+    assert f"{best} is damaged: state/_METADATA is not what was written" in told
 
 
 @on_trained

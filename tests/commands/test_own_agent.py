@@ -70,8 +70,15 @@ SHORT = {
     "MIX": "def mix(self, state, advantages, context): return",
     "ONE": "float = number(0.5, 0.0, 1.0)",
     "PAID": "context.rollout.reward",
+    "UPDATE": "def update(self, state, context, key): return",
     "Agent": "gasil_jax.Agent",
 }
+
+
+def in_full(lines):
+    return re.sub("|".join(SHORT), lambda found: SHORT[found.group()], lines)
+
+
 #: What agents are derived from, what they define, and why they are refused.
 WRONG = rows(
     r"""
@@ -103,8 +110,7 @@ Own | def check(self, sizes): return sizes.alhpa | .* fails: AttributeError: .*a
 """
 )
 for number, (base, definition, _) in enumerate(WRONG):
-    lines = f"\n\nclass Wrong{number}({base}):\n    {definition}\n"
-    MODULE += re.sub("|".join(SHORT), lambda found: SHORT[found.group()], lines)
+    MODULE += in_full(f"\n\nclass Wrong{number}({base}):\n    {definition}\n")
 #: Other names of agents, and why they are refused.
 NAMES = """
 nowhere:Own | 'nowhere:Own' can't be imported: No module named 'nowhere'
@@ -263,21 +269,22 @@ class Signs(gasil_jax.RewardModel):
         context = context.replace(rollout=context.rollout.replace(reward=reward))
         return state, context, True, {"my_factor": self.factor}
 """
-UPDATE = "def update(self, state, context, key): return "
 #: What models of rewards define, and why they are refused.
-WRONG_MODELS = [
-    (UPDATE + "state, context, {}", "update .* 3 values: .*state, context, learned"),
-    (UPDATE + "state, context.rollout, True, {}", "returned context.rollout.* missing"),
-    (UPDATE + "(), context, context.rollout.reward > 0, {}", "learned is bool.32, 4.:"),
-    (UPDATE + "state, context, 'yes', {}", "update .* returns what is no array: "),
-    (UPDATE + "state, context, True, {'entropy': 0}", "'entropy' of a model of rew"),
-    ("def update(self, state, context): pass", r"traced: .*update\(\) takes 3 posi"),
-    ("def init(self, key): pass", r"can't be traced: .*init\(\) takes 2 positional"),
-    ("gamma: float = number(1.0, 0.0)", "'gamma', a name that is taken: "),
-    ("seeds: float = number(1.0, 0.0)", "'seeds', a name that is taken by an option"),
-]
+WRONG_MODELS = rows(
+    r"""
+UPDATE state, context, {} | update .* 3 values: .*state, context, learned
+UPDATE state, context.rollout, True, {} | returned context.rollout.* missing
+UPDATE (), context, PAID > 0, {} | learned is bool.32, 4.:
+UPDATE state, context, 'yes', {} | update .* returns what is no array:
+UPDATE state, context, True, {'entropy': 0} | 'entropy' of a model of rew
+def update(self, state, context): pass | traced: .*update\(\) takes 3 posi
+def init(self, key): pass | can't be traced: .*init\(\) takes 2 positional
+gamma: ONE | 'gamma', a name that is taken:
+seeds: ONE | 'seeds', a name that is taken by an option
+"""
+)
 for number, (definition, _) in enumerate(WRONG_MODELS):
-    MODEL += f"\n\nclass Wrong{number}(Signs):\n    {definition}\n"
+    MODEL += in_full(f"\n\nclass Wrong{number}(Signs):\n    {definition}\n")
 
 
 @pytest.fixture
@@ -300,8 +307,8 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     assert run.main([*again, "--total-steps", "384"]) == 0
     assert evaluate.main(["out", "--episodes", "1"]) == 0
     assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
-    assert run.main([*again, "--rewards", "my_models:Wrong0"]) == 2
-    assert "rewards was ['my_models:Signs'], is ['my_mod" in capsys.readouterr().err
+    told = refused(capsys, run, *again, "--rewards", "my_models:Wrong0")
+    assert "rewards was ['my_models:Signs'], is ['my_mod" in told
 
 
 @pytest.mark.parametrize(
@@ -314,6 +321,6 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     ],
 )
 def test_what_is_no_model_is_refused_in_a_line(my_models, capsys, model, why):
-    assert run.main([*FLAGS, "--agent", "ppo", "--rewards", model, "--out", "x"]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ") and re.search(why, error), error
+    words = ("--agent", "ppo", "--rewards", model, "--out", "x")
+    told = refused(capsys, run, *FLAGS, *words)
+    assert re.search(why, told), told

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import small_training
+from refusals import refused
 from test_checkpoints import assert_same
 from test_resume import program_of
 
@@ -240,8 +241,7 @@ def test_what_no_command_line_can_name_is_read_where_it_can_be(own, tmp_path, ca
         (render, str(out)),
         (run, "--resume", f"--out={out}"),
     ):
-        assert command.main(words) == 2
-        (message,) = capsys.readouterr().err.splitlines()
+        message = refused(capsys, command, *words)
         assert why in message and "use gasil_jax.fit, gasil_jax.load_policy" in message
 
     # With what only Python has, the states and the reward are read.

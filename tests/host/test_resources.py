@@ -7,6 +7,7 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
+from refusals import refused
 from small_training import FLAGS
 
 import gasil_jax
@@ -51,16 +52,12 @@ def full(monkeypatch, free):
 def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
     arguments = [*FLAGS, "--seeds", "3", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
-    assert run.main(arguments) == 2
-    error = capsys.readouterr().err
-    assert "a single seed needs about" in error
-    assert len(error.splitlines()) == 1
+    assert "a single seed needs about" in refused(capsys, run, *arguments)
 
     monkeypatch.setattr(resources, "available", lambda devices: None)
     full(monkeypatch, 10_000)
-    assert run.main(arguments) == 2
-    error = capsys.readouterr().err
-    assert "3 checkpoints of each run, and one that is being written" in error
+    told = refused(capsys, run, *arguments)
+    assert "3 checkpoints of each run, and one that is being written" in told
     assert not (tmp_path / "out").exists()
 
     # Those of all points stay on the disk.
