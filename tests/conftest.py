@@ -37,13 +37,7 @@ gc.set_threshold(100_000, 20, 20)
 # with this mark check XLA's numbers or its memory, and are compiled as for users.
 _AS_FOR_USERS = "compiled_as_for_users"
 # Modules with tests that take long by themselves.
-_LONG = {
-    "test_examples",
-    "test_figures",
-    "test_ray",
-    "test_readme",
-    "test_sweep",
-}
+_LONG = {"test_examples", "test_figures", "test_ray", "test_readme", "test_sweep"}
 
 
 def pytest_configure(config):
@@ -132,10 +126,7 @@ def pytest_collection_modifyitems(items):
     changes. Long tests come before the others, so that none is left at the end.
     """
     items.sort(
-        key=lambda item: (
-            not _is_optimized(item),
-            item.module.__name__ not in _LONG,
-        )
+        key=lambda item: (not _is_optimized(item), item.module.__name__ not in _LONG)
     )
     for item in items:
         fixtures = item._fixtureinfo.name2fixturedefs.values()

@@ -14,8 +14,7 @@ HUMANOID = ((2e6, 0.0), (3e6, 1.0))
 
 
 @pytest.mark.parametrize(
-    ("steps", "expected"),
-    [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)],
+    ("steps", "expected"), [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)]
 )
 def test_the_papers_rule_for_humanoid(steps, expected):
     result = jax.jit(lambda steps: schedule_factor(HUMANOID, steps))(steps)

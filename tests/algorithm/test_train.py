@@ -85,6 +85,19 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
 
 
 @pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"expert": "a.npz"}, r"expert is a setting of gail, not of ppo\+gasil"),
+        ({"reward_clip": 1.0}, "reward_clip has no effect: normalize_rewards is off"),
+        ({"alhpa": 0.1}, "setting 'alhpa' is unknown: did you mean 'alpha'"),
+    ],
+)
+def test_a_setting_that_it_does_not_have_is_refused(change, message):
+    with pytest.raises(ValueError, match=message):
+        PPO_GASIL.replace(**change)
+
+
+@pytest.mark.parametrize(
     ("hyperparameters", "message"),
     [
         (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),

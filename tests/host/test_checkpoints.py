@@ -73,8 +73,7 @@ def test_a_checkpoint_is_read_from_a_folder_of_any_name(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "like",
-    [{"x": jnp.ones(3, jnp.float16)}, {"x": jnp.ones(2, jnp.bfloat16)}, {}],
+    "like", [{"x": jnp.ones(3, jnp.float16)}, {"x": jnp.ones(2, jnp.bfloat16)}, {}]
 )
 def test_another_state_is_not_taken_for_what_is_stored(like, tmp_path):
     checkpoint.save(tmp_path / "state", {"x": jnp.ones(3, jnp.bfloat16)})

@@ -238,12 +238,3 @@ def test_a_seeds_scores_are_its_own_and_compile_once(tmp_path, caplog):
     alone = scored(tmp_path, [6], devices=1)
     np.testing.assert_allclose(alone[6], together[6], **TOLERANCE)
     assert np.abs(np.subtract(together[5], together[6])).max() > 0.1
-
-
-def test_keys_differ_by_seed_and_iteration():
-    keys = {
-        tuple(jax.random.key_data(evaluation_key(np.uint32(seed), iteration)).tolist())
-        for seed in (0, 1, 2**32 - 1)
-        for iteration in (1, 2)
-    }
-    assert len(keys) == 6

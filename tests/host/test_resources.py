@@ -75,11 +75,7 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
         ("ppo", {"batch_steps": 2**24, "hidden_sizes": (8,)}, "batches, with batch_st"),
         ("ppo+sil", {"sil_buffer_steps": 10**8}, "the state of agent 'ppo+sil', with"),
         ("ppo+sil", {"sil_minibatch_size": 10**9}, "outputs of layers, with sil_minib"),
-        (
-            "gasil",
-            {"discriminator_minibatch_size": 10**9},
-            "outputs of layers, with d",
-        ),
+        ("gasil", {"discriminator_minibatch_size": 10**9}, "outputs of layers, with d"),
         ("ppo", {"hidden_sizes": (10**6,)}, "outputs of layers, with batch_steps 2048"),
         ("ppo", {"hidden_sizes": (10**5, 10**5)}, "networks"),
     ],
