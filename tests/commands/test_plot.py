@@ -85,24 +85,3 @@ def test_a_table_that_is_being_written_is_read_up_to_its_last_whole_row(
             writer.writerow(row | late)
     final = [float(x["episode_return"]) for x in rows if x["env_steps"] == "768"]
     np.testing.assert_allclose(plot.read(out).final, final)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "runs is empty: name one folder or more"),
-        ("RUN --out x.txt", "must end in .png, .pdf, .svg"),
-        ("RUN --out RUN/learning_curve.png", "which exists: name a new file"),
-        ("RUN --out /proc/nowhere/x.png", "out is /proc/nowhere/x.png"),
-        ("RUN --out RUN/summary.png --point 1", "point is 1: "),
-        ("RUN/programs --out /proc/x.png", "must be the folder of a run"),
-        ("RUN RUN --labels a", "labels has 1 names: it must have one for each of the"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(
-    arguments, message, trained, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    assert plot.main(arguments.replace("RUN", str(trained.folder)).split()) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error

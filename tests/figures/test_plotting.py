@@ -98,18 +98,6 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     assert "neighbouring values" in caption
 
 
-def test_values_that_begin_at_zero_have_a_scale(figures, tmp_path):
-    values = {"alpha": (0.0, 0.02, 1.0)}
-    plotting.marginals(
-        tmp_path / "x.png", values, np.arange(3.0), best=None, left_out=0
-    )
-    (axes,) = figures[0].axes
-    assert axes.get_xscale() == "symlog"
-    assert figures[0].get_supxlabel() == (
-        "point: mean over its seeds; mean: over the points of each\nvalue"
-    )
-
-
 def labels_of(points):
     return results._labels(mock.Mock(sweep=mock.Mock(points=points)))
 
@@ -123,23 +111,6 @@ def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
     assert [label.get_weight() for label in labels] == ["normal", "bold"]
 
 
-def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
-    point = {"learning_rate": 3e-5, "discriminator_updates": 10, "alpha": 0.1}
-    point |= {"discriminator_learning_rate": 2e-5, "buffer_steps": 10_000}
-    points = [point, {name: 2 * value for name, value in point.items()}]
-    plotting.final_returns(
-        tmp_path / "x.png", labels_of(points), np.ones((2, 5)), best=1
-    )
-    (figure,) = figures
-    figure.draw_without_rendering()
-    (axes,) = figure.axes
-    assert axes.get_position().width > 0.5
-    low, high = [label.get_window_extent() for label in axes.get_yticklabels()]
-    assert not low.overlaps(high) and min(low.x0, high.x0) >= 0.0
-    text = axes.get_yticklabels()[0].get_text()
-    assert text.replace("\n", " ") == f"0: {labels_of(points)[0]}"
-
-
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     kept = []
     pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
@@ -147,15 +118,3 @@ def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     names = [f"alpha={i}" for i in range(1300)]
     plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), best=None)
     assert kept[0] < 2**16
-
-
-def test_names_at_the_ends_of_lines_are_apart_and_in_order():
-    axes = matplotlib.figure.Figure().subplots()
-    axes.set_ylim(0.0, 10.0)
-    ends = {"a": 9.0, "b": 5.0, "c": 5.0, "d": 4.9, "e": 0.0, "f": 0.0}
-    plotting.label_ends(axes, ends, dict.fromkeys(ends, "black"))
-    places = [text.xy[1] for text in axes.texts]
-    assert [text.get_text() for text in axes.texts] == [*ends]
-    assert (-np.diff(places) > 0.0599).all()
-    # Where there is room a name is at the end of its line.
-    assert places[0] == 0.9 and places[1] == 0.5 and min(places) == 0.0
