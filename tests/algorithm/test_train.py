@@ -51,7 +51,7 @@ def test_it_trains_an_environment_of_brax():
     assert np.all(np.isfinite(metrics["policy_loss"]))
     # No episode ends by itself, and none is longer than the limit.
     assert set(np.asarray(metrics["episode_length"])) == {50.0}
-    assert int(state.agent.size) > 0
+    assert int(state.agent.buffer.size) > 0
 
 
 def test_an_environment_with_the_physics_of_brax_can_be_traced():
