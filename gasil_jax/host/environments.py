@@ -9,9 +9,11 @@ from gasil_envs.physics.native import available_cores
 from gasil_envs.pictures import can_draw as can_be_drawn
 from gasil_envs.registry import Settings, check, made_with, prepare, without_effect
 from gasil_envs.registry import make as make_env
+from gasil_envs.worlds import FAMILIES
 from gasil_envs.wrappers import is_discrete
 
 __all__ = [
+    "FAMILIES",
     "Settings",
     "available_cores",
     "can_be_drawn",
@@ -30,7 +32,7 @@ __all__ = [
 def names() -> list[str]:
     """Return the names of all environments, also of other packages, if installed."""
     every = list(registry.names())
-    for family in worlds.FAMILIES:
+    for family in FAMILIES:
         with contextlib.suppress(ValueError):
             every += worlds.names(family)
     return every

@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import hashlib
 import pathlib
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Required, TypedDict
 
@@ -25,8 +26,16 @@ import jax
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, refusal, shown
-from gasil_jax.host import descriptions, folders, json_files, points, programs
+from gasil_jax.host import (
+    descriptions,
+    environments,
+    folders,
+    json_files,
+    points,
+    programs,
+)
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
 from gasil_jax.host.points import Point
 from gasil_jax.host.programs import Program
 from gasil_jax.host.runs import Run
@@ -256,6 +265,7 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
             "python -m gasil_jax.plot"
         )
     with json_files.blamed(folder / folders.CONFIG):
+        _note_imports(folder, stored)
         if algorithm is None:
             algorithm = descriptions.read(stored["algorithm"])
         others = tuple(map(descriptions.read, stored.get("others", ())))
@@ -269,6 +279,17 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
     return Sweep(
         algorithm=algorithm, others=others, points=every, start=start, **fields
     )
+
+
+def _note_imports(folder: pathlib.Path, stored: Config) -> None:
+    """Print which modules a config.json names, which its reader imports."""
+    named: list[Any] = [stored["env"]]
+    for each in (stored["algorithm"], *stored.get("others", ())):
+        named += [each.get("agent"), *each.get("rewards", ())]
+    modules = {str(name).partition(":")[0] for name in named if ":" in str(name)}
+    new = sorted(modules - {*environments.FAMILIES, *sys.modules})
+    if new:
+        note(f"{folder} names code that is imported now: {', '.join(new)}")
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
