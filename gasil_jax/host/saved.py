@@ -51,25 +51,18 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     Raises:
       InputError: if it is no such folder, or has no such point.
     """
-    described = sweep.described(folder)
-    chosen = _choose_point(folder, described["points"], point)
-    agent = described["points"][chosen].get("agent", described["algorithm"]["agent"])
-    if described["only_python"] is None:
-        return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
-    return described["env"], agent, programs.labelled(folder / "programs", chosen)
+    stored = sweep.described(folder)
+    chosen = _choose_point(folder, stored["points"], point)
+    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
+    if stored["only_python"] is None:
+        every = _programs(folder, sweep.made(folder, stored), chosen)
+    else:
+        every = programs.labelled(folder / "programs", chosen)
+    return stored["env"], str(agent), every
 
 
-def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
-    """Return the seed with the highest final return of a point; None if unknown.
-
-    A policy of the zoo has one seed, which needs no name.
-    """
-    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        return None
-    return _best_seed(find(folder, point)[2])
-
-
-def _best_seed(every: Sequence[Program]) -> int | None:
+def best_seed(every: Sequence[Program]) -> int | None:
+    """Return the seed with the highest final return of programs; None if unknown."""
     scores = {}
     for each in every:
         table = each.table("metrics.csv", ("episode_return",))
@@ -80,6 +73,11 @@ def _best_seed(every: Sequence[Program]) -> int | None:
                     np.nan_to_num(final, nan=-np.inf)
                 )
     return max(scores, key=scores.__getitem__) if scores else None
+
+
+def choose_point(folder: pathlib.Path, point: int | None) -> int:
+    """Return the number of the requested point of a folder; by default the best."""
+    return _choose_point(folder, sweep.described(folder)["points"], point)
 
 
 def _choose_point(
@@ -219,7 +217,7 @@ def find_start(folder: pathlib.Path) -> Start:
     """Return the policy of a run's best seed, in its newest checkpoint."""
     stored = sweep.read(folder)
     every = _programs(folder, stored, _choose_point(folder, stored.points, None))
-    seed = _best_seed(every)
+    seed = best_seed(every)
     if seed is None:
         seed = every[0].seeds[0]
     (path,) = (x.path for x in every if seed in x.seeds)
@@ -405,7 +403,8 @@ def load_policy(
     if has_file and which == "last" and point is None:
         return policy.make(numpy_policy.read(path, seed))
     if seed is None:
-        seed = best_seed(folder, point)
+        point = choose_point(folder, point)
+        seed = best_seed(find(folder, point)[2])
     env, _, _, states = load(
         folder, which, point, seed=seed, env=env, algorithm=algorithm
     )

@@ -257,7 +257,13 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
 
     An algorithm that only Python can make is an argument.
     """
-    stored = described(folder)
+    return made(folder, described(folder), algorithm)
+
+
+def made(
+    folder: pathlib.Path, stored: Config, algorithm: Algorithm | None = None
+) -> Sweep:
+    """Return the sweep that a folder's config.json describes; see `read`."""
     if algorithm is None and (why := stored["only_python"]) is not None:
         raise InputError(
             f"run is {folder}, which was trained from Python with what no command line "
