@@ -51,13 +51,16 @@ class Recording:
     """What is recorded of training, and when. It does not change a run's numbers.
 
     Attributes:
-      checkpoint_every: environment steps per seed between two checkpoints, rounded up
-        to whole iterations; None writes one every ten minutes.
-      keep_checkpoints: number of newest checkpoints to keep, besides the best one; 0
-        writes none.
-      evaluate_every: environment steps per seed between two evaluations; None for none.
+      checkpoint_every: environment steps per seed between two checkpoints; by
+        default a checkpoint is written every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
+        with the best evaluation or, without evaluate_every, with the best returns.
+      evaluate_every: environment steps per seed between two evaluations of the
+        policy's mean action in fresh environments, rounded up to whole iterations;
+        by default none. The untrained policy is evaluated too. The scores are undelayed
+        returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation.
-      log: names of trackers.
+      log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
     checkpoint_every: int | None = None
