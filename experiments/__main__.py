@@ -1,4 +1,4 @@
-"""``python -m experiments NAME``: train a figure's missing runs and write its page.
+"""``python -m experiments NAME``: train a figure's missing runs and draw them.
 
 Without a name it lists the figures and the other commands.
 """
@@ -16,7 +16,6 @@ from experiments import (
     engine,
     profile,
     report,
-    summary,
     zoo,
 )
 from experiments.curves import Curve, Figure
@@ -32,7 +31,7 @@ from gasil_jax.host.runs import Run
 
 #: Commands other than figures: each module has a `parser` and a `run`.
 COMMANDS: Mapping[str, ModuleType] = {
-    "report": summary,
+    "report": report,
     "benchmark": benchmark,
     "profile": profile,
     "zoo": zoo,
@@ -44,7 +43,7 @@ _QUICK_STEPS = 100_000
 
 def _parser(name: str) -> Parser:
     """Return the reader of a figure's options."""
-    parser = Parser(name, "Train the runs that a figure lacks, then write its page.")
+    parser = Parser(name, "Train the runs that a figure lacks, then draw them.")
     add = parser.add_argument
     add(
         "--quick",
@@ -66,7 +65,7 @@ def _parser(name: str) -> Parser:
         default="1/1",
         help="train only this part of the runs, as NUMBER/COUNT",
     )
-    parser.add_results("folder of the pages and, below runs/, of the stored runs")
+    parser.add_results("folder of the stored runs, in runs/, and of a page")
     add("--runs", type=pathlib.Path, help="scratch folder of the training in progress")
     add("--resume", action="store_true", help="continue interrupted training")
     add(
@@ -148,7 +147,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 
 
 def _train(name: str, options: Options) -> None:
-    """Train the runs that a figure lacks, then write its page."""
+    """Train the runs that a figure lacks, then draw them."""
     setup = Setup(
         **{x.name: getattr(options, x.name) for x in dataclasses.fields(Setup)}
     )
@@ -190,8 +189,15 @@ def _train(name: str, options: Options) -> None:
         for each in engine.unfinished(missing, setup):
             print(f"  {engine.title(each)}")
         return
-    text = "{{table}}" if options.quick else None
-    report.write(name, Results(figure, *stores()), results, text)
+    if results.resolve() == RESULTS.resolve():
+        pages = report.all_results(stores()[0])
+        for page in report.showing(name):
+            report.write(pages, page, report.PAGES)
+            print(f"in {report.PAGES / page}.md")
+        return
+    text = f"# {figure.title}\n\n{{{{{name} curves}}}}\n\n{{{{{name} forest}}}}\n"
+    shown = {name: Results(name, figure, *stores())}
+    report.write(shown, name, results, text)
     print(f"in {results / name}.md")
 
 

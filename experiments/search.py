@@ -435,23 +435,3 @@ class SingleSetting(Search):
                 return None
             ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
-
-
-def mean_ranks(
-    name: str, env: str, reward_delay: int, *, store: Store
-) -> dict[Any, float]:
-    """Return the mean rank, by value of a hyperparameter, of points on a task.
-
-    An agent's drawn points are ranked from 0, the worst, to 1. The mean is over the
-    points with the value, of all agents whose search has the hyperparameter and whose
-    drawn points are all stored. Without such an agent the result is empty.
-    """
-    ranks: dict[Any, list[float]] = {}
-    for search in searches(env, reward_delay).values():
-        points = draw(search.agent)
-        scores = search.scores(points, store)
-        if scores is not None and name in points[0]:
-            shares = _ranks(scores) / (len(points) - 1)
-            for point, rank in zip(points, shares, strict=True):
-                ranks.setdefault(point[name], []).append(float(rank))
-    return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}

@@ -154,8 +154,7 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
 
     Args:
       agent: name of one of the package's agents.
-      **settings: settings of the agent, of PPO and of models of rewards, by name. Those
-        that are not given have their defaults.
+      **settings: as in `Algorithm.replace`; the others have their defaults.
 
     Raises:
       ValueError: if a name is unknown.
@@ -185,9 +184,8 @@ def check(algorithm: Algorithm) -> None:
         raise refusal("config", config, "a gasil_jax.Config")
     if not isinstance(agent, Agent):
         raise refusal("agent", agent, "an instance of a class from gasil_jax.Agent")
-    if not isinstance(rewards, tuple) or not all(
-        isinstance(model, RewardModel) for model in rewards
-    ):
+    models = rewards if isinstance(rewards, tuple) else (None,)
+    if not all(isinstance(model, RewardModel) for model in models):
         raise refusal("rewards", rewards, "a tuple of models of rewards")
     validate_config(config)
     taken = {*_COLUMNS, *names(Config)}
@@ -201,7 +199,7 @@ def check(algorithm: Algorithm) -> None:
                 )
         taken.update(names(part))
     for part in (agent, *rewards):
-        validate(part, config.total_steps)
+        validate(part)
     if agent.num_streams > 1 and type(agent).mix is Agent.mix:
         raise ValueError(
             f"agent {agent.name!r} has {agent.num_streams} reward streams: it must "
@@ -223,4 +221,4 @@ def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> N
                 f"{name} is not traced: change it with algorithm.replace instead"
             )
     for part in algorithm.replace(**hyperparameters).parts:
-        validate(part, algorithm.config.total_steps)
+        validate(part)

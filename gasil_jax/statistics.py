@@ -116,18 +116,12 @@ def are_numbers(values: Sequence[Any]) -> bool:
 
 
 def groups(values: Sequence[Any]) -> list[np.ndarray]:
-    """Return the groups of points that have the same value, or neighbouring ones.
+    """Return the indices of points that have the same value, or neighbouring ones.
 
     Neighbouring numbers form a group if there are eight points or more, and fewer than
     two for each value. A group then has about three values, or more where that would
-    make more than eight groups.
-
-    Args:
-      values: each point's value of one hyperparameter.
-
-    Returns:
-      The indices of each group's points. Groups are in the order of their values, which
-      is that of their first points if they are not all numbers.
+    make more than eight groups. Groups are in the order of their values, which is that
+    of their first points if they are not all numbers.
     """
     distinct = list(dict.fromkeys(values))
     count = len(distinct)

@@ -41,6 +41,7 @@ REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
     "value_coefficient": (("learning_rate",), 1.0),
     "admission": (("buffer_steps",), "all"),
     "ties": (("buffer_steps",), "oldest"),
+    "sample_by_return": (("buffer_steps",), False),
     "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
     "discriminator_gradient_penalty": (("bonus",), 0.0),
     "discriminator_normalizes_actions": (("bonus",), False),
