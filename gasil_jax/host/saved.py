@@ -179,22 +179,12 @@ def restore(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        root = each.path / "checkpoints"
-        if which == "best":
-            with _named(folder):
-                chosen = checkpoint.best(root)
-        else:
-            chosen, errors = checkpoint.latest(root)
-            for error in errors:
-                print(f"warning: {error}", file=sys.stderr)
-        if chosen is None:
-            scored = " with a score" if which == "best" else ""
-            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
         init = functools.partial(train.first_state, env, each.algorithm)
         keys = jax.random.split(jax.random.key(0), each.num_members)
         with _named(folder):
             # The leaves of all members have the same shapes.
-            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
+            like = jax.eval_shape(jax.vmap(init), keys)
+            restored = _read_checkpoint(each.path / "checkpoints", which, like)
         own = zip(each.seeds, each.indices, strict=True)
         states |= {number: member(restored, i) for number, i in own}
     seeds = [x for x in stored.seeds if x in states]
@@ -292,6 +282,30 @@ def begin(trained: Any, env: Any, every: Sequence[Program]) -> None:
 
 def _without_checkpoint(every: Sequence[Program]) -> list[Program]:
     return [x for x in every if checkpoint.latest(x.path / "checkpoints")[0] is None]
+
+
+def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:
+    """Return the states in a checkpoint, which training may delete meanwhile."""
+    for _ in range(5):
+        before = set(root.iterdir()) if root.is_dir() else set()
+        errors: list[str] = []
+        try:
+            if which == "best":
+                chosen = checkpoint.best(root)
+            else:
+                chosen, errors = checkpoint.latest(root)
+            if chosen is None:
+                scored = " with a score" if which == "best" else ""
+                raise ValueError(f"it has no whole checkpoint{scored}")
+            states = chosen.restore(like)
+        except (ValueError, OSError):
+            if all(path.exists() for path in before):
+                raise
+        else:
+            for error in errors:
+                print(f"warning: {error}", file=sys.stderr)
+            return states
+    raise ValueError(f"training deletes {root} sooner than it can be read: try again")
 
 
 def states_of(
