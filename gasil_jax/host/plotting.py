@@ -68,16 +68,8 @@ def draw_returns(
 ) -> None:
     """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
 
-    Args:
-      axes: where to draw; steps are in millions.
-      env_steps: (points,).
-      returns: (seeds, points).
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each, whose interquartile mean is dashed; None if there are none.
-      color: color of the line, the interval and the evaluations.
-      label: label in the legend.
-      evaluated: label of the evaluations.
-      style: style of the line.
+    Steps are (points,), and returns (seeds, points). "env_steps" and "mean" of the
+    evaluations are (seeds, evaluations); their interquartile mean is dashed.
     """
     if len(env_steps):
         steps, middle = env_steps / 1e6, interquartile_mean(returns, axis=0)
@@ -133,13 +125,8 @@ def learning_curve(
 ) -> None:
     """Save the returns over environment steps as a PNG: all seeds, mean and interval.
 
-    Args:
-      path: the image file.
-      env_steps: (iterations,).
-      episode_return: (seeds, iterations); NaN where no episode ended.
-      title: title of the plot.
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each; None if there are none.
+    Steps are (iterations,), and returns (seeds, iterations), NaN where no episode
+    ended; evaluations are as in `draw_returns`.
     """
     from matplotlib.figure import Figure
 
@@ -165,13 +152,9 @@ def final_returns(
     *,
     best: int | None,
 ) -> None:
-    """Save every seed's final return and their mean, in a row for each point.
+    """Save every seed's final return, (points, seeds), and their mean, row by row.
 
-    Args:
-      path: the image file.
-      labels: the name of each point.
-      returns: (points, seeds).
-      best: index of the best point by mean, which is marked; None if there is none.
+    The best point by mean is marked, if there is one.
     """
     from matplotlib.figure import Figure
 
@@ -212,7 +195,7 @@ def marginals(
       path: the image file.
       values: each point's value of every hyperparameter that varies, by name.
       returns: each point's mean final return, (points,), all finite.
-      best: index of the point that is marked as the best; None for none.
+      best: index of the point that is marked.
       left_out: number of points without a return, which are not among these.
     """
     from matplotlib.figure import Figure
