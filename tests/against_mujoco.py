@@ -74,7 +74,12 @@ def of_c(model, qpos, qvel, control, steps, fields=()):
     state = np.concatenate([data.qpos, data.qvel])
     if warned:
         state[:] = np.nan
-    return state, {name: getattr(data, name).copy() for name in fields}
+    found = {name: getattr(data, name).copy() for name in fields}
+    # What they are rounded to: a force is no more exact than those that it balances.
+    largest = {name: np.abs(x).max(initial=1.0) for name, x in found.items()}
+    forces = np.abs(data.qfrc_smooth).max(initial=1.0)
+    largest |= {x: max(largest[x], forces) for x in largest if x == "qfrc_constraint"}
+    return state, {name: (x, largest[name]) for name, x in found.items()}
 
 
 @dataclasses.dataclass
@@ -133,8 +138,7 @@ def compare(
             if not np.isfinite(right).all():
                 continue  # C itself fails.
             own_error = relative(ours_[k], right, unit)
-            for name, x in right_fields.items():
-                size = max(1.0, np.abs(x).max(initial=0.0))
+            for name, (x, size) in right_fields.items():
                 own_error = max(
                     own_error, relative(of_fields[name][..., k] / size, x / size)
                 )
