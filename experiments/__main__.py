@@ -37,6 +37,8 @@ COMMANDS: Mapping[str, ModuleType] = {
     "zoo": zoo,
     "doing_nothing": doing_nothing,
 }
+#: Environment steps of each run of `--quick`.
+_QUICK_STEPS = 100_000
 
 
 def _parser(name: str) -> Parser:
@@ -128,13 +130,20 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
         if search := curve.search:
             base = "scaled" if search.decompose_rewards else "tuned"
             base = "paper" if isinstance(search, PaperSearch) else base
-        return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
+        return dataclasses.replace(curve, base=base, seeds=3, total_steps=_QUICK_STEPS)
 
     panels = {
         panel: {name: small(curve) for name, curve in curves.items()}
         for panel, curves in selected.panels.items()
     }
-    return dataclasses.replace(figure, panels=panels, searches={})
+    comparisons = figure.comparisons and {
+        names: terms
+        for names, terms in figure.comparisons.items()
+        if all(panel in panels for _, panel, _ in terms)
+    }
+    return dataclasses.replace(
+        figure, panels=panels, searches={}, comparisons=comparisons
+    )
 
 
 def _train(name: str, options: Options) -> None:

@@ -1,6 +1,5 @@
 """Turn training states and saved policies into JAX functions."""
 
-import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -60,30 +59,8 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
     return arrays
 
 
-def load_policy(
-    path: str | pathlib.Path, seed: int | None = None
-) -> Callable[..., jax.Array]:
-    """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
-
-    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
-    float32. It clips actions to their range. Without a key the action is the policy's
-    mean, or that of a mixture's most probable Gaussian; with a key it is drawn from the
-    policy. The key is consumed. Discrete actions are int32 (...), without a key the
-    most probable ones.
-
-    Args:
-      path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
-        the policies that come with the package.
-      seed: number of the seed; default the one with the highest final return.
-
-    Raises:
-      ValueError: if it is not a saved policy, or has no such seed.
-    """
-    return make(numpy_policy.read(path, seed))
-
-
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """Return the policy of a single `TrainState`, as `load_policy` does for a file.
+    """Return the policy of a single `TrainState`, as `saved.load_policy` does.
 
     Raises:
       ValueError: if it is a batch of states, or none.
@@ -93,7 +70,7 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
 
 
 def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
-    """Return the policy with these arrays, as `load_policy` does for a file."""
+    """Return the policy with these arrays, as `saved.load_policy` does."""
 
     def float32(x: Any) -> jax.Array:
         return jnp.asarray(x, jnp.float32)

@@ -44,11 +44,9 @@ Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
 Rows = Mapping[tuple[str, str], Overrides]
 
-
-#: File of the settings that searches chose: by "dense", "delayed", "paper dense" or
-#: "paper delayed"; then by environment; then by agent.
-#: `python -m experiments report` writes the rows of complete searches and leaves the
-#: others as they are.
+#: The settings that searches chose: by "dense", "delayed", "paper dense" or "paper
+#: delayed"; then by environment; then by agent. `python -m experiments report` writes
+#: the rows of complete searches, and leaves the others as they are.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
@@ -92,19 +90,15 @@ _GYMNAX = {
 }
 
 
-def _searched(rewards: str) -> Rows:
-    """Return the rows that searches chose."""
-    return {
-        (env, agent): row
-        for env, agents in _CHOSEN.get(rewards, {}).items()
-        for agent, row in agents.items()
-    }
-
-
-def _tuned(rewards: str, adaptive: Overrides) -> Rows:
+def _searched(rewards: str, adaptive: Overrides | None = None) -> Rows:
     """Return the rows that searches chose, and adaptive imitation's elsewhere."""
-    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in ACTION_SIZES}
-    return {**rows, **_searched(rewards)}
+    tasks = ACTION_SIZES if adaptive is not None else ()
+    rows: dict[tuple[str, str], Any] = {
+        (env, "ppo+gasil-adaptive"): adaptive for env in tasks
+    }
+    for env, agents in _CHOSEN.get(rewards, {}).items():
+        rows |= {(env, agent): row for agent, row in agents.items()}
+    return rows
 
 
 def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
@@ -154,7 +148,9 @@ class Preset(NamedTuple):
 
 
 PRESETS: Mapping[str, Preset] = {
-    "tuned": Preset(_tuned("dense", _ADAPTIVE), _tuned("delayed", ADAPTIVE_DELAYED)),
+    "tuned": Preset(
+        _searched("dense", _ADAPTIVE), _searched("delayed", ADAPTIVE_DELAYED)
+    ),
     "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
@@ -227,6 +223,7 @@ def preset(
     if name == "scaled" and kind.name == "ppo" and action_size is not None:
         row = scaled(action_size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
+    rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and (name, kind.name) == ("scaled", "ppo"):
         raise ValueError(
@@ -234,25 +231,14 @@ def preset(
             "actions, which is env.action_size"
         )
     if lacking is not None and name != DEFAULT:
-        raise ValueError(f"{lacking}: it has {_listed(_rows(name, reward_delay))}")
-    row = _rows(name, reward_delay).get((env, kind.name), {})
+        tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
+        raise ValueError(f"{lacking}: it has {agents} on {tasks}")
+    row = rows.get((env, kind.name), {})
     return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
-def _listed(rows: Rows) -> str:
-    """Return the agents and environments of rows in words."""
-    by_agent: dict[str, list[str]] = {}
-    for env, agent in rows:
-        by_agent.setdefault(agent, []).append(env)
-    words = [f"{agent} on {', '.join(envs)}" for agent, envs in by_agent.items()]
-    return "; ".join(words)
-
-
 def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str | None:
-    """Return in words that a preset changes no default for an agent on a task.
-
-    The result is None if the preset changes any.
-    """
+    """Return in words that a preset has nothing for an agent on a task, or None."""
     if PRESETS[name].every or (env, agent) in _rows(name, reward_delay):
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"

@@ -114,11 +114,10 @@ def init(
         arXiv 2511.21011).
     """
     keys = jax.random.split(key, num_envs + 1)
-    reset_keys, age_key = keys[:-1], keys[-1]
-    state = jax.vmap(env.reset)(reset_keys)
+    state = jax.vmap(env.reset)(keys[:-1])
     starting_age = jnp.zeros(num_envs, jnp.int32)
     if age_limit is not None:
-        starting_age = jax.random.randint(age_key, (num_envs,), 0, age_limit)
+        starting_age = jax.random.randint(keys[-1], (num_envs,), 0, age_limit)
     # A weak type in the first state alone would make JAX compile everything twice.
     state = jax.tree.map(lambda x: _cast(x, jnp.asarray(x).dtype), state)
     # Each field needs its own array: a shared one could not be donated.
@@ -134,7 +133,7 @@ def init(
 
 
 def _restart_all(env: Any, states: Any, ended: jax.Array, *, keys: jax.Array) -> Any:
-    """Return the states (env, ...), in place of those that ended new ones."""
+    """Return the states (env, ...) with a new episode where one has ended."""
 
     def select(new: jax.Array, old: jax.Array) -> jax.Array:
         is_new = ended.reshape((-1,) + (1,) * (old.ndim - 1))
@@ -146,7 +145,7 @@ def _restart_all(env: Any, states: Any, ended: jax.Array, *, keys: jax.Array) ->
 def _restart_few(env: Any, states: Any, ended: jax.Array, *, keys: jax.Array) -> Any:
     """Do what `_restart_all` does, but reset an eighth of the environments at a time.
 
-    Few episodes end in a step. Where a reset takes as long as a step, to reset all
+    Few episodes end in a step. Where a reset takes as long as a step, resets of all
     environments would take a third of the time; where it is fast, this is slower.
     """
     num_envs = ended.shape[0]
@@ -205,7 +204,6 @@ def collect(
     """
     num_envs = environments.episode_length.shape[0]
     low, high = wrappers.action_range(env)
-
     restart = _restart_few if wrappers.resets_slowly(env) else _restart_all
 
     @jax.named_scope("environment")

@@ -3,8 +3,10 @@
 import collections
 import contextlib
 import dataclasses
+import logging
 import sys
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 from generated_models import draw
 from plain_numpy import Program
 
-from gasil_envs.physics import dynamics, newton_batch, ours
+from gasil_envs.physics import dynamics, mjx, newton_batch, ours
 from gasil_envs.physics.interface import PhysicsState
 
 
@@ -31,17 +33,34 @@ def tight(model):
     return model
 
 
+def units(model):
+    """Return the size of a typical change of qpos and qvel.
+
+    It is 1 for angles, and for lengths some ten times that of a body, but 1 at most.
+    """
+    length = min(1.0, 20 * model.stat.meansize)
+    of_qpos, of_qvel = np.ones(model.nq), np.ones(model.nv)
+    for joint in range(model.njnt):
+        kind = model.jnt_type[joint]
+        width = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_SLIDE: 1}
+        for x, first in ((of_qpos, model.jnt_qposadr), (of_qvel, model.jnt_dofadr)):
+            x[first[joint] : first[joint] + width.get(kind, 0)] = length
+    return of_qpos, of_qvel
+
+
 def starts(model, count, seed=0, scale=0.1):
     """Return positions, velocities and controls, (count, ...) each."""
     rng = np.random.default_rng(seed)
-    qpos = model.qpos0 + scale * rng.normal(size=(count, model.nq))
+    of_qpos, of_qvel = units(model)
+    qpos = model.qpos0 + scale * of_qpos * rng.normal(size=(count, model.nq))
     for row in qpos:
         mujoco.mj_normalizeQuat(model, row)
     low, high = np.where(
         model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]
     ).T
     control = rng.uniform(low, high, (count, model.nu))
-    return qpos, 5 * scale * rng.normal(size=(count, model.nv)), control
+    qvel = 5 * scale * of_qvel * rng.normal(size=(count, model.nv))
+    return qpos, qvel, control
 
 
 def of_c(model, qpos, qvel, control, steps, fields=()):
@@ -60,7 +79,7 @@ def of_c(model, qpos, qvel, control, steps, fields=()):
 
 @dataclasses.dataclass
 class Difference:
-    """Errors, max |a - b| / (1 + |b|), of a model's states after a number of steps."""
+    """Errors, max |a - b| / (unit + |b|), of a model's states after some steps."""
 
     steps: int
     error: np.ndarray
@@ -74,32 +93,26 @@ class Difference:
         return float(np.max(error, initial=0.0))
 
 
-def relative(a, b):
-    return float(np.max(np.abs(a - b) / (1 + np.abs(b)), initial=0.0))
+def relative(a, b, unit=1.0):
+    return float(np.max(np.abs(a - b) / (unit + np.abs(b)), initial=0.0))
 
 
-def compare(model, count=4, seed=0, *, fields=(), steps=(1, 50), dtype=np.float32):
+def compare(
+    model, count=4, seed=0, *, fields=(), steps=(1, 50), dtype=np.float32, engine=None
+):
     """Return the differences of our physics after each number of steps.
 
     Those after the first also count the fields, relative to the largest of each.
+    `engine` is another one: (state, control) -> state and fields, of batches that are
+    last.
     """
-    own = dynamics.make(model, fields, 100, 30)
+    own = None if engine else dynamics.make(model, fields, 100, 30)
+    advance = engine or (lambda state, control: dynamics.step(own, state, control, 1))
     qpos, qvel, control = starts(model, count, seed)
     state = PhysicsState(qpos.T, qvel.T, 0 * qvel.T)
-    single = jnp.zeros((0,))
-    del single
-    float32 = PhysicsState(
-        *(
-            jnp.asarray(x, jnp.float32)
-            for x in (state.qpos, state.qvel, state.qacc_warmstart)
-        )
-    )
+    single = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (state, control.T))
     with _products_at_once():
-        step = Program(
-            lambda state, control: dynamics.step(own, state, control, 1),
-            float32,
-            jnp.asarray(control.T, jnp.float32),
-        )
+        step = Program(advance, *single)
     rounded = [x.astype(np.float32).astype(np.float64) for x in (qpos, qvel, control)]
     results, of_fields = [], {}
     for i in range(steps[-1]):
@@ -108,7 +121,8 @@ def compare(model, count=4, seed=0, *, fields=(), steps=(1, 50), dtype=np.float3
             of_fields = seen
         if i + 1 in steps:
             results.append((i + 1, np.concatenate([state.qpos, state.qvel]).T))
-    rng = np.random.default_rng(1)
+    rng, (of_qpos, of_qvel) = np.random.default_rng(1), units(model)
+    unit = np.concatenate([of_qpos, of_qvel])
     differences = []
     for number, ours_ in results:
         error, sensitivity = [], []
@@ -118,24 +132,22 @@ def compare(model, count=4, seed=0, *, fields=(), steps=(1, 50), dtype=np.float3
             )
             if not np.isfinite(right).all():
                 continue  # C itself fails.
-            own_error = relative(ours_[k], right)
-            if number == 1:
-                for name, x in right_fields.items():
-                    size = max(1.0, np.abs(x).max(initial=0.0))
-                    own_error = max(
-                        own_error, relative(of_fields[name][..., k] / size, x / size)
-                    )
+            own_error = relative(ours_[k], right, unit)
+            for name, x in right_fields.items():
+                size = max(1.0, np.abs(x).max(initial=0.0))
+                own_error = max(
+                    own_error, relative(of_fields[name][..., k] / size, x / size)
+                )
             error.append(own_error if np.isfinite(own_error) else np.inf)
             near = []
             for _ in range(2):
                 moved = [
                     x[k]
-                    + 1e-7 * np.sign(rng.normal(size=x[k].shape)) * (1 + np.abs(x[k]))
-                    for x in rounded[:2]
+                    + 1e-7 * np.sign(rng.normal(size=x[k].shape)) * (u + np.abs(x[k]))
+                    for x, u in zip(rounded, (of_qpos, of_qvel))
                 ]
-                near.append(
-                    relative(of_c(model, *moved, rounded[2][k], number)[0], right)
-                )
+                perturbed = of_c(model, *moved, rounded[2][k], number)[0]
+                near.append(relative(perturbed, right, unit))
             sensitivity.append(max(near))
         differences.append(Difference(number, np.array(error), np.array(sensitivity)))
     return differences
@@ -161,25 +173,52 @@ def why_not_ours(model, fields=()):
     return ours.unsupported(model, fields)
 
 
-def main(first, last):
-    """Compare generated models, and print those that differ without a reason."""
-    count = collections.Counter()
-    for seed in range(first, last):
+def of_mjx(model):
+    """Return MJX's step of a model; None if it refuses."""
+    try:
+        physics = mjx.MjxPhysics(model, (), 100, 30)
+    except mjx.Unsupported:
+        return None
+    return jax.vmap(lambda state, control: physics.step(state, control, 1), -1, -1)
+
+
+def judge(seed):
+    """Return what became of a generated model, and its differences if there are any."""
+    try:
         model = tight(load(draw(seed)))
-        why = why_not_ours(model)
-        if why is not None or not model.nv:
-            count["not ours" if why else "nothing moves"] += 1
-            continue
-        if ours.JaxPhysics(model).is_stiff:
-            count["stiff, which is told"] += 1
-            continue
+    except ValueError:
+        return "refused by MuJoCo", []
+    if not model.nv or model.nv > 40:
+        return "nothing moves", []
+    if why_not_ours(model) is None:
+        told = bool(ours.JaxPhysics(model).warnings)
         fields = dynamics.FIELDS if why_not_ours(model, dynamics.FIELDS) is None else ()
         differences = compare(model, 3, seed, fields=fields)
-        worst = max(x.excess for x in differences)
-        count["the same" if worst < 1e-4 else "different"] += 1
-        if worst >= 1e-4:
-            print(seed, *differences, flush=True)
-    print(dict(count))
+    else:
+        if mjx.differences(model):
+            return "MJX's, whose differences are told, or refused", []
+        told, engine = False, of_mjx(model)
+        if engine is None:
+            return "refused", []
+        differences = compare(model, 2, seed, steps=(1,), engine=engine)
+    whose = "ours" if why_not_ours(model) is None else "MJX's"
+    worst = max(x.excess for x in differences)
+    if worst < 1e-4:
+        return f"{whose}, the same", []
+    return f"{whose}, different, " + ("told" if told else "SILENT"), differences
+
+
+def main(first, last):
+    """Compare generated models, and print those that differ without a reason."""
+    logging.disable()
+    count = collections.Counter()
+    for seed in range(first, last):
+        what, differences = judge(seed)
+        count[what] += 1
+        if differences:
+            print(seed, what, *differences, flush=True)
+        if seed % 20 == 19 or seed == last - 1:
+            print(f"{first} to {seed}:", dict(count), flush=True)
 
 
 if __name__ == "__main__":

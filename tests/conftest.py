@@ -57,9 +57,9 @@ def pytest_collectstart():
 
     Not earlier: of several processes, one only hands out tests and needs no imports.
     """
-    from gasil_envs.physics import native
+    from gasil_envs.physics import host_threads
 
-    native.reserve_threads(2)
+    host_threads.reserve(2)
 
 
 def _is_optimized(item):

@@ -8,7 +8,8 @@ class Writer:
 
     def __init__(self, seed):
         self.rng = np.random.default_rng(seed)
-        self.scale = float(self.rng.choice([0.1, 0.1, 1.0, 1.0, 1.0, 1.0, 10.0]))
+        scales = [1e-3, 1e-2, 0.1, 0.1, *[1.0] * 6, 10.0, 100.0, 1000.0]
+        self.scale = float(self.rng.choice(scales))
         self.weight = float(self.rng.choice([1e-2, 1.0, 1.0, 1.0, 1e2]))
         self.joints, self.geoms, self.bodies, self.num_joints = [], [], [], 0
 
@@ -143,7 +144,7 @@ class Writer:
         self.bodies.append(name)
         pos = 0.3 * self.scale * self.rng.uniform(-1, 1, 3)
         if depth == 0:
-            far = self.scale * self.pick(0, 0, 0, 10)
+            far = self.scale * self.pick(0, 0, 0, 0, 0, 10, 10, 300)
             pos += np.array([far * self.rng.uniform(-1, 1), 0, 0.3 * self.scale])
         out = f'name="{name}" pos="{" ".join(f"{x:.4g}" for x in pos)}"'
         out += m(0.3, "euler", lambda: self.vector(90))

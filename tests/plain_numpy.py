@@ -5,6 +5,8 @@ could not be tried. What is traced is evaluated here, operation by operation, in
 or in float64.
 """
 
+import functools
+
 import jax
 import numpy as np
 from jax.extend.core import Literal
@@ -64,7 +66,7 @@ def _select(which, *cases):
 def _pad(x, value, *, padding_config):
     low_high = [(low, high) for low, high, inner in padding_config]
     if any(inner for *_, inner in padding_config) or np.min(low_high, initial=0) < 0:
-        raise KeyError
+        return np.asarray(jax.lax.pad(x, np.asarray(value, x.dtype), padding_config))
     return np.pad(x, low_high, constant_values=value)
 
 
@@ -104,6 +106,7 @@ _PRIMITIVES = {
     "squeeze": lambda x, *, dimensions: np.squeeze(x, tuple(dimensions)),
     "expand_dims": lambda x, *, dimensions: np.expand_dims(x, dimensions),
     "concatenate": lambda *xs, dimension: np.concatenate(xs, dimension),
+    "stack": lambda *xs, axis: np.stack(xs, axis),
     "slice": _slice,
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
@@ -128,7 +131,7 @@ _PRIMITIVES = {
 
 
 def _nested(eqn):
-    """Return the program that an operation is a call of."""
+    """Return the program that an operation is a call of, or None."""
     for name in ("jaxpr", "call_jaxpr", "fun_jaxpr", "call"):
         if name in eqn.params:
             return eqn.params[name]
@@ -136,109 +139,164 @@ def _nested(eqn):
 
 
 class Program:
-    """A traced function of arrays, to be evaluated in a floating-point type."""
+    """A traced function of arrays, to be evaluated in a floating-point type.
+
+    The operations are made into a list of Python functions once, calls of functions
+    among them, because to look at each again costs more than to compute it.
+    """
 
     def __init__(self, function, *arguments):
         closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
         self._closed, self._out = closed, jax.tree.structure(shape)
-        # By program and type; a program is kept, so that no other has its identity.
-        self._constants, self._keep = {}, []
+        self._compiled = {}
 
     def __call__(self, *arguments, dtype=np.float64):
-        self._dtype = dtype
-        leaves = [self._cast(x) for x in jax.tree.leaves(arguments)]
+        if dtype not in self._compiled:
+            self._compiled[dtype] = _Compiled(self._closed, np.dtype(dtype))
+        run = self._compiled[dtype]
+        leaves = [run.cast(x) for x in jax.tree.leaves(arguments)]
         with np.errstate(all="ignore"):
-            return jax.tree.unflatten(self._out, self._run(self._closed, leaves))
+            return jax.tree.unflatten(self._out, run(leaves))
 
-    def _cast(self, x):
+
+class _Compiled:
+    """A program as functions of numbered values."""
+
+    def __init__(self, closed, dtype):
+        self._dtype = dtype
+        self._values, self._steps = [], []
+        jaxpr = getattr(closed, "jaxpr", closed)
+        self._inputs = [self._new() for _ in jaxpr.invars]
+        self._outputs = self._inline(closed, self._inputs)
+
+    def cast(self, x):
         x = np.asarray(x)
         return x.astype(self._dtype) if x.dtype.kind == "f" else x
 
-    def _run(self, closed, arguments):
-        jaxpr = getattr(closed, "jaxpr", closed)
-        if (id(jaxpr), self._dtype) not in self._constants:
-            self._keep.append(jaxpr)
-            constants = dict(zip(jaxpr.constvars, getattr(closed, "consts", ())))
-            atoms = [x for eqn in jaxpr.eqns for x in eqn.invars]
-            for x in (*atoms, *jaxpr.outvars):
-                if isinstance(x, Literal):
-                    constants[id(x)] = x.val
-            self._constants[id(jaxpr), self._dtype] = {
-                name: self._cast(x) for name, x in constants.items()
-            }
-        values = dict(self._constants[id(jaxpr), self._dtype])
-        values.update(zip(jaxpr.invars, arguments))
+    def __call__(self, arguments):
+        values = self._values.copy()
+        for i, x in zip(self._inputs, arguments):
+            values[i] = x
+        for function, inputs, output in self._steps:
+            found = function(*[values[i] for i in inputs])
+            if type(output) is int:
+                values[output] = found
+            else:
+                for i, x in zip(output, found):
+                    values[i] = x
+        return [values[i] for i in self._outputs]
 
-        def read(x):
-            return values[id(x) if isinstance(x, Literal) else x]
+    def _new(self, value=None):
+        self._values.append(value)
+        return len(self._values) - 1
+
+    def _inline(self, closed, inputs):
+        """Add a program's operations, and return the numbers of its results."""
+        jaxpr = getattr(closed, "jaxpr", closed)
+        numbers = dict(zip(jaxpr.invars, inputs))
+        for name, x in zip(jaxpr.constvars, getattr(closed, "consts", ())):
+            numbers[name] = self._new(self.cast(x))
+
+        def number(x):
+            return self._new(self.cast(x.val)) if isinstance(x, Literal) else numbers[x]
 
         for eqn in jaxpr.eqns:
-            results = self._apply(eqn, [read(x) for x in eqn.invars])
-            values.update(zip(eqn.outvars, results))
-        return [read(x) for x in jaxpr.outvars]
+            given = [number(x) for x in eqn.invars]
+            numbers.update(zip(eqn.outvars, self._add(eqn, given)))
+        return [number(x) for x in jaxpr.outvars]
 
-    def _apply(self, eqn, arguments):
-        name, params = eqn.primitive.name, eqn.params
-        if name == "while":
-            return self._while(params, arguments)
-        if name == "scan":
-            return self._scan(params, arguments)
-        if name == "cond":
-            index = min(max(int(arguments[0]), 0), len(params["branches"]) - 1)
-            return self._run(params["branches"][index], arguments[1:])
+    def _add(self, eqn, given):
+        name = eqn.primitive.name
         if name == "optimization_barrier":
-            return arguments
+            return given
+        if name not in _PRIMITIVES and name not in _CONTROL and _nested(eqn):
+            return self._inline(_nested(eqn), given)
+        numbers = [self._new() for _ in eqn.outvars]
+        function = self._function(eqn)
+        alone = name in _PRIMITIVES or name in ("convert_element_type", "iota")
+        self._steps.append((function, given, numbers[0] if alone else numbers))
+        return numbers
+
+    def _function(self, eqn):
+        name, params = eqn.primitive.name, eqn.params
+        if name in _CONTROL:
+            return getattr(self, f"_{name}")(params)
+        kind = self._kind(eqn.outvars[0].aval.dtype) if eqn.outvars else None
         if name == "convert_element_type":
-            kind = np.dtype(params["new_dtype"])
-            return [np.asarray(arguments[0], self._dtype if kind.kind == "f" else kind)]
+            return lambda x: np.asarray(x, kind)
         if name == "iota":
             shape, axis = params["shape"], params["dimension"]
-            kind = np.dtype(params["dtype"])
-            line = np.arange(
-                shape[axis], dtype=self._dtype if kind.kind == "f" else kind
-            )
             middle = [1] * len(shape)
             middle[axis] = shape[axis]
-            return [np.broadcast_to(line.reshape(middle), shape)]
+            line = np.arange(shape[axis], dtype=kind).reshape(middle)
+            line = np.broadcast_to(line, shape)
+            return lambda: line
         if name in _PRIMITIVES:
-            try:
-                return [np.asarray(_PRIMITIVES[name](*arguments, **params))]
-            except KeyError:
-                pass
-        elif _nested(eqn) is not None:
-            nested = _nested(eqn)
-            return self._run(nested, arguments)
-        # Gather, scatter, sort, decompositions: as JAX does them.
-        given = [np.asarray(x, y.aval.dtype) for x, y in zip(arguments, eqn.invars)]
-        found = eqn.primitive.bind(*given, **params)
-        found = found if eqn.primitive.multiple_results else [found]
-        return [self._cast(x) for x in found]
+            return functools.partial(_PRIMITIVES[name], **params)
 
-    def _while(self, params, arguments):
+        # Scatter, sort, decompositions: as JAX does them.
+        types = [x.aval.dtype for x in eqn.invars]
+
+        def of_jax(*arguments):
+            given = [np.asarray(x, y) for x, y in zip(arguments, types)]
+            found = eqn.primitive.bind(*given, **params)
+            found = found if eqn.primitive.multiple_results else [found]
+            return [self.cast(x) for x in found]
+
+        return of_jax
+
+    def _kind(self, dtype):
+        return self._dtype if dtype.kind == "f" else dtype
+
+    def _while(self, params):
+        test, body = (
+            _Compiled(params[x], self._dtype) for x in ("cond_jaxpr", "body_jaxpr")
+        )
         split = np.cumsum([params["cond_nconsts"], params["body_nconsts"]])
-        of_test, of_body, carry = (
-            arguments[: split[0]],
-            arguments[split[0] : split[1]],
-            arguments[split[1] :],
-        )
-        while self._run(params["cond_jaxpr"], [*of_test, *carry])[0]:
-            carry = self._run(params["body_jaxpr"], [*of_body, *carry])
-        return carry
 
-    def _scan(self, params, arguments):
+        def run(*arguments):
+            of_test, of_body = arguments[: split[0]], arguments[split[0] : split[1]]
+            carry = arguments[split[1] :]
+            while (goes_on := test([*of_test, *carry])[0]).any():
+                following = body([*of_body, *carry])
+                if goes_on.ndim:  # Each of a batch ends by itself.
+                    following = [
+                        np.where(goes_on.reshape(-1, *(1,) * (x.ndim - 1)), x, y)
+                        for x, y in zip(following, carry)
+                    ]
+                carry = following
+            return carry
+
+        return run
+
+    def _cond(self, params):
+        branches = [_Compiled(x, self._dtype) for x in params["branches"]]
+
+        def run(index, *arguments):
+            return branches[min(max(int(index), 0), len(branches) - 1)](arguments)
+
+        return run
+
+    def _scan(self, params):
         first, last = params["num_consts"], params["num_consts"] + params["num_carry"]
-        constants, carry, rows = (
-            arguments[:first],
-            arguments[first:last],
-            arguments[last:],
-        )
-        outputs = []
-        order = range(params["length"])
-        for i in reversed(order) if params["reverse"] else order:
-            found = self._run(
-                params["jaxpr"], [*constants, *carry, *(x[i] for x in rows)]
+        body = _Compiled(params["jaxpr"], self._dtype)
+        order = range(params["length"])[:: -1 if params["reverse"] else 1]
+
+        def run(*arguments):
+            constants, carry, rows = (
+                arguments[:first],
+                arguments[first:last],
+                arguments[last:],
             )
-            carry = found[: params["num_carry"]]
-            outputs.append(found[params["num_carry"] :])
-        outputs = outputs[::-1] if params["reverse"] else outputs
-        return [*carry, *(np.stack(x) for x in zip(*outputs))]
+            outputs = []
+            for i in order:
+                found = body([*constants, *carry, *(x[i] for x in rows)])
+                carry = found[: last - first]
+                outputs.append(found[last - first :])
+            outputs = outputs[:: -1 if params["reverse"] else 1]
+            return [*carry, *(np.stack(x) for x in zip(*outputs))]
+
+        return run
+
+
+_CONTROL = ("while", "cond", "scan")

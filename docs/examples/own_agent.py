@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 import gasil_jax
-from gasil_jax import normalization
+from gasil_jax import buffer, normalization
 from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.config import number
 
@@ -35,7 +35,7 @@ class Nearest(BufferedAgent):
             observation = normalization.normalize(context.normalizer, observation)
             return jnp.concatenate([observation, action], axis=-1)
 
-        good = pairs(*self.sample(state, key, 256))
+        good = pairs(*buffer.sample(key, state, 256))
         own = pairs(context.rollout.observation, context.rollout.action)
         squares = jnp.sum((own[:, :, None] - good) ** 2, axis=-1)  # (time, env, 256)
         closeness = jnp.exp(-jnp.sqrt(jnp.min(squares, axis=-1)))

@@ -6,12 +6,12 @@ reward, termination, start and frame skip are those of ``gymnasium.envs.mujoco.*
 """
 
 import dataclasses
+import importlib.util
 import pathlib
 import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -113,8 +113,11 @@ class Task:
     episode_length: int = 1000
 
 
+# Found without importing it, which takes as long as all of our own modules.
+_gymnasium = importlib.util.find_spec("gymnasium")
+assert _gymnasium is not None and _gymnasium.origin is not None  # A dependency.
 #: The folder of Gymnasium's models.
-ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+ASSETS = pathlib.Path(_gymnasium.origin).parent / "envs/mujoco/assets"
 
 
 def _torso_position(model: mujoco.MjModel, fields: Fields) -> jax.Array:
@@ -567,7 +570,8 @@ class Locomotion(Env):
     def reset(self, rng: jax.Array) -> State:
         """Start as the task says, or at rest with noise on positions and velocities."""
         if self.task.start is not None:
-            return self.state_at(*self.task.start(rng))
+            qpos, qvel = self.task.start(rng)
+            return self.state_at(_with_unit_quaternions(self.model, qpos), qvel)
         scale = self.task.reset_noise
         position_key, velocity_key = jax.random.split(rng)
         noise = jax.random.uniform(

@@ -1,10 +1,17 @@
 """The environments of ``brax.envs`` by name, as brax:NAME."""
 
-import brax.envs
+import contextlib
+import io
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 
-from gasil_envs.base import Env, Wrapper
+# MJX, which Brax imports, prints that its optional Warp backend is absent.
+with contextlib.redirect_stdout(io.StringIO()):
+    import brax.envs
+
+from gasil_envs.base import Wrapper
 
 
 class _OfBrax(Wrapper):
@@ -13,7 +20,7 @@ class _OfBrax(Wrapper):
     Brax runs a reset, operation by operation, each time that it is asked for the size.
     """
 
-    def __init__(self, env: Env, observation_size: int):
+    def __init__(self, env: Any, observation_size: int):
         super().__init__(env)
         self._observation_size = observation_size
 
@@ -28,7 +35,7 @@ def names() -> tuple[str, ...]:
     return tuple(brax.envs._envs)
 
 
-def build(name: str) -> Env:
+def build(name: str) -> Any:
     """Build an environment of Brax, and trace a step without running it."""
     env = brax.envs.get_environment(name)
     state = jax.eval_shape(env.reset, jax.random.key(0))

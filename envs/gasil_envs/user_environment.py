@@ -52,6 +52,8 @@ def find(name: str) -> Callable[[], Env]:
 def build(name: str) -> Env:
     """Build and check the environment that MODULE:NAME names, without running it.
 
+    If its actions are far from -1 to 1, it gets them in these units.
+
     Raises:
       ValueError: if it can't be built or does not have Brax's interface.
     """
@@ -64,7 +66,16 @@ def build(name: str) -> Env:
         raise ValueError(f"env {name!r} is no environment: it has no {lacking}")
     # `registry.make` wraps it in an `EpisodeLimit`, which adds fields to its states.
     check(name, env, wrappers.EpisodeLimit(env, 1))
-    return env
+    return env if _is_scaled(env) else wrappers.UnitActions(env)
+
+
+def _is_scaled(env: Env) -> bool:
+    """Whether noise of deviation 1 on actions near 0 explores their range."""
+    if wrappers.is_discrete(env):
+        return True
+    low, high = (np.asarray(x, np.float32) for x in wrappers.action_range(env))
+    half = 0.5 * (high - low)
+    return bool(np.all((half <= 10) & (half >= 0.1) & (low <= 0) & (high >= 0)))
 
 
 def check(name: str, env: Any, trained: Any) -> None:
@@ -96,6 +107,12 @@ def check(name: str, env: Any, trained: Any) -> None:
     if hasattr(env, "episode_length"):
         _check_count(name, "episode_length", env.episode_length)
     _check_action_range(name, env)
+    if trained is env and not _is_scaled(env):
+        _LOGGER.warning(
+            "env %r has actions far from -1 to 1, which an untrained policy's are: "
+            "wrap it in gasil_envs.wrappers.UnitActions",
+            name,
+        )
     _check_states(name, env, trained)
 
 
@@ -118,15 +135,6 @@ def _check_action_range(name: str, env: Env) -> None:
         raise ValueError(
             f"env {name!r} has action_range {given!r}: it must be the lowest and the "
             "highest action, each a number or one for each dimension"
-        )
-    half = 0.5 * (high - low)
-    if np.any((half > 10) | (half < 0.1)):
-        _LOGGER.warning(
-            "env %r has actions from %.4g to %.4g, and an untrained policy's have "
-            "standard deviation 1: scale them to some -1 to 1, or set --initial-std",
-            name,
-            low.min(),
-            high.max(),
         )
 
 

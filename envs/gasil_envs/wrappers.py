@@ -10,8 +10,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gasil_envs.base import Env, PipelineEnv, State, Wrapper
+from gasil_envs.base import Env, State, Wrapper
 
 #: C MuJoCo's mjMAXVAL: a larger number means that the simulation has failed.
 _LARGEST = 1e10
@@ -74,7 +75,7 @@ def zero_action(env: Any) -> jax.Array:
 
 def resets_slowly(env: Any) -> bool:
     """Return whether a reset takes about as long as a step: with Brax's own physics."""
-    return isinstance(getattr(env, "unwrapped", env), PipelineEnv)
+    return hasattr(env, "pipeline_init")
 
 
 def _refuse_taken(state: State, *names: str) -> None:
@@ -115,6 +116,25 @@ class ActionNoise(Wrapper):
             action = action + self._scale * 0.5 * (high - low) * noise
         info = {**state.info, "action_noise_key": key}
         return self.env.step(state.replace(info=info), action)
+
+
+class UnitActions(Wrapper):
+    """Make -1 and 1 the lowest and the highest action of an environment.
+
+    An untrained policy's actions have some deviation 1, which explores no range that is
+    much wider, and only the ends of one that is much narrower.
+    """
+
+    action_range = (-1.0, 1.0)
+
+    def __init__(self, env: Any):
+        super().__init__(env)
+        low, high = (np.asarray(x, np.float32) for x in action_range(env))
+        self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take a step with the action in the environment's own units."""
+        return self.env.step(state, self._middle + self._half * action)
 
 
 class EpisodeLimit(Wrapper):

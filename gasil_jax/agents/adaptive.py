@@ -16,8 +16,7 @@ Standardized advantages have no unit, so there is no alpha to tune. The weight w
   latest episodes, both discounted as the buffer ranks them: imitation counts more, the
   better the buffer is than the policy.
 
-`imitation_rule` names the factors that are used. While the buffer is empty, w
-is 0.
+`imitation_rule` names the factors that are used. While the buffer is empty, w is 0.
 """
 
 from collections.abc import Callable, Mapping
@@ -93,20 +92,10 @@ def follow_return(
     return jnp.where(count > 0, moved, policy_return), has_episodes | (count > 0)
 
 
-def correlation(advantages: jax.Array) -> jax.Array:
-    """Return the correlation of two standardized advantages (time, env, 2), ()."""
-    return jnp.mean(advantages[..., 0] * advantages[..., 1])
-
-
 def gap(good_return: jax.Array, policy_return: jax.Array) -> jax.Array:
     """Return how much better the buffer is than the policy, from 0 to 1, ()."""
     spread = _FULL_GAP * jnp.abs(good_return) + 1e-8
     return jnp.clip((good_return - policy_return) / spread, 0.0, 1.0)
-
-
-def mix(advantages: jax.Array, weight: jax.Array | float) -> jax.Array:
-    """Return (1 - w) A_r + w A_b of advantages (time, env, 2): (time, env)."""
-    return (1.0 - weight) * advantages[..., 0] + weight * advantages[..., 1]
 
 
 class PPOGASILAdaptive(SelfImitatingAgent):
@@ -155,6 +144,7 @@ class PPOGASILAdaptive(SelfImitatingAgent):
             return_=self.ranked_by(batch),
         )
         metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
+        metrics |= self.buffer_metrics(state.buffer)
         normalized = reward_normalization.normalize(
             normalizer, bonus, reward_normalization.CLIP
         )
@@ -165,22 +155,21 @@ class PPOGASILAdaptive(SelfImitatingAgent):
             policy_return=policy_return,
             has_episodes=has_episodes,
         )
-        return state, streams, {**metrics, **self.buffer_metrics(state.buffer)}
+        return state, streams, metrics
 
     def mix(
         self, state: Adaptive, advantages: jax.Array, context: Context
     ) -> tuple[jax.Array, Metrics]:
-        advantage_correlation = correlation(advantages)
-        good_return = mean_return(state.buffer)
-        return_gap = gap(good_return, state.policy_return)
-        factor = RULES[self.imitation_rule](
-            jnp.maximum(advantage_correlation, 0.0), return_gap
-        )
+        reward, bonus = advantages[..., 0], advantages[..., 1]
+        # They are standardized, so this is their correlation.
+        agreement = jnp.mean(reward * bonus)
+        return_gap = gap(mean_return(state.buffer), state.policy_return)
+        factor = RULES[self.imitation_rule](jnp.maximum(agreement, 0.0), return_gap)
         weight = self.imitation_weight * factor
         weight = jnp.where(state.buffer.size > 0, weight, 0.0)
         metrics = {
             "imitation_weight": weight,
-            "advantage_correlation": advantage_correlation,
+            "advantage_correlation": agreement,
             "return_gap": return_gap,
         }
-        return mix(advantages, weight), metrics
+        return (1.0 - weight) * reward + weight * bonus, metrics

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from gasil_jax import buffer as good_trajectories
 from gasil_jax import learner, normalization
 from gasil_jax.agents import expert
 from gasil_jax.agents.buffered import BufferedAgent
@@ -41,18 +42,12 @@ def softplus_bonus(logit: jax.Array) -> jax.Array:
 
 
 def logit_bonus(logit: jax.Array) -> jax.Array:
-    """Return log(1 - D) - log D (AIRL, Fu et al. 2018): positive or negative.
-
-    It is 0 where D is 1/2, so it favours neither long nor short episodes.
-    """
+    """Return log(1 - D) - log D (AIRL, Fu et al. 2018), which is 0 where D is 1/2."""
     return -logit
 
 
 def centered_bonus(logit: jax.Array) -> jax.Array:
-    """Return -log D minus its mean over the batch: positive or negative.
-
-    An average step gets 0, so it favours neither long nor short episodes.
-    """
+    """Return -log D minus its mean over the batch: an average step gets 0."""
     softplus = softplus_bonus(logit)
     return softplus - jnp.mean(softplus)
 
@@ -175,46 +170,13 @@ class AdversarialAgent(Agent):
         bonus = BONUSES[self.bonus](self.logit(discriminator.params, *pairs))
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
 
-    def discriminator(self, state: Any) -> Learner:
-        """Return the discriminator in a state."""
-        return state.discriminator
-
-    def reward(
-        self, state: Any, normalizer: Normalizer
-    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
-        """Return the bonus without alpha as a function of observation and action.
-
-        The function is (..., obs), (..., action) -> (...).
-
-        Args:
-          state: the agent's state.
-          normalizer: the normalizer of observations.
-
-        Raises:
-          ValueError: if the bonus of a step depends on the batch that it is in.
-        """
-        if self.bonus == "centered":
-            raise ValueError(
-                f"bonus is {self.bonus!r}: the reward of a step then depends on the "
-                "batch that it is in"
-            )
-        params = self.discriminator(state).params
-
-        def reward(observation: jax.Array, action: jax.Array) -> jax.Array:
-            return BONUSES[self.bonus](
-                self.logit(params, normalizer, observation, action)
-            )
-
-        return reward
-
     def _train(
         self, discriminator: Learner, source: Source, context: Context, key: jax.Array
     ) -> tuple[Learner, Metrics]:
         """Take gradient steps on the discriminator, if the source is ready."""
-        batch, normalizer = context.rollout, context.normalizer
-        observation = batch.observation.reshape(-1, batch.observation.shape[-1])
-        action = batch.action.reshape(-1, batch.action.shape[-1])
-        minibatch_size = self.discriminator_minibatch_size
+        normalizer, size = context.normalizer, self.discriminator_minibatch_size
+        steps = (context.rollout.observation, context.rollout.action)
+        pairs = jax.tree.map(lambda x: x.reshape(-1, x.shape[-1]), steps)
 
         def objective(params: Any, policy_pairs: Any, good_pairs: Any) -> Any:
             return loss(
@@ -225,13 +187,11 @@ class AdversarialAgent(Agent):
 
         def step(discriminator: Learner, key: jax.Array) -> Any:
             policy_key, good_key = jax.random.split(key)
-            rows = jax.random.randint(
-                policy_key, (minibatch_size,), 0, observation.shape[0]
-            )
+            rows = jax.random.randint(policy_key, (size,), 0, pairs[0].shape[0])
             gradient, metrics = jax.grad(objective, has_aux=True)(
                 discriminator.params,
-                (observation[rows], action[rows]),
-                source.sample(good_key, minibatch_size),
+                jax.tree.map(lambda x: x[rows], pairs),
+                source.sample(good_key, size),
             )
             stepped = learner.descend(
                 discriminator,
@@ -248,6 +208,29 @@ class AdversarialAgent(Agent):
             for name, value in metrics.items()
         }
         return learner.select(source.is_ready, trained, discriminator), metrics
+
+    def discriminator(self, state: Any) -> Learner:
+        """Return the discriminator in a state."""
+        return state.discriminator
+
+    def reward(
+        self, state: Any, normalizer: Normalizer
+    ) -> Callable[[jax.Array, jax.Array], jax.Array]:
+        """Return the bonus without alpha as a function of observation and action.
+
+        The function is (..., obs), (..., action) -> (...). The normalizer is that of
+        observations.
+
+        Raises:
+          ValueError: if the bonus of a step depends on the batch that it is in.
+        """
+        if self.bonus == "centered":
+            raise ValueError(
+                f"bonus is {self.bonus!r}: the reward of a step then depends on the "
+                "batch that it is in"
+            )
+        params, form = self.discriminator(state).params, BONUSES[self.bonus]
+        return lambda *pair: form(self.logit(params, normalizer, *pair))
 
 
 class ShapedRewardAgent(AdversarialAgent):
@@ -266,10 +249,9 @@ class ShapedRewardAgent(AdversarialAgent):
 
     def shape(self, context: Context, bonus: jax.Array) -> tuple[jax.Array, Metrics]:
         """Return the rewards that PPO maximizes, (time, env), and metrics."""
-        shaped = self.alpha * bonus
-        metrics = {"bonus": jnp.mean(shaped), "bonus_std": jnp.std(shaped)}
-        reward = context.rollout.reward
-        return (reward + shaped if self.uses_reward else shaped), metrics
+        bonus = self.alpha * bonus
+        reward = context.rollout.reward + bonus if self.uses_reward else bonus
+        return reward, {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
 
 
 class SelfImitation(struct.PyTreeNode):
@@ -297,8 +279,7 @@ class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
     def source(self, buffer: GoodTrajectories) -> Source:
         """Return the buffer as the source of what the policy imitates."""
         return Source(
-            lambda key, num_samples: self.sample(buffer, key, num_samples),
-            buffer.size > 0,
+            lambda key, n: good_trajectories.sample(key, buffer, n), buffer.size > 0
         )
 
 

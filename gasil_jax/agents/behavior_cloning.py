@@ -13,7 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gasil_jax import learner, normalization, ppo
+from gasil_jax import buffer, learner, normalization, ppo
 from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import count, number
@@ -51,8 +51,8 @@ class PPOBC(BufferedAgent):
             return self.behavior_cloning_coefficient * value, value
 
         def step(policy: Learner, key: jax.Array) -> Any:
-            observation, action = self.sample(
-                state, key, self.behavior_cloning_minibatch_size
+            observation, action = buffer.sample(
+                key, state, self.behavior_cloning_minibatch_size
             )
             observation = normalization.normalize(context.normalizer, observation)
             gradient, value = jax.grad(objective, has_aux=True)(

@@ -23,9 +23,6 @@ class BufferedAgent(Agent):
         its capacity in steps; None for no limit.
       buffer_discounts: whether the good-trajectory buffer ranks episodes by their
         discounted return, as the paper does; otherwise by the undiscounted one.
-      sample_by_return: whether good steps are drawn with weights exp(R / s), with R the
-        return of their episode and s its standard deviation over the buffer's steps;
-        otherwise uniformly.
     """
 
     history_episodes: ClassVar[int] = 1
@@ -33,7 +30,6 @@ class BufferedAgent(Agent):
     buffer_steps: int = count(1000)
     buffer_episodes: int | None = count(None)
     buffer_discounts: bool = switch(True)
-    sample_by_return: bool = switch(False)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
         return self.init_buffer(sizes)
@@ -70,19 +66,13 @@ class BufferedAgent(Agent):
         """
         batch, history = context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.
-        episodes = good_trajectories.ended_episodes(
-            history, batch.ended, return_, length=batch.episode_length
-        )
         return good_trajectories.insert(
-            buffer, history, episodes, max_episodes=self.buffer_episodes
-        )
-
-    def sample(
-        self, buffer: GoodTrajectories, key: jax.Array, num_samples: int
-    ) -> tuple[jax.Array, jax.Array]:
-        """Draw good observations (samples, obs) and actions (samples, action)."""
-        return good_trajectories.sample(
-            key, buffer, num_samples, by_return=self.sample_by_return
+            buffer,
+            history,
+            batch.ended,
+            return_,
+            length=batch.episode_length,
+            max_episodes=self.buffer_episodes,
         )
 
     def buffer_metrics(self, buffer: GoodTrajectories) -> Metrics:

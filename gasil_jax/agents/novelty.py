@@ -30,8 +30,8 @@ from gasil_jax.config import number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
 
-# The number of counters (a hash maps cells to counters, so cells may share one), and of
-# random directions. The primes, one per direction, are the multipliers of the hash.
+# The numbers of counters, which cells of the same hash share, and of random directions,
+# each with a prime that the hash multiplies by.
 _COUNTERS, _DIRECTIONS = 2**14, 4
 _PRIMES = (73856093, 19349663, 83492791, 49979687)
 # Weight of an episode's mean novelty, from 0 to 1, in its rank. It decides only between
@@ -71,12 +71,10 @@ class PPONovelty(Agent):
 
     def init_visits(self, key: jax.Array, sizes: Sizes) -> Visits:
         """Return counters of no visits; consumes the key."""
-        direction_key, offset_key = jax.random.split(key)
+        key, offset_key = jax.random.split(key)
         return Visits(
             count=jnp.zeros(_COUNTERS),
-            directions=jax.random.normal(
-                direction_key, (sizes.observation, _DIRECTIONS)
-            ),
+            directions=jax.random.normal(key, (sizes.observation, _DIRECTIONS)),
             offset=jax.random.uniform(offset_key, (_DIRECTIONS,)),
         )
 

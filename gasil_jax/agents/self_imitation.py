@@ -18,7 +18,7 @@ R is a sum of rewards that were not clipped, but V learns from PPO's rewards. So
 normalized rewards are clipped (the metric `clipped_rewards`), R - V is too large.
 """
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import chex
 import jax
@@ -32,20 +32,9 @@ from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
 
-_PRIORITY_EXPONENT = 0.6
-_IMPORTANCE_EXPONENT = 0.1
-_MIN_PRIORITY = 1e-6
+_PRIORITY_EXPONENT, _IMPORTANCE_EXPONENT = 0.6, 0.1
+_MIN_PRIORITY, _MIN_SCALE, _MIN_SAMPLES = 1e-6, 1e-8, 64
 _MAX_ADVANTAGE = 1.0
-_MIN_SCALE = 1e-8
-_MIN_SAMPLES = 64
-
-
-class Steps(NamedTuple):
-    """Steps of a `Replay`, (samples, ...) each."""
-
-    observation: jax.Array
-    action: jax.Array
-    return_: jax.Array
 
 
 class Replay(struct.PyTreeNode):
@@ -64,10 +53,6 @@ class Replay(struct.PyTreeNode):
     return_: jax.Array
     priority: jax.Array
     cursor: jax.Array
-
-    def at(self, index: jax.Array) -> Steps:
-        """Return the steps at these indices, int32 (samples,)."""
-        return Steps(self.observation[index], self.action[index], self.return_[index])
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
@@ -138,9 +123,10 @@ def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> R
     def write(ring: jax.Array, new: Any) -> jax.Array:
         return ring.at[index].set(new, mode="drop")
 
-    observation = flat(history.in_time(history.observation))
     return Replay(
-        observation=write(replay.observation, observation),
+        observation=write(
+            replay.observation, flat(history.in_time(history.observation))
+        ),
         action=write(replay.action, flat(history.in_time(history.action))),
         return_=write(replay.return_, flat(return_)),
         priority=write(replay.priority, _MAX_ADVANTAGE),
@@ -158,9 +144,8 @@ def sample(
     mass = jnp.where(replay.priority > 0, replay.priority**_PRIORITY_EXPONENT, 0.0)
     cumulative = jnp.cumsum(mass)
     total = cumulative[-1]
-    index = jnp.searchsorted(
-        cumulative, jax.random.uniform(key, (num_samples,)) * total, side="right"
-    )
+    drawn = jax.random.uniform(key, (num_samples,)) * total
+    index = jnp.searchsorted(cumulative, drawn, side="right")
     # In float32 the total may come out higher than the sum up to the last filled index.
     last = jnp.max(jnp.where(mass > 0, jnp.arange(mass.shape[0]), 0))
     index = jnp.minimum(index, last)
@@ -257,34 +242,32 @@ class PPOSIL(Agent):
         # that of the normalized reward.
         scale = return_scale(state) / context.reward_scale
 
-        def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
-            observation = normalization.normalize(context.normalizer, rows.observation)
+        def objective(params: Any, index: jax.Array, weight: jax.Array) -> Any:
+            observation = state.observation[index]
+            observation = normalization.normalize(context.normalizer, observation)
             parameters = context.policy(params["policy"], observation)
-            log_prob = context.distribution.log_prob(parameters, rows.action)
             (critic,) = params["values"]
             value = context.value(critic, observation)
+            return_ = state.return_[index] / context.reward_scale
             total, fraction = loss(
-                log_prob,
+                context.distribution.log_prob(parameters, state.action[index]),
                 value,
-                rows.return_,
+                return_,
                 weight=weight,
                 scale=scale,
                 value_coefficient=self.sil_value_coefficient,
             )
-            return self.sil_coefficient * total, (value, fraction)
+            advantage = clipped_advantage(return_, value, scale)
+            return self.sil_coefficient * total, (advantage, fraction)
 
         def step(carry: Any, key: jax.Array) -> Any:
             actor_critic, priority = carry
-            index, weight = sample(
-                key, state.replace(priority=priority), self.sil_minibatch_size
-            )
-            rows = state.at(index)
-            rows = rows._replace(return_=rows.return_ / context.reward_scale)
-            gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
-                actor_critic.params, rows, weight
+            replay = state.replace(priority=priority)
+            index, weight = sample(key, replay, self.sil_minibatch_size)
+            gradient, (advantage, fraction) = jax.grad(objective, has_aux=True)(
+                actor_critic.params, index, weight
             )
             actor_critic = ppo.descend(actor_critic, gradient, context.config)
-            advantage = clipped_advantage(rows.return_, value, scale)
             priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
             return (actor_critic, priority), fraction
 

@@ -13,7 +13,7 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import output_file, plotting, saved, tables
+from gasil_jax.host import output_file, plotting, results, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -27,8 +27,9 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of runs and sweeps, each a curve of its own; and another library's
-        CSV files, or folders of them with one for each seed (see columns).
+      runs: folders of runs and sweeps, each a curve of its own, and a sweep over agents
+        one for each agent; and another library's CSV files, or folders of them with one
+        for each seed (see columns).
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
@@ -286,23 +287,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise InputError(unknown("x", options.x, _X))
     output_file.check(options.out, (".png", ".pdf", ".svg"))
     drawn = {"metric": options.metric, "x": options.x}
-    runs = [
-        read_csv(run, label, options.columns)
-        if _is_csv(run)
-        else read(run, label, options.point, **drawn)
-        for run, label in zip(options.runs, labels, strict=True)
-    ]
+    read_of: list[tuple[pathlib.Path, Curves]] = []
+    for folder, label in zip(options.runs, labels, strict=True):
+        if _is_csv(folder):
+            read_of.append((folder, read_csv(folder, label, options.columns)))
+            continue
+        best = results.best_of_agents(folder) if options.point is None else {}
+        points: list[tuple[str | None, int | None]] = [*best.items()]
+        for agent, point in points or [(None, options.point)]:
+            own = f"{label}, {agent}" if label and agent else label
+            read_of.append((folder, read(folder, own, point, **drawn)))
     # A file does not say its environment: it is compared with the first run.
-    env = next((run.env for run in runs if run.env), "")
-    runs = [run._replace(env=run.env or env) for run in runs]
-    if not options.labels:
-        every = [run.label for run in runs]
-        runs = [
-            run
-            if every.count(run.label) == 1
-            else run._replace(label=f"{run.label} ({folder})")
-            for run, folder in zip(runs, options.runs, strict=True)
-        ]
+    env = next((run.env for _, run in read_of if run.env), "")
+    told = [run.label for _, run in read_of]
+    runs = [
+        run._replace(
+            env=run.env or env,
+            label=f"{run.label} ({folder})" if told.count(run.label) > 1 else run.label,
+        )
+        for folder, run in read_of
+    ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
         draw(runs, partial, smooth=options.smooth, **drawn)

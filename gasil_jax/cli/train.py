@@ -40,7 +40,7 @@ def train(
             options.out or pathlib.Path("runs"),
             num_devices=options.devices,
         )
-        options_.check_agent(env, requested.algorithm)
+        start = requested.start and saved.load_start(requested.start, env, needed)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):
@@ -55,11 +55,13 @@ def train(
     try:
         with noted(how), Interruption() as interruption:
             needed = requested.unfinished(folder, runs)
+            if start is not None:
+                saved.begin(start, env, needed)
             outcomes = training.train_programs(
                 env,
                 needed,
                 requested.recording,
-                title=f"{requested.env} {requested.algorithm.agent.name}",
+                title=f"{requested.env} {requested.agent}",
                 interruption=interruption,
             )
         trained = requested.trained(folder)
@@ -105,7 +107,7 @@ def write(
 
 def tell(folder: pathlib.Path, told: Results) -> None:
     """Print the best points of a sweep, its speed, and commands to go on with."""
-    print(*results.in_words(told), sep="\n")
+    print(*results.best_in_words(told), sep="\n")
     print(f"{speed_in_words(told.trainings)}, in {folder}")
     quoted = shlex.quote(str(folder))
     print(

@@ -3,10 +3,9 @@
 import contextlib
 from typing import Any
 
+import gasil_envs
 from gasil_envs import registry, worlds
-from gasil_envs.locomotion import Locomotion
-from gasil_envs.physics.native import available_cores
-from gasil_envs.pictures import can_draw as can_be_drawn
+from gasil_envs.physics.host_threads import available_cores
 from gasil_envs.registry import Settings, check, made_with, prepare, without_effect
 from gasil_envs.registry import make as make_env
 from gasil_envs.wrappers import is_discrete
@@ -36,6 +35,11 @@ def names() -> list[str]:
     return every
 
 
+def can_be_drawn(env: Any) -> bool:
+    """Return whether `render` can draw an environment."""
+    return gasil_envs.pictures.can_draw(env)
+
+
 def ends_early(env: Any) -> bool:
     """Return whether an episode may end before its step limit; true if unknown."""
     return getattr(env.unwrapped, "ends_early", True)
@@ -43,4 +47,4 @@ def ends_early(env: Any) -> bool:
 
 def is_locomotion(env: Any) -> bool:
     """Return whether an environment, wrapped or not, is one of the MuJoCo tasks."""
-    return isinstance(env.unwrapped, Locomotion)
+    return isinstance(env.unwrapped, gasil_envs.Locomotion)

@@ -32,12 +32,15 @@ def member(states: Any, index: int) -> Any:
 
     Raises:
       IndexError: if there is no such entry. JAX alone would return the last one.
-      ValueError: if the index is no whole number.
+      ValueError: if the index is no whole number, or the states have no axis.
     """
     traced = isinstance(index, jax.Array) and jnp.issubdtype(index.dtype, np.integer)
     if index not in Range(-math.inf, whole=True) and not traced:
         raise refusal("index", index, "a whole number")
-    count = jax.tree.leaves(states)[0].shape[0]
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(states)]
+    if not shapes or not all(shapes):
+        raise refusal("states", states, "arrays with an axis of members")
+    count = shapes[0][0]
     if not traced and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)

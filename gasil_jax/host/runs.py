@@ -33,6 +33,7 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "action_noise": 0.0,
     "policy_components": 1,
+    "rewards": (),
 }
 
 #: Settings that are no more: the settings beside which a run had one, and the value
@@ -41,6 +42,7 @@ REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
     "value_coefficient": (("learning_rate",), 1.0),
     "admission": (("buffer_steps",), "all"),
     "ties": (("buffer_steps",), "oldest"),
+    "sample_by_return": (("buffer_steps",), False),
     "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
     "discriminator_gradient_penalty": (("bonus",), 0.0),
     "discriminator_normalizes_actions": (("bonus",), False),
@@ -60,7 +62,8 @@ def removed(settings: Mapping[str, Any]) -> dict[str, Any]:
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The physics engine and the device are not among them, because they compute the same
+    `start` is the hash of the policy that it starts from, if that is a trained one. The
+    physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -69,6 +72,7 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
+    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -99,6 +103,7 @@ class Run:
                     del group[name]
         return {
             "env": self.env,
+            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": {

@@ -55,7 +55,6 @@ def update(
       gamma: discount.
     """
     chex.assert_equal_shape([reward, ended])
-    chex.assert_equal(reward.shape[1:], normalizer.running.shape)
 
     def step(running: jax.Array, now: Any) -> Any:
         reward, ended = now
@@ -89,10 +88,7 @@ def normalize(
 def clipped(
     normalizer: RewardNormalizer, reward: jax.Array, clip: jax.Array | float
 ) -> jax.Array:
-    """Return the share of rewards other than 0 that `normalize` clips, ().
-
-    It is NaN if all rewards are 0.
-    """
+    """Return the share of rewards other than 0 that `normalize` clips, (), or NaN."""
     is_clipped = jnp.abs(reward) > clip * scale(normalizer)
     return jnp.sum(is_clipped) / jnp.sum(reward != 0.0)
 

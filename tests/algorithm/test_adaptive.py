@@ -19,21 +19,6 @@ ADAPTIVE = SMALL["ppo+gasil-adaptive"]
 ENV = gasil_jax.make_env("point_mass")
 
 
-def test_mix_and_correlation_are_their_formulas():
-    rng = np.random.default_rng(0)
-    first, second = rng.normal(size=(2, 50, 4))
-    second += 0.7 * first
-    standard = lambda x: (x - x.mean()) / x.std()
-    first, second = standard(first), standard(second)
-    both = jnp.stack([jnp.array(first), jnp.array(second)], axis=-1)
-    expected = np.corrcoef(first.ravel(), second.ravel())[0, 1]
-    assert 0.3 < expected < 0.9
-    np.testing.assert_allclose(adaptive.correlation(both), expected, rtol=1e-4)
-    np.testing.assert_allclose(
-        adaptive.mix(both, 0.3), 0.7 * first + 0.3 * second, rtol=1e-4, atol=1e-5
-    )
-
-
 @pytest.mark.parametrize(
     ("good", "policy", "expected"),
     [(100.0, 90.0, 0.4), (100.0, 60.0, 1.0), (100.0, 110.0, 0.0), (-8.0, -9.0, 0.5)],
@@ -180,7 +165,6 @@ def first_update(**changes):
         {"buffer_steps": 150},
         {"buffer_episodes": 1},
         {"buffer_discounts": False},
-        {"sample_by_return": True},
     ],
 )
 def test_an_option_of_buffer_or_discriminator_changes_what_is_learned(change):

@@ -116,7 +116,6 @@ def test_a_minari_data_set_is_an_expert(tmp_path, monkeypatch):
     np.testing.assert_array_equal(observation, episodes[0].observations[:5])
     # Minari itself does not need h5py, its data sets do.
     monkeypatch.setitem(sys.modules, "h5py", None)
-    expert_module._load.cache_clear()
     with pytest.raises(ValueError, match="needs the package minari"):
         expert_module.load("minari:test/expert-v0")
 
@@ -150,8 +149,6 @@ def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
         np.savez(path, **arrays)
         observation, action = expert_module.load(path)
         assert len(observation) == len(action) == length
-        with pytest.raises(ValueError, match="read-only"):
-            action[0] = 0.0
 
 
 def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):

@@ -93,27 +93,10 @@ def test_bad_files_and_seeds_are_refused(saved, tmp_path):
         with pytest.raises(ValueError, match="is not a saved policy"):
             gasil_jax.load_policy(tmp_path)
     arrays = npz.read(folder / "policy.npz")
-    for changes, reason in (
-        ({"seeds": np.int32(5)}, "seeds has the shape"),
-        ({"log_std": arrays["log_std"][:2]}, "log_std has the shape"),
-        ({"final_return": np.array(["a", "b", "c"])}, "final_return holds no numbers"),
-        ({"kernel_7": arrays["kernel_0"]}, "kernel_3 is missing"),
-        ({"kernel_1": arrays["kernel_1"][:, 1:]}, "kernel_1 has the shape"),
-        ({"kernel_2": arrays["kernel_2"][..., :1]}, "kernel_2 has the shape"),
-        ({"bias_0": arrays["bias_0"][:, :, None]}, "bias_0 has the shape"),
-        ({"scale": arrays["scale"][:, :3]}, "scale has the shape"),
-        ({"low": arrays["low"][:1]}, "low has the shape"),
-        ({"kernel_0": arrays["kernel_0"] * np.nan}, "kernel_0 has numbers that are"),
-        (
-            {"mean": arrays["mean"].astype(float) + 1e300},
-            "mean has numbers that aren't finite",
-        ),
-    ):
-        np.savez(tmp_path / "policy.npz", **{**arrays, **changes})
-        with pytest.raises(ValueError, match=f"is not a saved policy .*{reason}"):
-            gasil_jax.load_policy(tmp_path)
-    np.savez(tmp_path / "policy.npz", **arrays, notes=np.array([{}]))
-    gasil_jax.load_policy(tmp_path)
+    del arrays["mean"]
+    np.savez(tmp_path / "policy.npz", **arrays)
+    with pytest.raises(ValueError, match=r"not a saved policy \(mean is missing"):
+        gasil_jax.load_policy(tmp_path)
 
 
 def test_an_observation_of_another_size_is_refused(saved):
@@ -129,6 +112,9 @@ def test_a_batch_of_states_is_no_policy(trained_point_mass):
     assert gasil_jax.member(states, -1).iteration.shape == ()
     with pytest.raises(IndexError, match="index is 3: there are 3 states"):
         gasil_jax.member(states, 3)
+    for none in (0, b"x", None, {"a": np.zeros(2), "b": 1.0}):
+        with pytest.raises(ValueError, match=r"states is .*: it must be arrays with"):
+            gasil_jax.member(none, 0)
     with pytest.raises(ValueError, match="state is a batch of 3 states"):
         policy.from_state(states, env)
 
@@ -192,9 +178,3 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     normalized = normalization.normalize(normalizer, observation)
     mean, _ = jax.jit(network.apply)(own, normalized)
     np.testing.assert_allclose(mean, x, rtol=1e-3)
-    if layer_norm:
-        arrays = dict(np.load(tmp_path / "policy.npz"))
-        del arrays["norm_bias_1"]
-        np.savez(tmp_path / "policy.npz", **arrays)
-        with pytest.raises(ValueError, match="norm_bias_1 is missing"):
-            gasil_jax.load_policy(tmp_path)

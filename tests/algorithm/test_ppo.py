@@ -1,5 +1,7 @@
 """GAE and the PPO loss against plain NumPy."""
 
+import types
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -81,14 +83,14 @@ def test_loss_equals_numpy():
         *(jnp.asarray(x, jnp.float32) for x in (mean, action, old, advantage)),
         returns=jnp.asarray(return_, jnp.float32)[:, None],
     )
-    total, metrics = ppo.loss(
-        {"policy": jnp.asarray(log_std, jnp.float32), "values": (None,)},
-        batch,
+    context = types.SimpleNamespace(
         policy=lambda params, observation: (observation, params),
         distribution=GAUSSIAN,
         value=lambda params, observation: jnp.asarray(value, jnp.float32),
         config=config,
     )
+    params = {"policy": jnp.asarray(log_std, jnp.float32), "values": (None,)}
+    total, metrics = ppo.loss(params, batch, context)
     np.testing.assert_allclose(total, expected, rtol=1e-5)
     kl = np.mean(np.exp(log_prob - old) - 1 - (log_prob - old))
     np.testing.assert_allclose(metrics["approx_kl"], kl, rtol=1e-4)

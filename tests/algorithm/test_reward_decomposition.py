@@ -1,6 +1,7 @@
 """Decomposition of delayed rewards against plain loops, and its use in training."""
 
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -77,14 +78,7 @@ def random_batches(seed, num_batches, delay=5):
 
 @jax.jit
 def decompose_once(state, history, batch, key, learning_rate):
-    history = good_trajectories.record(
-        history,
-        batch.observation,
-        batch.action,
-        reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
-        ended=batch.ended,
-        next_observation=batch.next_observation,
-    )
+    history = good_trajectories.record(history, batch)
     context = Context(
         rollout=batch,
         history=history,
@@ -138,19 +132,21 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
         keep_next=True,
         num_episodes=num_episodes,
     )
-    record, most = jax.jit(good_trajectories.record), 0
+    most = 0
     for batch in range(30):
         step = batch * NUM_STEPS + np.arange(NUM_STEPS)[:, None]
         ended = (step + 1) % LIMIT == 0
         zeros = np.zeros((NUM_STEPS, 1, OBS), np.float32)
-        history = record(
-            history,
-            zeros,
-            zeros[..., :ACT],
+        steps = types.SimpleNamespace(
+            observation=zeros,
+            action=zeros[..., :ACT],
             reward=np.float32(ended),
             ended=ended,
             next_observation=zeros,
+            faulty=False,
+            cut_short=False,
         )
+        history = good_trajectories.record(history, steps)
         recorded = np.int32((batch + 1) * NUM_STEPS)
         windows = windows_of(history, recorded)
         most = max(most, int(windows.ends.sum()))

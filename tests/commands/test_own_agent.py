@@ -261,7 +261,7 @@ def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
     # On a slow machine a line says first that the program is traced.
     *others, error = capsys.readouterr().err.splitlines()
     assert error.startswith("error: ") and re.search(why, error), error
-    assert all(line.endswith(("environment", "agent")) for line in others), others
+    assert all(line.endswith(("environment", "functions")) for line in others), others
     assert not (tmp_path / "run").exists()
 
 
@@ -325,3 +325,72 @@ def test_numbers_that_are_not_given_have_their_defaults(my_agents):
     state = init(jax.random.key(0))
     np.testing.assert_allclose(state.hyperparameters["my_weight"], 0.5)
     np.testing.assert_allclose(state.hyperparameters["gamma"], 0.9)
+
+
+MODEL = """
+import gasil_jax
+from gasil_jax.config import number
+
+
+class Signs(gasil_jax.RewardModel):
+    factor: float = number(1.0, 0.0)
+
+    def update(self, state, context, key):
+        reward = self.factor * context.rollout.reward
+        context = context.replace(rollout=context.rollout.replace(reward=reward))
+        return state, context, True, {"my_factor": self.factor}
+"""
+UPDATE = "def update(self, state, context, key): return "
+#: What models of rewards define, and why they are refused.
+WRONG_MODELS = [
+    (UPDATE + "state, context, {}", "update .* 3 values: .*state, context, learned"),
+    (UPDATE + "state, context.rollout, True, {}", "returned context.rollout.* missing"),
+    (UPDATE + "(), context, context.rollout.reward > 0, {}", "learned is bool.32, 4.:"),
+    (UPDATE + "state, context, 'yes', {}", "update .* returns what is no array: "),
+    (UPDATE + "state, context, True, {'entropy': 0}", "'entropy' of a model of rew"),
+    ("def update(self, state, context): pass", r"traced: .*update\(\) takes 3 posi"),
+    ("def init(self, key): pass", r"can't be traced: .*init\(\) takes 2 positional"),
+    ("gamma: float = number(1.0, 0.0)", "'gamma', a name that is taken: "),
+    ("seeds: float = number(1.0, 0.0)", "'seeds', a name that is taken by an option"),
+]
+for number, (definition, _) in enumerate(WRONG_MODELS):
+    MODEL += f"\n\nclass Wrong{number}(Signs):\n    {definition}\n"
+
+
+@pytest.fixture
+def my_models(my_agents, tmp_path, monkeypatch):
+    (tmp_path / "my_models.py").write_text(MODEL)
+    return importlib.import_module("my_models")
+
+
+def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsys):
+    small = [*FLAGS, "--agent", "ppo", "--rewards", "my_models:Signs", "--devices", "1"]
+    assert sweep.main([*small, "--grid", "factor=0.5,2", "--out", "out"]) == 0
+    assert column(metrics(tmp_path / "out"), "my_factor") == {0.5, 2.0}
+    stored = read_sweep(tmp_path / "out").algorithm
+    assert stored.rewards == (my_models.Signs(), gasil_jax.Normalize())
+    # Among others, the package's models have their own places.
+    both = stored.replace(decompose_rewards=True)
+    kinds = (my_models.Signs, gasil_jax.Decompose, gasil_jax.Normalize)
+    assert tuple(map(type, both.rewards)) == kinds
+    again = ["--resume", "--out", "out"]
+    assert run.main([*again, "--total-steps", "384"]) == 0
+    assert evaluate.main(["out", "--episodes", "1"]) == 0
+    assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
+    assert run.main([*again, "--rewards", "my_models:Wrong0"]) == 2
+    assert "rewards was ['my_models:Signs'], is ['my_mod" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("model", "why"),
+    [
+        *((f"my_models:Wrong{i}", why) for i, (_, why) in enumerate(WRONG_MODELS)),
+        ("my_models", "rewards is 'my_models': it must be MODULE:CLASS"),
+        ("gasil_jax:Agent", "derived from gasil_jax.RewardModel"),
+        ("gasil_jax.rewards.normalization:Normalize", "use normalize_rewards instead"),
+    ],
+)
+def test_what_is_no_model_is_refused_in_a_line(my_models, capsys, model, why):
+    assert run.main([*FLAGS, "--agent", "ppo", "--rewards", model, "--out", "x"]) == 2
+    error = capsys.readouterr().err.splitlines()[-1]
+    assert error.startswith("error: ") and re.search(why, error), error

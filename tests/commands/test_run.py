@@ -1,9 +1,11 @@
 """The command line: a run from end to end, and refusals before anything compiles."""
 
 import csv
+import dataclasses
 import io
 import json
 import math
+import pathlib
 import re
 import shutil
 import signal
@@ -12,15 +14,18 @@ import sys
 import types
 
 import brax.envs
+import jax
 import numpy as np
 import pytest
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_envs import locomotion, user_code
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.reporting import HelpShown, reports_errors
-from gasil_jax.host import training
+from gasil_jax.host import checkpoint, saved, training
+from gasil_jax.host import sweep as sweep_
 from gasil_jax.run import main
 
 pytestmark = pytest.mark.xdist_group("commands")
@@ -415,3 +420,47 @@ def test_an_environment_that_brax_itself_breaks_is_refused(
     *_, line = capsys.readouterr().err.splitlines()
     assert "env 'brax:broken' fails within Brax" in line and "KeyError: 'a_min'" in line
     assert not out.exists()
+
+
+def test_training_starts_from_another_runs_policy(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    begin = ("--agent", "ppo", "--seeds", "2", "--out", "first")
+    assert main([*FLAGS, *begin]) == 0
+    more = ("--agent", "ppo+sil", "--init-from", "first", "--evaluate-every", "128")
+    keep = ("--keep-checkpoints", "3")
+    assert main([*FLAGS, *more, *keep, "--out", "second"]) == 0
+    (stored,) = (path.parent for path in tmp_path.glob("second/**/00000000"))
+    begun = checkpoint.read(stored / "00000000")
+    *_, trained = saved.load(pathlib.Path("first"))
+    best = saved.find_start(pathlib.Path("first")).seed
+    *_, last = saved.load(pathlib.Path("second"))
+    first = gasil_jax.member(begun.restore(jax.eval_shape(lambda: last)), 0)
+    expected = gasil_jax.member(trained, best)
+    for part in (lambda x: x.actor_critic.policy.params, lambda x: x.normalizer):
+        jax.tree.map(np.testing.assert_array_equal, part(first), part(expected))
+    assert int(first.iteration) == 0
+    # It is not the run that starts from scratch, and other policies are refused.
+    (one,) = sweep_.read(pathlib.Path("second")).runs.values()
+    assert one.key != dataclasses.replace(one, start=None).key
+    assert main(["--resume", "--out", "first", "--total-steps", "384"]) == 0
+    for words, why in (
+        (("--resume", "--out", "second", "--seeds", "2"), "has been trained since"),
+        ((*FLAGS, "--init-from", "first", "--layer-norm"), "has another form: "),
+        ((*FLAGS, "--init-from", "nowhere"), "nowhere, which does not exist"),
+    ):
+        assert main([*words]) == 2
+        assert why in capsys.readouterr().err
+    assert not pathlib.Path("runs").exists()
+
+
+def test_the_settings_of_a_config_are_taken(trained, tmp_path, capsys):
+    config = ("--config", str(trained.folder / "config.json"))
+    _, requested = options_.read(Options, [*config, "--alpha", "0.3"], "x")
+    before = sweep_.read(trained.folder)
+    assert requested.algorithm == before.algorithm.replace(alpha=0.3)
+    same = dataclasses.replace(requested, algorithm=before.algorithm)
+    assert same == dataclasses.replace(before, algorithm=before.algorithm)
+    assert main([*config, "--agent", "ppo"]) == 2
+    assert "where agent was ppo+gasil, is ppo: leave it out" in capsys.readouterr().err
+    assert main(["--config", "nowhere.json"]) == 2
+    assert "config is nowhere.json: it must be the config" in capsys.readouterr().err

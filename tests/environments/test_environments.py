@@ -11,7 +11,7 @@ import pytest
 from environment_contract import BATCH, check_reset_and_step
 
 import gasil_envs
-from gasil_envs import locomotion, point_mass
+from gasil_envs import locomotion, point_mass, user_environment, wrappers
 from gasil_envs.physics.interface import PhysicsState
 
 # One worker for each environment, so that it is compiled once; and one of them, because
@@ -347,15 +347,25 @@ def test_a_fault_of_the_users_environment_is_one_line(
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize(("limit", "told"), [(100, True), (1, False)])
-def test_actions_that_are_no_standard_deviation_are_told(
-    limit, told, tmp_path, monkeypatch, caplog
+@pytest.mark.parametrize(
+    ("low", "high", "allowed", "own"),
+    # `_OWN` rewards an action.
+    [(-100, 100, (-1, 1), 50.0), (2, 4, (-1, 1), 3.5), (-1, 3, (-1, 3), 0.5)],
+)
+def test_actions_of_a_wide_range_are_in_units_of_it(
+    low, high, allowed, own, tmp_path, monkeypatch, caplog
 ):
-    module = _OWN + f"    action_range = (-{limit}, {limit})\n"
-    (tmp_path / f"own_range_{limit}.py").write_text(module)
+    module = _OWN + f"    action_range = ({low}, {high})\n"
+    (tmp_path / f"own_range_{high}.py").write_text(module)
     monkeypatch.syspath_prepend(tmp_path)
-    gasil_envs.make(f"own_range_{limit}:Env")
-    assert ("has actions from -100 to 100" in caplog.text) is told
+    env = gasil_envs.make(f"own_range_{high}:Env")
+    assert wrappers.action_range(env) == allowed
+    state = env.step(env.reset(jax.random.key(0)), jnp.full(1, 0.5))
+    assert state.reward == own and not caplog.text
+    user_environment.check("Env", env.unwrapped, env.unwrapped)
+    assert ("wrap it in gasil_envs.wrappers.UnitActions" in caplog.text) is (
+        allowed == (-1, 1)
+    )
 
 
 def test_a_warning_of_mujoco_writes_no_file(tmp_path, monkeypatch):

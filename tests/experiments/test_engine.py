@@ -14,9 +14,10 @@ import numpy as np
 import pytest
 
 import gasil_jax
-from experiments import __main__, engine
-from experiments.curves import Curve, Figure
+from experiments import __main__, engine, report
+from experiments.curves import Curve, Figure, difference
 from experiments.engine import Setup
+from experiments.figure_results import Results
 from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store, read
 from gasil_jax.errors import InputError
@@ -273,6 +274,29 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
         assert (curve.seeds, curve.total_steps) == (3, 100_000)
         assert len(curve.runs(Store(tmp_path))) == 3  # whatever is searched
     assert list(__main__._small(FIGURES["matrix"], ()).panels) == ["hopper-delayed"]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
+    figure, store = __main__._small(FIGURES[name], ()), Store(tmp_path / "runs")
+    made = dict.fromkeys(("versions", "commit", "device"), None) | {"physics": "jax"}
+    record = Record(*[np.arange(1.0, 11.0)] * 3, made)
+    store.add(dict.fromkeys(figure.requested(store), record))
+    report.write(name, Results(figure, store, store), tmp_path, "{{table}}")
+    assert "| " in (tmp_path / f"{name}.md").read_text()
+
+
+def test_a_small_version_is_trained(toy, tmp_path, monkeypatch, capsys):
+    panels = {"a": toy.panels["a"], "b": toy.panels["a"]}
+    both = (*difference("a", "x", "y"), *difference("b", "y", "x"))
+    compared = {("a", "x", "y"): both[:2], ("b", "x", "y", "a"): both}
+    figure = dataclasses.replace(toy, panels=panels, comparisons=compared)
+    monkeypatch.setitem(FIGURES, "matrix", figure)
+    monkeypatch.setattr(__main__, "_QUICK_STEPS", 512)
+    arguments = ["--runs", str(tmp_path), "--evaluate-episodes", "0", "--devices", "1"]
+    assert __main__.main(["matrix", "--quick", *arguments]) == 0
+    page = (tmp_path / "quick" / "results" / "matrix.md").read_text()
+    assert "Not trained yet" not in page and "| x |" in page, page
 
 
 def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):

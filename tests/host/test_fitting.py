@@ -246,7 +246,7 @@ def test_points_are_trained_beside_each_other(env):
     ("changes", "why"),
     [
         ({"clip_epsilon_schedule": lambda steps: 1.0}, "a schedule that is a function"),
-        ({"rewards": (Normalize(), Decompose())}, "a model of rewards without a name"),
+        ({"rewards": (Normalize(), Decompose())}, "models of rewards that a command"),
         ({}, None),
     ],
 )
@@ -285,6 +285,9 @@ def test_what_no_command_line_can_name_is_read_where_it_can_be(own, tmp_path, ca
     # With what only Python has, the states and the reward are read.
     given = {"env": own, "algorithm": gasil}
     assert_same(saved.load(out, **given)[-1], whole.states)
+    at = np.ones(own.observation_size)
+    stored = gasil_jax.load_policy(out, 5, point=0, **given)
+    np.testing.assert_allclose(stored(at), gasil_jax.load_policy(out, 5)(at), rtol=1e-6)
     reward = gasil_jax.load_reward(out, seed=5, **given)
     steps = np.ones((4, own.observation_size)), np.zeros((4, 2))
     one = gasil_jax.member(whole.states, 1)

@@ -413,17 +413,6 @@ CONTENTS = [
     *[saved(np.savez, **EXPERT | {"action": x}) for x in ODD],
     saved(np.savez, **EXPERT)[:300],
     saved(np.savez, observation=np.ones(3)),
-    *[
-        saved(np.savez, **POLICY | changed)
-        for changed in (
-            {"kernel_1": np.zeros((2, 3, 1))},
-            {"kernel_0": np.full((2, 3, 4), np.nan)},
-            {"scale": np.zeros((2, 3))},
-            {"low": np.full(1, np.nan)},
-            {"high": np.full(1, -2.0)},
-            {"seeds": np.array(["0", "1"])},
-        )
-    ],
 ]
 
 
@@ -452,36 +441,26 @@ def test_a_foreign_archive_is_refused_and_never_unpickled(content, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("arrays", "use"), [(POLICY, act_of), (EXPERT, load)])
-def test_a_randomly_altered_archive_is_read_or_refused(arrays, use, tmp_path):
+def test_a_randomly_altered_expert_is_read_or_refused(tmp_path):
     told = 0
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for number, content in enumerate(altered(arrays, 350)):
+        for number, content in enumerate(altered(EXPERT, 350)):
             path = tmp_path / f"{number}.npz"
             path.write_bytes(content)
             try:
-                use(path)
+                load(path)
             except ValueError as error:
                 told += 1
                 assert str(path) in str(error) and "\n" not in str(error)
     assert 150 < told < 330
 
 
-def test_a_policy_of_another_byte_order_and_with_a_further_array_acts(tmp_path):
+def test_a_policy_of_another_byte_order_acts(tmp_path):
     swapped = {name: x.astype(x.dtype.newbyteorder()) for name, x in POLICY.items()}
-    np.savez(tmp_path / "policy.npz", **swapped, notes=np.array([{}]))
+    np.savez(tmp_path / "policy.npz", **swapped)
     np.savez(tmp_path / "plain.npz", **POLICY)
     observation = np.ones(3, np.float32)
     expected = gasil_jax.load_policy(tmp_path / "plain.npz")(observation)
     assert gasil_jax.load_policy(tmp_path)(observation) == expected
     assert numpy_policy.load(tmp_path)(observation) == expected
-
-
-@pytest.mark.parametrize("about", [None, "{", "[]1", "[1]"])
-def test_a_damaged_policy_of_the_zoo_is_told(about, tmp_path, monkeypatch):
-    monkeypatch.setattr(numpy_policy, "ZOO", tmp_path)
-    entry = {} if about is None else {"about": np.array(about)}
-    np.savez(tmp_path / "mine.npz", **POLICY, **entry)
-    with pytest.raises(ValueError, match=r"mine\.npz is damaged: about can't be read"):
-        numpy_policy.about("zoo:mine")

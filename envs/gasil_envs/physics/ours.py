@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 
-from gasil_envs.physics import dynamics
+from gasil_envs.physics import dynamics, tree
 from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
@@ -76,18 +76,22 @@ class JaxPhysics:
         self._dynamics = dynamics.make(
             model, fields, iterations or 100, ls_iterations or (4 if iterations else 16)
         )
-        if self.is_stiff:
+        if self.warnings:
             _LOGGER.warning(
-                "physics 'jax' may differ from C MuJoCo's by 1e-3 in this model: its "
-                "contacts are %.0e times as stiff as what they move (by friction, "
-                "impratio or solimp), and float32 resolves no more",
-                self._dynamics.layout.stiffness,
+                "physics 'jax' may differ from C MuJoCo's by 1e-3 in this model's %s",
+                ", ".join(self.warnings),
             )
 
     @property
-    def is_stiff(self) -> bool:
-        """Whether contacts are so stiff that float32 loses digits of the motion."""
-        return self._dynamics.layout.stiffness > 3e3
+    def warnings(self) -> list[str]:
+        """Return the parts of the model that float32 resolves too little of."""
+        own, found = self._dynamics, []
+        if own.layout.stiffness > 3e3:
+            found.append(
+                f"contacts, which are {own.layout.stiffness:.0e} times as stiff as "
+                "what they move (by friction, impratio or solimp)"
+            )
+        return found + tree.rounding(own.model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

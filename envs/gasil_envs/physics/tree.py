@@ -29,6 +29,8 @@ FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_HINGE),
 )
 _NEGLIGIBLE = 1e-9
+#: From this distance from the origin on, metres, rounding moves contacts by 1e-5 m/s.
+_FAR = 20.0
 
 
 class Kinematics(NamedTuple):
@@ -67,6 +69,19 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if model.opt.disableflags & passive == passive and medium:
         return "its medium is disabled with its springs and dampers"
     return None
+
+
+def rounding(model: mujoco.MjModel) -> list[str]:
+    """Return what to warn of if bodies that move start far from the origin."""
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    away = np.linalg.norm(data.xpos[model.body_weldid > 0], axis=1).max(initial=0.0)
+    if away < _FAR:
+        return []
+    return [
+        f"bodies {away:.0f} m from the origin, where float32 rounds positions to "
+        f"{away * 1e-7:.0e} m"
+    ]
 
 
 def trees(model: mujoco.MjModel) -> list[tuple[int, slice]]:
