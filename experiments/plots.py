@@ -44,6 +44,7 @@ def curves(results: Results, kind: str = "") -> Picture:
     for axes, panel in zip(grid.flat, panels, strict=False):
         draw = _draw_over if figure.over else _draw_curves
         draw(results, panel, axes, lines)
+        _draw_floor(figure, panel, axes)
         axes.set_title(_short(panel), fontsize=9)
         axes.tick_params(labelsize=7)
     if whole:
@@ -72,10 +73,7 @@ def _draw_legend(picture: Picture, panels: Sequence[Any], lines: Any) -> None:
 
 
 def _lines(figure: Figure) -> dict[str, dict[str, Any]]:
-    """Return color and width of each shown line, the same in all panels.
-
-    The figure's subject is thick.
-    """
+    """Return color and width of each shown line, the same in all panels."""
     named: dict[str, str] = {}
     first: set[str] = set()
     for panel, curves in figure.panels.items():
@@ -105,10 +103,7 @@ def _with_free_colors(names: Collection[str], agents: Any) -> dict[str, Any]:
 
 
 def _draw_curves(results: Results, panel: str, axes: Any, lines: Any) -> None:
-    """Draw the interquartile mean over seeds and its 95% interval.
-
-    Where tasks are either solved or not, a curve is the share of seeds that solve it.
-    """
+    """Draw the interquartile mean over seeds and its 95% interval."""
     figure = results.figure
     for name, style in lines.items():
         if (panel, name) not in results.curves:
@@ -129,12 +124,16 @@ def _draw_curves(results: Results, panel: str, axes: Any, lines: Any) -> None:
         axes.plot(steps, interquartile_mean(returns, 0), label=name, **style)
     if figure.solved_from is not None:
         axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("million steps", fontsize=8)
+
+
+def _draw_floor(figure: Figure, panel: str, axes: Any) -> None:
+    """Draw what doing nothing returns, where that is shown."""
     if floor := doing_nothing.of(figure, panel):
         dotted = {"color": "0.4", "linestyle": (0, (1, 1)), "linewidth": 1.0}
         axes.axhline(floor.mean, **dotted)
         at = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "right"}
         axes.text(0.98, floor.mean, "doing nothing", color="0.4", fontsize=6, **at)
-    axes.set_xlabel("million steps", fontsize=8)
 
 
 def _returns(one: CurveResults) -> tuple[np.ndarray, np.ndarray]:

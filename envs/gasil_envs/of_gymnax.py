@@ -66,9 +66,10 @@ def build(name: str) -> World:
         episode_length=int(params.max_steps_in_episode),
         part=part or None,
     )
+    _, seen = jax.eval_shape(begin, jax.random.key(0))
     if hasattr(env, "render"):
         world.draw = functools.partial(_draw, env, params)
-    elif len(getattr(env.observation_space(params), "shape", ())) == 3:
+    elif len(getattr(seen, "shape", ())) == 3:
         world.draw = functools.partial(_draw_planes, env, params)
     return world
 
