@@ -99,11 +99,7 @@ def generator(name: str) -> np.random.Generator:
 
 
 def _drawn(space: Space, count: int, name: str) -> tuple[Point, ...]:
-    """Return points of a space, all different and the same for the same name.
-
-    Each value of a hyperparameter occurs equally often, or once more than another. The
-    combinations are random.
-    """
+    """Return points of a space, all different and the same for the same name."""
     rng = generator(name)
     rows: list[tuple[Any, ...]] = []
     while len(set(rows)) < count:

@@ -33,7 +33,6 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "action_noise": 0.0,
     "policy_components": 1,
-    "rewards": (),
 }
 
 #: Settings that are no more: the settings beside which a run had one, and the value
@@ -85,6 +84,8 @@ class Run:
     def _fields(self) -> dict[str, Any]:
         """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
+        if not values["rewards"]:  # Stored runs had no models of the user's.
+            del values["rewards"]
         for name, value in values.items():
             if callable(value):
                 values[name] = "a function"

@@ -103,6 +103,7 @@ def test_a_setting_that_it_does_not_have_is_refused(change, message):
         (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"learning_rate": -jnp.ones(())}, "rate is -1.0"),
+        ({"learning_rate": 1e-60}, "rate is 1e-60: it must be more than 0 in float32"),
         ({"alpha": np.ones(3)}, r"alpha has shape \(3,\): .*vmap"),
         ({"discriminator_updates": 1}, "discriminator_updates is not traced"),
         ({"imitation_weight": 0.5}, r"of ppo\+gasil-adaptive, not of ppo\+gasil"),
