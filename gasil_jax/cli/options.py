@@ -21,7 +21,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
-    saved,
+    start,
     sweep,
     trackers,
 )
@@ -196,9 +196,7 @@ def read(
         start=None if stored is None else stored.start,
     )
     if options.init_from is not None:
-        requested = dataclasses.replace(
-            requested, start=saved.find_start(options.init_from)
-        )
+        requested = dataclasses.replace(requested, start=start.find(options.init_from))
     _check(options, requested)
     if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
         raise InputError(
