@@ -91,11 +91,7 @@ def _parser(name: str) -> Parser:
 
 
 def _selected(figure: Figure, names: Sequence[str]) -> Figure:
-    """Return a figure with only the named panels and searches, or all for no names.
-
-    Raises:
-      InputError: if the figure has no panel or search of that name.
-    """
+    """Return a figure with only the named panels and searches, or all for no names."""
     allowed = (*figure.panels, *figure.searches)
     for name in names:
         if name not in allowed:
@@ -109,15 +105,7 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
 
 
 def _small(figure: Figure, names: Sequence[str]) -> Figure:
-    """Return the small version of a figure, of the named panels or the first one.
-
-    Instead of what searches choose, which may not be known yet, it uses the presets
-    "tuned", "scaled" and "paper".
-
-    Raises:
-      InputError: if a name is no panel or search of the figure, or if only searches are
-        named.
-    """
+    """Return the small version of a figure, of the named panels or the first one."""
     selected = _selected(figure, names or [*figure.panels][:1])
     if not selected.panels:
         raise InputError(

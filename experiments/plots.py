@@ -37,14 +37,15 @@ def curves(results: Results, kind: str = "") -> Picture:
     panels = [x for x in figure.of_kind(kind) if any(k[0] == x for k in results.curves)]
     lines, whole = _lines(figure), results.whole(panels)
     count = len(panels) + bool(whole)
-    columns = 3 if count % 6 == 0 else min(_MOST_COLUMNS, count)
+    columns = 3 if count in (5, 6, 12) else min(_MOST_COLUMNS, count)
     rows = math.ceil(count / columns)
     picture = Picture(figsize=(3.1 * columns, 2.5 * rows + 0.4), layout="constrained")
     grid = picture.subplots(rows, columns, squeeze=False)
     for axes, panel in zip(grid.flat, panels, strict=False):
         draw = _draw_over if figure.over else _draw_curves
         draw(results, panel, axes, lines)
-        axes.set_title(panel.removeprefix("sparse:"), fontsize=9)
+        _draw_floor(figure, panel, axes)
+        axes.set_title(_short(panel), fontsize=9)
         axes.tick_params(labelsize=7)
     if whole:
         _draw_whole(grid.flat[len(panels)], whole, lines, figure)
@@ -72,14 +73,13 @@ def _draw_legend(picture: Picture, panels: Sequence[Any], lines: Any) -> None:
 
 
 def _lines(figure: Figure) -> dict[str, dict[str, Any]]:
-    """Return color and width of each shown line, the same in all panels.
-
-    The figure's subject is thick.
-    """
+    """Return color and width of each shown line, the same in all panels."""
     named: dict[str, str] = {}
-    for panel, name, curve in figure.curves():
-        named.setdefault(figure.point_of(panel, name)[0], curve.agent)
-    first = sorted(named, key=lambda x: x != figure.favourite)[:MOST_LINES]
+    first: set[str] = set()
+    for panel, curves in figure.panels.items():
+        own = {figure.point_of(panel, x)[0]: curve.agent for x, curve in curves.items()}
+        first |= {*sorted(own, key=lambda x: x != figure.favourite)[:MOST_LINES]}
+        named = {**own, **named}
     shown = [x for x in named if x in (figure.shown or first)]
     color_of = _with_free_colors(shown, named)
     return {
@@ -103,10 +103,7 @@ def _with_free_colors(names: Collection[str], agents: Any) -> dict[str, Any]:
 
 
 def _draw_curves(results: Results, panel: str, axes: Any, lines: Any) -> None:
-    """Draw the interquartile mean over seeds and its 95% interval.
-
-    Where tasks are either solved or not, a curve is the share of seeds that solve it.
-    """
+    """Draw the interquartile mean over seeds and its 95% interval."""
     figure = results.figure
     for name, style in lines.items():
         if (panel, name) not in results.curves:
@@ -127,12 +124,16 @@ def _draw_curves(results: Results, panel: str, axes: Any, lines: Any) -> None:
         axes.plot(steps, interquartile_mean(returns, 0), label=name, **style)
     if figure.solved_from is not None:
         axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("million steps", fontsize=8)
+
+
+def _draw_floor(figure: Figure, panel: str, axes: Any) -> None:
+    """Draw what doing nothing returns, where that is shown."""
     if floor := doing_nothing.of(figure, panel):
         dotted = {"color": "0.4", "linestyle": (0, (1, 1)), "linewidth": 1.0}
         axes.axhline(floor.mean, **dotted)
         at = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "right"}
         axes.text(0.98, floor.mean, "doing nothing", color="0.4", fontsize=6, **at)
-    axes.set_xlabel("million steps", fontsize=8)
 
 
 def _returns(one: CurveResults) -> tuple[np.ndarray, np.ndarray]:
@@ -204,7 +205,7 @@ def forest(results: Results, kind: str = "") -> Picture:
     if panels:
         ratios.append(0.24 * len(panels))
         width += ratios[-1]
-        height += 0.065 * max(map(len, panels))
+        height += 0.065 * max(len(_short(x)) for x in panels)
     picture = Picture(figsize=(width, height), layout="constrained")
     (grid,) = picture.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)
     for i, part in enumerate(parts):
@@ -241,10 +242,15 @@ def _draw_rows(axes: Any, rows: Sequence[Row], null: float) -> None:
                 axes.plot(end, y, "|", color="0.3", markersize=6, markeredgewidth=0.8)
     if null == 0.5:
         axes.set_xlim(-0.03, 1.03)
-    axes.set_ylim(max(len(rows), 1) - 0.5, -0.5)
+    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
     axes.tick_params(axis="x", labelsize=7)
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)
+
+
+def _short(panel: str) -> str:
+    """Return a panel's name without the package of its task."""
+    return panel.split(":")[-1].removeprefix("Navix-")
 
 
 def _draw_squares(axes: Any, rows: Sequence[Row], panels: Sequence[str]) -> None:
@@ -257,10 +263,9 @@ def _draw_squares(axes: Any, rows: Sequence[Row], panels: Sequence[str]) -> None
                 "lw": 0.6,
             }
             axes.add_patch(Rectangle((x - 0.36, y - 0.36), 0.72, 0.72, **face))
-    names = [panel.removeprefix("sparse:") for panel in panels]
-    axes.set_xticks(range(len(panels)), names, fontsize=7, rotation=90)
+    axes.set_xticks(range(len(panels)), [*map(_short, panels)], fontsize=7, rotation=90)
     axes.set_yticks([])
-    axes.set(xlim=(-0.6, len(panels) - 0.4), ylim=(len(rows) - 0.5, -0.5))
+    axes.set(xlim=(-0.6, len(panels) - 0.4), ylim=(max(len(rows), 2) - 0.5, -0.5))
     axes.spines[:].set_visible(False)
     axes.tick_params(length=0)
 

@@ -99,11 +99,7 @@ def generator(name: str) -> np.random.Generator:
 
 
 def _drawn(space: Space, count: int, name: str) -> tuple[Point, ...]:
-    """Return points of a space, all different and the same for the same name.
-
-    Each value of a hyperparameter occurs equally often, or once more than another. The
-    combinations are random.
-    """
+    """Return points of a space, all different and the same for the same name."""
     rng = generator(name)
     rows: list[tuple[Any, ...]] = []
     while len(set(rows)) < count:
@@ -326,6 +322,19 @@ class PaperSearch(SingleStage):
         points = paper_points(self.agent)
         own = {"alpha": HUMANOID["alpha"]} if self._has_schedule else {}
         return tuple({**point, **own} for point in points)
+
+
+class SecondStage(PaperSearch):
+    """`PaperSearch`, whose best points by two seeds get ten before one is chosen.
+
+    The ten seeds are other ones than the search's.
+    """
+
+    _final_seeds = range(10)
+
+    def finalists(self, store: Store) -> tuple[Point, ...]:
+        """Return the best points by the search's two seeds."""
+        return Search.finalists(self, store)
 
 
 #: The sparse tasks, and the ways to explore and imitate that are compared on them.

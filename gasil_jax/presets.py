@@ -6,7 +6,7 @@ the settings; a flag overrides a row.
 "tuned" has the settings that a search chose for an agent on a task, with the number of
 environments and the normalization of rewards that it ran with. Alpha suits only that
 normalization. Where the agent returns more with the learning rate, lambda, gamma and
-initial std that PPO's or PPO+GASIL's search chose, it has those
+initial std that PPO's or PPO+GASIL's search chose, it has these
 (docs/results/ablations.md). The rows of locomotion tasks, and those of PPO and
 PPO+GASIL on the dense point mass, are from the stored searches; the other rows of the
 point mass are from earlier ones. Adaptive imitation has one setting for all tasks of
@@ -134,17 +134,11 @@ def _scaled(decompose_rewards: bool) -> Rows:
 
 
 class Preset(NamedTuple):
-    """The overrides of a preset, by environment and agent.
+    """The overrides of a preset, by environment and agent."""
 
-    Attributes:
-      dense: rows for rewards that are given at every step.
-      delayed: rows for delayed rewards.
-      every: overrides for all tasks and agents; a row takes precedence.
-    """
-
-    dense: Rows
-    delayed: Rows
-    every: Overrides = types.MappingProxyType({})
+    dense: Rows  # for rewards that are given at every step
+    delayed: Rows  # for delayed rewards
+    every: Overrides = types.MappingProxyType({})  # for all; a row takes precedence
 
 
 PRESETS: Mapping[str, Preset] = {

@@ -1,11 +1,13 @@
 """The environments of ``brax.envs`` by name, as brax:NAME."""
 
 import contextlib
+import functools
 import io
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 # MJX, which Brax imports, prints that its optional Warp backend is absent.
 with contextlib.redirect_stdout(io.StringIO()):
@@ -37,7 +39,17 @@ def names() -> tuple[str, ...]:
 
 def build(name: str) -> Any:
     """Build an environment of Brax, and trace a step without running it."""
-    env = brax.envs.get_environment(name)
+    env: Any = brax.envs.get_environment(name)
+    # "fast" has no robot.
+    if getattr(env, "sys", None) is not None:
+        env.draw = functools.partial(_draw, env.sys)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
     return _OfBrax(env, state.obs.shape[-1])
+
+
+def _draw(system: Any, state: Any, size: tuple[int, int]) -> np.ndarray:
+    """Return Brax's own picture of a state, which MuJoCo draws."""
+    from brax.io import image
+
+    return image.render_array(system, state, height=size[1], width=size[0])

@@ -137,6 +137,7 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     best = told["best_by_mean"]
     shown = 0 if best is None else best
     scores = {x: y[shown] for x, y in results.evaluations.items()}
+    title = ", ".join([sweep.env, *sweep.agent.split(",")])
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
@@ -148,7 +149,12 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     if len(sweep.points) > 1:
         with output_file.atomic(folder / "sweep.png") as partial:
             plotting.final_returns(
-                partial, _labels(results), results.finals["final_return"], best=best
+                partial,
+                _labels(results),
+                results.finals["final_return"],
+                title=title,
+                env_steps=results.metrics["env_steps"][:, 0],
+                curves=results.metrics["episode_return"],
             )
         known = np.flatnonzero(np.isfinite(results.mean)).tolist()
         varied = {
@@ -162,6 +168,7 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
                     partial,
                     varied,
                     results.mean[known],
+                    title=title,
                     best=None if best is None else known.index(best),
                     left_out=len(sweep.points) - len(known),
                 )

@@ -42,6 +42,7 @@ REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
     "admission": (("buffer_steps",), "all"),
     "ties": (("buffer_steps",), "oldest"),
     "sample_by_return": (("buffer_steps",), False),
+    "buffer_discounts": (("buffer_steps",), True),
     "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
     "discriminator_gradient_penalty": (("bonus",), 0.0),
     "discriminator_normalizes_actions": (("bonus",), False),
