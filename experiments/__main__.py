@@ -1,4 +1,4 @@
-"""``python -m experiments NAME``: train a figure's missing runs and write its page.
+"""``python -m experiments NAME``: train a figure's missing runs and draw them.
 
 Without a name it lists the figures and the other commands.
 """
@@ -16,7 +16,6 @@ from experiments import (
     engine,
     profile,
     report,
-    summary,
     zoo,
 )
 from experiments.curves import Curve, Figure
@@ -32,17 +31,19 @@ from gasil_jax.host.runs import Run
 
 #: Commands other than figures: each module has a `parser` and a `run`.
 COMMANDS: Mapping[str, ModuleType] = {
-    "report": summary,
+    "report": report,
     "benchmark": benchmark,
     "profile": profile,
     "zoo": zoo,
     "doing_nothing": doing_nothing,
 }
+#: Environment steps of each run of `--quick`.
+_QUICK_STEPS = 100_000
 
 
 def _parser(name: str) -> Parser:
     """Return the reader of a figure's options."""
-    parser = Parser(name, "Train the runs that a figure lacks, then write its page.")
+    parser = Parser(name, "Train the runs that a figure lacks, then draw them.")
     add = parser.add_argument
     add(
         "--quick",
@@ -64,7 +65,7 @@ def _parser(name: str) -> Parser:
         default="1/1",
         help="train only this part of the runs, as NUMBER/COUNT",
     )
-    parser.add_results("folder of the pages and, below runs/, of the stored runs")
+    parser.add_results("folder of the stored runs, in runs/, and of a page")
     add("--runs", type=pathlib.Path, help="scratch folder of the training in progress")
     add("--resume", action="store_true", help="continue interrupted training")
     add(
@@ -90,11 +91,7 @@ def _parser(name: str) -> Parser:
 
 
 def _selected(figure: Figure, names: Sequence[str]) -> Figure:
-    """Return a figure with only the named panels and searches, or all for no names.
-
-    Raises:
-      InputError: if the figure has no panel or search of that name.
-    """
+    """Return a figure with only the named panels and searches, or all for no names."""
     allowed = (*figure.panels, *figure.searches)
     for name in names:
         if name not in allowed:
@@ -108,15 +105,7 @@ def _selected(figure: Figure, names: Sequence[str]) -> Figure:
 
 
 def _small(figure: Figure, names: Sequence[str]) -> Figure:
-    """Return the small version of a figure, of the named panels or the first one.
-
-    Instead of what searches choose, which may not be known yet, it uses the presets
-    "tuned", "scaled" and "paper".
-
-    Raises:
-      InputError: if a name is no panel or search of the figure, or if only searches are
-        named.
-    """
+    """Return the small version of a figure, of the named panels or the first one."""
     selected = _selected(figure, names or [*figure.panels][:1])
     if not selected.panels:
         raise InputError(
@@ -129,17 +118,24 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
         if search := curve.search:
             base = "scaled" if search.decompose_rewards else "tuned"
             base = "paper" if isinstance(search, PaperSearch) else base
-        return dataclasses.replace(curve, base=base, seeds=3, total_steps=100_000)
+        return dataclasses.replace(curve, base=base, seeds=3, total_steps=_QUICK_STEPS)
 
     panels = {
         panel: {name: small(curve) for name, curve in curves.items()}
         for panel, curves in selected.panels.items()
     }
-    return dataclasses.replace(figure, panels=panels, searches={})
+    comparisons = figure.comparisons and {
+        names: terms
+        for names, terms in figure.comparisons.items()
+        if all(panel in panels for _, panel, _ in terms)
+    }
+    return dataclasses.replace(
+        figure, panels=panels, searches={}, comparisons=comparisons
+    )
 
 
 def _train(name: str, options: Options) -> None:
-    """Train the runs that a figure lacks, then write its page."""
+    """Train the runs that a figure lacks, then draw them."""
     setup = Setup(
         **{x.name: getattr(options, x.name) for x in dataclasses.fields(Setup)}
     )
@@ -181,8 +177,15 @@ def _train(name: str, options: Options) -> None:
         for each in engine.unfinished(missing, setup):
             print(f"  {engine.title(each)}")
         return
-    text = "{{table}}" if options.quick else None
-    report.write(name, Results(figure, *stores()), results, text)
+    if results.resolve() == RESULTS.resolve():
+        pages = report.all_results(stores()[0])
+        for page in report.showing(name):
+            report.write(pages, page, report.PAGES)
+            print(f"in {report.PAGES / page}.md")
+        return
+    text = f"# {figure.title}\n\n{{{{{name} curves}}}}\n\n{{{{{name} forest}}}}\n"
+    shown = {name: Results(name, figure, *stores())}
+    report.write(shown, name, results, text)
     print(f"in {results / name}.md")
 
 

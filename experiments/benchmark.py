@@ -7,8 +7,6 @@
   environments and, if it is installed (the extra "benchmark"), Stable-Baselines3's PPO
   on Gymnasium's task: a run in one process, a run whose environments have processes of
   their own, and a run on every core.
-- "peers": PPO of this package, rejax and purejaxrl, with the same sizes on the same
-  environments, 1 and 10 seeds at once (see `peers`; a line says what to install).
 - "scaling": training on 1, 2, 4 ... devices, with as many seeds on each device. A
   perfect ratio is the number of devices.
 
@@ -33,8 +31,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as P
 
 import gasil_envs
-from experiments import measured, peers
-from experiments.comparisons import interval
+from experiments import measured
 from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
@@ -64,7 +61,7 @@ def parser() -> Parser:
     add = parser.add_argument
     for name, choices, default, words in (
         ("tables", TABLES, ["physics", "training"], "tables to print"),
-        ("envs", TASKS, ["walker2d"], "tasks; the table peers has its own"),
+        ("envs", TASKS, ["walker2d"], "tasks"),
         ("variants", VARIANTS, [], "ways of building a task, instead of the table's"),
     ):
         add(f"--{name}", nargs="+", choices=choices, default=default, help=words)
@@ -75,7 +72,7 @@ def parser() -> Parser:
         ("devices", None, "CPU devices, instead of one per core"),
         ("seeds", 10, "seeds to train; in the scaling table on each device"),
         ("training-envs", None, "environments per seed, instead of the preset's"),
-        ("iterations", 2, "iterations in a repeat; of each training in table peers"),
+        ("iterations", 2, "iterations in a repeat"),
     ):
         add(f"--{name}", type=whole, default=number, help=words)
     parser.add_page()
@@ -93,7 +90,6 @@ class Row:
       run: takes some steps and returns how many per second.
       compile_seconds: time of compiling; 0 if nothing is compiled.
       error: relative error of one step; None if it is not measured.
-      returns: what trained policies return, (seeds,); None if it is not measured.
       speed: steps per second, the median of the repeats, once it is measured.
     """
 
@@ -103,7 +99,6 @@ class Row:
     run: Callable[[], float]
     compile_seconds: float = 0.0
     error: float | None = None
-    returns: np.ndarray | None = None
     speed: float = 0.0
 
 
@@ -156,10 +151,9 @@ def _serve(pipe: Any, flags: str, num_devices: int, build: Callable[[], Row]) ->
 
 
 def _row(variant: str, build: Callable[[], Row]) -> Row:
-    """Build a row; on a CPU that of MJX in a process of its own.
-
-    The option that keeps the loops of our physics is of a whole process, and slows MJX.
-    """
+    """Build a row; on a CPU that of MJX in a process of its own."""
+    # The option that keeps the loops of our physics is of a whole process, and slows
+    # MJX.
     if variant != "mjx" or jax.default_backend() != "cpu":
         return build()
     context = multiprocessing.get_context("spawn")
@@ -395,26 +389,12 @@ def scaling_table(env_name: str, options: Options) -> Iterator[list[Row]]:
     yield rows
 
 
-def peers_table(env_name: str, options: Options) -> Iterator[list[Row]]:
-    """The rows of each number of seeds."""
-    for seeds in (1, 10):
-        rows = []
-        for name, train, seconds, steps, returns in peers.programs(
-            env_name, seeds, options.iterations
-        ):
-            name = f"{name}, {seeds} seed{'s' * (seeds > 1)}"
-            run = functools.partial(speed_of, train, steps)
-            rows.append(Row(env_name, name, 32 * seeds, run, seconds, returns=returns))
-        yield rows
-
-
 def measure(rows: Sequence[Row], repeats: int) -> None:
     """Time the rows of a task in turn and print them."""
     speeds = np.median([[row.run() for row in rows] for _ in range(repeats)], axis=0)
     for row, speed in zip(rows, speeds, strict=True):
         row.speed = speed
         error = "" if row.error is None else f"{row.error:17.1e}"
-        error += "" if row.returns is None else f"  {interval(row.returns)}"
         print(
             f"{row.env:16} {row.name:36} {row.num_envs:6} {speed:11,.0f} "
             f"{speed / speeds[0]:6.2f} {row.compile_seconds:9.1f}{error}",
@@ -453,14 +433,11 @@ TABLES = {
     "physics": physics_table,
     "training": training_table,
     "scaling": scaling_table,
-    "peers": peers_table,
 }
 
 
 def run(options: Options) -> None:
     """Print the tables."""
-    if "peers" in options.tables:
-        peers.check()
     page = measured.find(parser(), options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
@@ -468,10 +445,8 @@ def run(options: Options) -> None:
     print(", ".join(f"{name} {x}" for name, x in versions.items() if x is not None))
     every: list[Row] = []
     for table in options.tables:
-        print(
-            f"{table:54}  envs     steps/s  ratio compile s  error of a step, or return"
-        )
-        for env_name in peers.ENVS if table == "peers" else options.envs:
+        print(f"{table:54}  envs     steps/s  ratio compile s  error of a step")
+        for env_name in options.envs:
             for rows in TABLES[table](env_name, options):
                 measure(rows, options.repeats)
                 every += rows

@@ -1,4 +1,4 @@
-"""Comparisons of final returns with their intervals, as numbers and as text.
+"""Comparisons of final returns, and of the seeds that solve a task, with intervals.
 
 Verdicts are corrected by Holm's method for the number of comparisons in their family.
 """
@@ -25,9 +25,10 @@ _DRAWS = 10_000
 FEWEST_SEEDS = 5
 #: The verdict on two curves that both return less than doing nothing.
 BELOW = "both below doing nothing"
-_VERDICTS = ("better", "not clear", "worse", BELOW)
 #: Scores, (seeds,), by panel and curve.
 Scores = Mapping[tuple[str, str], np.ndarray]
+#: The scores of our curve and of the other one on a task, (seeds,) each.
+Sides = tuple[np.ndarray, np.ndarray]
 
 
 class Effect(NamedTuple):
@@ -36,13 +37,6 @@ class Effect(NamedTuple):
     middle: float
     p: float
     drawn: np.ndarray
-
-
-def verdict(middle: float, p: float) -> str:
-    """Return whether a difference with a corrected p-value is better or worse."""
-    if not p <= LEVEL:
-        return "not clear"
-    return "better" if middle > 0 else "worse"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -69,16 +63,14 @@ class Comparison:
     @property
     def verdict(self) -> str:
         """Better, worse, not clear, or that both are below doing nothing."""
-        return BELOW if self.below else verdict(self.middle, self.p)
+        if self.below:
+            return BELOW
+        if not self.p <= LEVEL:
+            return "not clear"
+        return "better" if self.middle > 0 else "worse"
 
     def __format__(self, spec: str) -> str:
         return in_words(self.middle, self.low, self.high, spec)
-
-    def verdict_in_words(self, spec: str = "") -> str:
-        """Return the verdict; if it is not clear, with what would have been."""
-        if self.verdict != "not clear":
-            return self.verdict
-        return f"not clear (visible from {number(self.visible, spec)} on)"
 
 
 def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Comparison]:
@@ -90,6 +82,28 @@ def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Compari
         visible = visible_effect(drawn, len(effects) + dropped)
         compared[key] = Comparison(middle, p_values[key], low, high, visible)
     return compared
+
+
+def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
+    """Return the p-values of a family, corrected by Holm's method.
+
+    Those that are dropped, because their runs are, count as if they were the largest.
+    """
+    higher, least = {}, 0.0
+    for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
+        least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
+        higher[key] = least
+    return {key: higher[key] for key in p_values}
+
+
+def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
+    """Return the smallest true effect that would be found with a probability of 80%.
+
+    The level of the test is `LEVEL` / `comparisons`, as for Holm's smallest p-value.
+    """
+    quantile = statistics.NormalDist().inv_cdf
+    errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
+    return errors * float(np.std(drawn))
 
 
 @functools.cache
@@ -126,6 +140,12 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     return float((1 + as_far.sum()) / (1 + _DRAWS))
 
 
+def bootstrap_p(drawn: np.ndarray) -> float:
+    """Return the p-value of bootstrap samples of an effect, (draws,)."""
+    beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
+    return min(1.0, 2 * (1 + beyond) / (1 + len(drawn)))
+
+
 def compare(
     scores: Scores, family: Comparisons, dropped: int = 0
 ) -> dict[tuple[str, ...], Comparison]:
@@ -138,13 +158,10 @@ def compare(
     of comparisons, the next by one less, and so on, and makes none smaller than the one
     before.
     """
-    complete = {
-        key: terms
-        for key, terms in family.items()
-        if all((panel, curve) in scores for _, panel, curve in terms)
-    }
     effects = {}
-    for key, terms in complete.items():
+    for key, terms in family.items():
+        if not all((panel, curve) in scores for _, panel, curve in terms):
+            continue
         sides = [scores[panel, curve] for _, panel, curve in terms]
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
@@ -156,87 +173,90 @@ def compare(
     return judged(effects, dropped)
 
 
-def bootstrap_p(drawn: np.ndarray) -> float:
-    """Return the p-value of bootstrap samples of an effect, (draws,)."""
-    beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
-    return min(1.0, 2 * (1 + beyond) / (1 + len(drawn)))
-
-
-def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
-    """Return the smallest true effect that would be found with a probability of 80%.
-
-    The level of the test is `LEVEL` / `comparisons`, as for Holm's smallest p-value.
-    """
-    quantile = statistics.NormalDist().inv_cdf
-    errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
-    return errors * float(np.std(drawn))
-
-
-def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
-    """Return the p-values of a family, corrected by Holm's method.
-
-    Those that are dropped, because their runs are, count as if they were the largest.
-    """
-    higher, least = {}, 0.0
-    for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
-        least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
-        higher[key] = least
-    return {key: higher[key] for key in p_values}
-
-
 def more(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Return 1 where one is more than the other, and one half where they are equal."""
     return np.add(one > other, one >= other, dtype=np.int8) / 2
 
 
-def share_of_more(ours: np.ndarray, others: np.ndarray) -> np.ndarray:
-    """Return the share of pairs of seeds in which ours is more, from (..., seeds)."""
-    return more(ours[..., :, None], others[..., None, :]).mean(axis=(-1, -2))
+def improvement(name: str, sides: Sequence[Sides]) -> Effect:
+    """Return the probability of improvement over tasks, less one half.
 
-
-def improvement_share(scores: Scores, panel: str, ours: str, other: str) -> float:
-    """Return `share_of_more` of two curves, NaN below all; NaN without scores."""
-    if not {(panel, ours), (panel, other)} <= scores.keys():
-        return math.nan
-    pair = [
-        np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
-        for x in (ours, other)
-    ]
-    return float(share_of_more(*pair))
-
-
-def improvement(scores: Scores, panels: Sequence[str], ours: str, *, other: str) -> str:
-    """Return the probability of improvement over the panels, as text.
-
-    It is the probability that a random seed of `ours` has a higher score than a random
-    seed of `other`, where equal scores count half, averaged over the panels (Agarwal et
-    al. 2021). The 95% percentile bootstrap interval is over seeds, drawn within each
-    panel. A NaN, the score of a seed that ended no episode, is below all other scores.
+    It is the probability that a random seed of ours has a higher score than a random
+    seed of the other curve, where equal scores count half, averaged over tasks (Agarwal
+    et al. 2021). A NaN, the score of a seed that ended no episode, is below all other
+    scores. The p-value is that of a permutation of seeds within each task; `name` seeds
+    its random numbers.
     """
-    rng = generator(f"{ours}/{other}")
+    rng, middle = generator(name), 0.0
+    dealt, drawn = np.zeros(_DRAWS), np.zeros(_DRAWS)
+    for pair in sides:
+        both = [np.nan_to_num(x, nan=-np.inf, neginf=-np.inf) for x in pair]
+        ours, other = map(len, both)
+        # Our seeds by the other's: (our seeds, other seeds).
+        wins = more(both[0][:, None], both[1][None, :]) - 0.5
+        middle += float(wins.mean())
+        # The sum of our ranks among all says how often ours are more.
+        pooled = np.concatenate(both)
+        ranks = np.tile(more(pooled[:, None], pooled).sum(axis=1), (_DRAWS, 1))
+        sums = rng.permuted(ranks, axis=1)[:, :ours].sum(axis=1)
+        dealt += (sums - ours**2 / 2) / (ours * other) - 0.5
+        first, second = (_resampled(size, rng) for size in (ours, other))
+        drawn += np.sum(first @ wins * second, axis=1)
+    as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
+    p_value = (1 + as_far) / (1 + _DRAWS)
+    return Effect(middle / len(sides), p_value, drawn / len(sides))
 
-    def resampled(values: np.ndarray) -> np.ndarray:
-        return values[rng.integers(len(values), size=(_DRAWS // 10, len(values)))]
 
-    def of(panel: str, x: str) -> np.ndarray:
-        return np.nan_to_num(scores[panel, x], nan=-np.inf, neginf=-np.inf)
-
-    pairs = [(of(panel, ours), of(panel, other)) for panel in panels]
-    middle = np.mean([share_of_more(*pair) for pair in pairs])
-    drawn = [share_of_more(*map(resampled, pair)) for pair in pairs]
-    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
-    return in_words(float(middle), low, high, ".2f")
+def _resampled(size: int, rng: np.random.Generator) -> np.ndarray:
+    """Return the share of each seed in bootstrap samples, (draws, seeds)."""
+    drawn = rng.integers(size, size=(_DRAWS, size)) + size * np.arange(_DRAWS)[:, None]
+    counts = np.bincount(drawn.ravel(), minlength=_DRAWS * size)
+    return counts.reshape(_DRAWS, size) / size
 
 
-def counted(verdicts: Sequence[str]) -> str:
-    """Return the count of each verdict as text, such as "better on 2, worse on 1"."""
-    words = [word for word in _VERDICTS if word in verdicts]
-    return ", ".join(f"{word} on {verdicts.count(word)}" for word in words)
+@functools.cache
+def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
+    """Return the p-value of Fisher's exact test, two-sided.
+
+    `ours` of our seeds and `other` of the other curve's solve the task.
+    """
+    solved, seeds = ours + other, our_seeds + other_seeds
+
+    def ways(x: int) -> int:
+        return math.comb(our_seeds, x) * math.comb(other_seeds, solved - x)
+
+    counts = range(max(0, solved - other_seeds), min(solved, our_seeds) + 1)
+    as_rare = [ways(x) for x in counts if ways(x) <= ways(ours)]
+    return sum(as_rare) / math.comb(seeds, solved)
+
+
+def lead(name: str, sides: Sequence[Sides]) -> Effect:
+    """Return how much larger our share of solving seeds is, averaged over tasks.
+
+    `sides` say which seeds solve a task, as bool. The p-value is Fisher's for one task,
+    else that of a permutation of seeds within each task; `name` seeds its random
+    numbers.
+    """
+    rng, middle = generator(name), 0.0
+    dealt, drawn = np.zeros(_DRAWS), np.zeros(_DRAWS)
+    for first, second in sides:
+        middle += float(first.mean() - second.mean())
+        for seeds, sign in ((first, 1), (second, -1)):
+            drawn += sign * rng.binomial(len(seeds), seeds.mean(), _DRAWS) / len(seeds)
+        total = int(first.sum() + second.sum())
+        left = len(first) + len(second) - total
+        got = rng.hypergeometric(total, left, len(first), _DRAWS)
+        dealt += got / len(first) - (total - got) / len(second)
+    as_far = int(np.sum(np.abs(dealt) >= abs(middle) - 1e-9))
+    p_value = (1 + as_far) / (1 + _DRAWS)
+    if len(sides) == 1:
+        p_value = fisher_p(int(first.sum()), len(first), int(second.sum()), len(second))
+    return Effect(middle / len(sides), p_value, drawn / len(sides))
 
 
 def number(value: float, spec: str = "") -> str:
     """Return a score as text; by default without decimals from 100 on."""
-    return format(value, spec or (".0f" if abs(value) >= 100 else ".1f"))
+    return format(value, spec or (",.0f" if abs(value) >= 100 else ".1f"))
 
 
 def in_words(middle: float, low: float, high: float, spec: str = "") -> str:
@@ -253,8 +273,8 @@ def interval(scores: np.ndarray) -> str:
     return in_words(middle, low, high)
 
 
-def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
-    """Return the interquartile mean over the seeds of all tasks, as text.
+def over_tasks(name: str, scores: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Return the interquartile mean over the seeds of all tasks, and its interval.
 
     Every task has the same weight; its scores are (seeds,), in one unit. The 95%
     interval is the percentile bootstrap's over seeds, drawn within each task; `name`
@@ -269,4 +289,15 @@ def over_tasks(name: str, scores: Sequence[np.ndarray]) -> str:
     means = interquartile_mean(np.reshape(drawn, (len(drawn), -1)), axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     every = np.concatenate([x.repeat(most // len(x)) for x in scores])
-    return in_words(float(interquartile_mean(every)), low, high, ".2f")
+    return float(interquartile_mean(every)), float(low), float(high)
+
+
+def mean_share(solved: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Return the mean share of solving seeds over tasks, and its bootstrap interval.
+
+    `solved` says of each task which seeds solve it, bool (seeds,).
+    """
+    rng = np.random.default_rng(0)
+    drawn = [rng.binomial(len(x), x.mean(), _DRAWS) / len(x) for x in solved]
+    low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])
+    return float(np.mean([x.mean() for x in solved])), float(low), float(high)

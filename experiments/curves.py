@@ -3,11 +3,18 @@
 import dataclasses
 import itertools
 import types
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from experiments.agents import AGENTS
-from experiments.search import DELAY, PAPERS, Point, Search
+from experiments.search import (
+    DELAY,
+    PAPERS,
+    SPARSE_GRIDS,
+    SPARSE_ROBOTS,
+    Point,
+    Search,
+)
 from experiments.store import Store
 from gasil_jax import presets
 from gasil_jax.algorithms import Algorithm
@@ -102,19 +109,20 @@ Panels = Mapping[str, Mapping[str, Curve]]
 
 @dataclasses.dataclass(frozen=True)
 class Figure:
-    """A figure and its page.
+    """A figure: curves, and what is compared.
 
     Attributes:
-      title: title of the page.
+      title: what it is about.
       claim: the paper's claim; empty if it has none about this.
       panels: the curves by panel and name.
-      favourite: name of the curve that is compared with each other curve of its panel;
-        None compares each pair of curves.
-      comparisons: comparisons to make instead of those with the favourite.
+      favourite: name of the curve that is compared with each other curve of its panel.
+      pairs: pairs of curves to compare instead, (ours, other), in each panel of both.
+      comparisons: comparisons to make instead.
       searches: searches that are trained before the curves, by their names.
       over: a field of `Curve`, or a setting, that is the x-axis of final returns, and
         the axis' label; None for learning curves. Curves whose names differ only in the
         field's value are points of one line.
+      shown: names of the lines in the picture, default five of them.
       early: number of first environment steps whose mean return is compared too, as the
         curve "NAME early".
       dropped_pairs: number of pairs of curves that were compared in every panel and are
@@ -128,10 +136,12 @@ class Figure:
     title: str
     claim: str
     panels: Panels = dataclasses.field(default_factory=dict)
-    favourite: str | None = "ppo+gasil"
+    favourite: str = "ppo+gasil"
+    pairs: Sequence[tuple[str, str]] = ()
     comparisons: Comparisons | None = None
     searches: Mapping[str, Search] = dataclasses.field(default_factory=dict)
     over: tuple[str, str] | None = None
+    shown: Sequence[str] = ()
     early: int | None = None
     dropped_pairs: int = 0
     solved_from: Callable[[str], float] | None = None
@@ -149,6 +159,27 @@ class Figure:
         chosen = self.panels if panels is None else panels
         return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
 
+    def of_kind(self, kind: str = "") -> list[str]:
+        """Return the panels of a kind.
+
+        It is "delayed" or "dense", with "raw" behind it for rewards that are not
+        normalized; of sparse tasks "robots" or "navix", and "noisy" for noise on the
+        actions. Without a kind they are all panels, or the sparse ones of no such
+        kind.
+        """
+
+        def words(panel: str) -> set[str]:
+            if self.solved_from is None:
+                delayed, raw, _ = next(iter(self.panels[panel].values())).family
+                return {"delayed" if delayed else "dense", *["raw"] * raw}
+            task = panel.removesuffix("_noisy")
+            kinds = {"robots": task in SPARSE_ROBOTS, "navix": task in SPARSE_GRIDS}
+            kinds["noisy"] = task != panel
+            return {x for x, holds in kinds.items() if holds}
+
+        of_all = not kind and self.solved_from is None
+        return [x for x in self.panels if of_all or words(x) == set(kind.split())]
+
     def point_of(self, panel: str, name: str) -> tuple[str, Any]:
         """Return the name of the line that a curve belongs to, and its x value."""
         if self.over is None:
@@ -164,14 +195,14 @@ class Figure:
         return next((x for x in curves if x != name), None)
 
     def compared(self) -> Comparisons:
-        """Return all comparisons of the figure's page: one family of tests."""
+        """Return all comparisons of the figure."""
         if self.comparisons is not None:
             return self.comparisons
         compared: dict[tuple[str, ...], Terms] = {}
         for panel, curves in self.panels.items():
             pairs = [(self.rival(panel, name), name) for name in curves]
-            if self.favourite is None:
-                pairs = [*itertools.combinations(curves, 2)]
+            if self.pairs:
+                pairs = [pair for pair in self.pairs if curves.keys() >= {*pair}]
             for part in ("", " early") if self.early else ("",):
                 for ours, other in pairs:
                     if ours is not None:
@@ -180,7 +211,7 @@ class Figure:
         return compared
 
     def families(self) -> list[Comparisons]:
-        """Return the comparisons of the page in families, each corrected on its own.
+        """Return the comparisons in families, each corrected on its own.
 
         Comparisons with dense and with delayed rewards, those with normalized and with
         raw ones, and those among the paper's agents and others are separate families.
@@ -210,13 +241,6 @@ class Figure:
 def difference(panel: str, ours: str, other: str) -> Terms:
     """Return the terms of one curve less another of the same panel."""
     return ((1.0, panel, ours), (-1.0, panel, other))
-
-
-def differences(
-    panels: Iterable[str], pairs: Collection[tuple[str, str]]
-) -> Comparisons:
-    """Return the comparisons of pairs of curves, (ours, other), in each panel."""
-    return {(panel, *x): difference(panel, *x) for panel in panels for x in pairs}
 
 
 def name_of(env: str, reward_delay: int = 1) -> str:

@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from experiments.curves import Figure
 from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from experiments.store import RESULTS
@@ -55,6 +56,12 @@ def stored() -> Mapping[str, Return]:
             row["task"]: Return(*(float(row[x]) for x in Return._fields))
             for row in csv.DictReader(file)
         }
+
+
+def of(figure: Figure, panel: str) -> Return | None:
+    """Return what doing nothing returns in a panel, or None if it is not shown."""
+    curve = next(iter(figure.panels[panel].values()))
+    return stored()[curve.env] if figure.floor else None
 
 
 def parser() -> Parser:

@@ -35,8 +35,13 @@ from gasil_jax.host.sweep import Recording, Sweep
 ROWS, EVALUATIONS = 50, 10
 #: Files and folders of the checkout that experiments write.
 _WRITTEN = (
-    *("experiments/results", "README.md", "gasil_jax/tuned_presets.json"),
-    *("gasil_jax/zoo", "docs/zoo.md"),
+    *(
+        "experiments/results",
+        "docs/results",
+        "README.md",
+        "gasil_jax/tuned_presets.json",
+    ),
+    *("gasil_jax/zoo", "docs/data.md"),
 )
 #: The file of a scratch folder that says how each session trained.
 _SESSIONS = "provenance.json"

@@ -3,13 +3,16 @@
 import dataclasses
 import functools
 import itertools
+import math
 from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import doing_nothing, shares
-from experiments.comparisons import Comparison, Scores, compare
-from experiments.curves import Curve, Figure
+from experiments import comparisons, doing_nothing
+from experiments.comparisons import Comparison, Scores, Sides
+from experiments.curves import Comparisons, Curve, Figure
+from experiments.search import Search
 from experiments.store import Record, Store
 from gasil_jax.host.runs import Run
 from gasil_jax.statistics import interquartile_mean
@@ -38,6 +41,10 @@ class CurveResults:
         evaluations = [record.evaluation_return for record in self.records.values()]
         return np.array([returns[-1] for returns in evaluations if len(returns)])
 
+    def steps_until(self, success: float) -> np.ndarray:
+        """Return `steps_until_solved` of each seed, (seeds,)."""
+        return np.array([steps_until_solved(x, success) for x in self.records.values()])
+
     def provenance(self) -> str:
         """Return physics, versions, devices and commits of the seeds as text."""
         seeds_of: dict[str, list[int]] = {}
@@ -64,19 +71,66 @@ def _ranges(numbers: Sequence[int]) -> str:
     return ", ".join(f"{x[0]} to {x[-1]}" if len(x) > 1 else f"{x[0]}" for x in runs)
 
 
+def steps_until_solved(record: Record, success: float) -> float:
+    """Return the steps after which a run's mean return is half of a success's.
+
+    They are infinite for a run that does not solve its task: whose final return is less
+    than half of a success's, whatever it was before.
+    """
+    if not record.final >= success / 2:
+        return math.inf
+    return float(record.env_steps[(record.episode_return >= success / 2).argmax()])
+
+
+class Row(NamedTuple):
+    """A line of a forest plot.
+
+    Attributes:
+      name: what is compared.
+      compared: the comparison; its null is 0.
+      verdicts: the verdict on each single panel, where there are several.
+    """
+
+    name: str
+    compared: Comparison
+    verdicts: Mapping[str, str]
+
+
+#: A mean over tasks and the ends of its interval, by curve.
+Whole = dict[str, tuple[float, float, float]]
+
+
+@functools.cache
+def unit(env: str, store: Store) -> float | None:
+    """Return what tuned PPO returns with dense rewards, or None if it is not stored."""
+    search = Search(env, "ppo")
+    if (point := search.chosen(store)) is None:
+        return None
+    (runs,) = search.runs([point], range(10))
+    if store.missing(runs):
+        return None
+    return float(interquartile_mean(np.array([store[run].final for run in runs])))
+
+
 class Results:
     """The stored runs of a figure; `searched` is the store of the searches' runs.
 
     Attributes:
+      name: name of the figure.
       curves: the curves of which runs are stored, by panel and name.
-      scores: the final returns of the complete ones, and what they return early.
+      scores: the final returns of the complete ones, and what they return early; where
+        tasks are either solved or not, whether each seed solves it.
+      sooner: where tasks are either solved or not, minus the steps until then.
       comparisons: the figure's comparisons of these scores.
     """
 
-    def __init__(self, figure: Figure, store: Store, searched: Store | None = None):
-        self.figure, self.searched = figure, searched or store
+    def __init__(
+        self, name: str, figure: Figure, store: Store, searched: Store | None = None
+    ):
+        self.name, self.figure, self.searched = name, figure, searched or store
         self.curves: dict[tuple[str, str], CurveResults] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
+        self.sooner: dict[tuple[str, str], np.ndarray] = {}
         for panel, label, curve in figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
@@ -84,51 +138,135 @@ class Results:
             results = CurveResults(curve, {run: store[run] for run in runs})
             self.curves[panel, label] = results
             if results.complete:
-                self.scores[panel, label] = results.final
-                if figure.early is not None:
-                    share = figure.early / curve.total_steps
-                    early = [x.part(0.0, share) for x in results.records.values()]
-                    self.scores[panel, f"{label} early"] = np.array(early)
-        self.comparisons = self.compare(self.scores)
+                self._add_scores(panel, label, results)
 
-    def compare(self, scores: Scores) -> dict[tuple[str, ...], Comparison]:
-        """Return the figure's comparisons of scores, corrected family by family."""
+    def _add_scores(self, panel: str, label: str, one: CurveResults) -> None:
+        figure = self.figure
+        self.scores[panel, label] = one.final
+        if figure.solved_from is not None:
+            steps = one.steps_until(figure.solved_from(one.curve.env))
+            self.scores[panel, label] = np.isfinite(steps)
+            self.sooner[panel, label] = -steps
+        if figure.early is not None:
+            share = figure.early / one.curve.total_steps
+            early = [x.part(0.0, share) for x in one.records.values()]
+            self.scores[panel, f"{label} early"] = np.array(early)
+
+    @functools.cached_property
+    def comparisons(self) -> dict[tuple[str, ...], Comparison]:
+        """The figure's comparisons, corrected family by family."""
         dropped = self.figure.dropped_pairs * len(self.figure.panels)
         compared: dict[tuple[str, ...], Comparison] = {}
         for family in self.figure.families():
-            compared |= compare(scores, family, dropped)
-        if not self.figure.floor:
-            return compared
-        terms = self.figure.compared()
+            if self.figure.solved_from is None:
+                compared |= comparisons.compare(self.scores, family, dropped)
+                continue
+            sides = {key: self._sides(self.scores, key) for key in family}
+            effects = {key: comparisons.lead("", [x]) for key, x in sides.items() if x}
+            compared |= comparisons.judged(effects, dropped)
+        terms = self._terms
         return {
             key: dataclasses.replace(
-                one, below=all(self._is_below(scores, *x) for _, *x in terms[key])
+                one, below=all(self._is_below(*x) for _, *x in terms[key])
             )
             for key, one in compared.items()
         }
 
-    def _is_below(self, scores: Scores, panel: str, label: str) -> bool:
-        """Return whether a curve returns less than doing nothing on its task."""
-        floor = doing_nothing.stored()[self.figure.panels[panel][label].env].mean
-        return float(interquartile_mean(scores[panel, label])) < floor
-
     @functools.cached_property
-    def steps(self) -> shares.Steps:
-        """The steps until seeds solve their tasks, of complete curves."""
-        from_ = self.figure.solved_from
-        assert from_ is not None
-        return {
-            key: np.array(
-                [
-                    shares.steps_until_solved(record, from_(results.curve.env))
-                    for record in results.records.values()
-                ]
+    def _terms(self) -> Comparisons:
+        return self.figure.compared()
+
+    def _sides(self, scores: Scores, key: tuple[str, ...]) -> Sides | None:
+        """Return the scores of a comparison's two curves, or None if any lack."""
+        found = [scores.get((panel, name)) for _, panel, name in self._terms[key]]
+        ours, other = found
+        return None if ours is None or other is None else (ours, other)
+
+    def _is_below(self, panel: str, label: str) -> bool:
+        """Return whether a curve is known to return less than doing nothing."""
+        floor = doing_nothing.of(self.figure, panel)
+        if floor is None:
+            return False
+        return float(interquartile_mean(self.scores[panel, label])) < floor.mean
+
+    def whole(self, panels: Sequence[str]) -> Whole:
+        """Return each complete curve's mean over panels of at least three tasks.
+
+        Where tasks are either solved or not, it is the share of seeds. Else a return is
+        divided by what tuned PPO returns on the task with dense rewards. There is no
+        mean of panels that share a task, and none of two curves alone.
+        """
+        figure, whole = self.figure, Whole()
+        envs = [next(iter(figure.panels[x].values())).env for x in panels]
+        if figure.over or len(set(envs)) < max(3, len(envs)):
+            return whole
+        for name in figure.names(panels):
+            if not all((panel, name) in self.scores for panel in panels):
+                continue
+            scores = [self.scores[panel, name] for panel in panels]
+            if figure.solved_from is not None:
+                whole[name] = comparisons.mean_share(scores)
+                continue
+            units = [unit(env, self.searched) for env in envs]
+            relative = [x / u for x, u in zip(scores, units, strict=True) if u]
+            if len(relative) == len(scores):
+                whole[name] = comparisons.over_tasks(name, relative)
+        return whole if len(whole) > 2 else {}
+
+    def pairs(self, kind: str = "") -> dict[tuple[str, str], list[str]]:
+        """Return the pairs that are compared on panels of a kind, each with these."""
+        on: dict[tuple[str, str], list[str]] = {}
+        panels = self.figure.of_kind(kind)
+        for panel, ours, other, *_ in self.comparisons:
+            if panel in panels:
+                on.setdefault((ours, other), []).append(panel)
+        return on
+
+    @property
+    def is_of_one_task(self) -> bool:
+        """Whether all panels are of one task, so that returns have one unit."""
+        return len({curve.env for *_, curve in self.figure.curves()}) == 1
+
+    def forest(self, kind: str = "") -> list[Row]:
+        """Return what is compared on panels of a kind, a row for each pair of curves.
+
+        On one task it is the difference of final returns. Over several tasks it is the
+        probability of improvement, less one half, or the difference of the shares of
+        seeds that solve a task. These rows are a family of tests. Panels where both
+        curves return less than doing nothing do not count.
+        """
+        if self.is_of_one_task:
+            return [
+                Row(_in_words(*key), one, {}) for key, one in self.comparisons.items()
+            ]
+        test: Any = comparisons.improvement
+        if self.figure.solved_from is not None:
+            test = comparisons.lead
+        return self._rows(kind, test, self.scores)
+
+    def who_is_sooner(self, kind: str = "") -> list[Row]:
+        """Return `forest`'s rows with how often ours solves a task sooner."""
+        return self._rows(kind, comparisons.improvement, self.sooner)
+
+    def _rows(self, kind: str, test: Any, scores: Scores) -> list[Row]:
+        pairs, effects = self.pairs(kind), {}
+        for pair, panels in pairs.items():
+            keys = [(panel, *pair) for panel in panels]
+            keys = [key for key in keys if not self.comparisons[key].below]
+            if sides := [x for x in (self._sides(scores, key) for key in keys) if x]:
+                effects[pair] = test("/".join(pair), sides)
+        every = comparisons.judged(effects, self.figure.dropped_pairs)
+        return [
+            Row(
+                _in_words("", *pair),
+                one,
+                {x: self.comparisons[x, *pair].verdict for x in pairs[pair]},
             )
-            for key, results in self.curves.items()
-            if results.complete
-        }
+            for pair, one in every.items()
+        ]
 
-    @functools.cached_property
-    def solved(self) -> shares.Solved:
-        """Which seeds solve their task, of complete curves."""
-        return {key: np.isfinite(steps) for key, steps in self.steps.items()}
+
+def _in_words(panel: str, ours: str, other: str, less: str = "") -> str:
+    """Return what a comparison compares."""
+    before = f"{panel}: " if panel else ""
+    return f"{before}{ours} − {other}" + (f", less {less}'s" if less else "")

@@ -1,237 +1,276 @@
-"""Plots of figures: learning curves, or final returns over a setting."""
+"""Pictures of figures: learning curves, returns over a setting, and forest plots."""
 
 import io
 import itertools
 import math
 import pathlib
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any
 
-import matplotlib
 import numpy as np
 from matplotlib.figure import Figure as Picture
+from matplotlib.patches import Rectangle
 from PIL import Image
 
 from experiments import doing_nothing
-from experiments.comparisons import Scores
+from experiments.comparisons import BELOW
 from experiments.curves import Figure
+from experiments.figure_results import CurveResults, Results, Row, Whole
 from experiments.search import AGENTS
-from experiments.store import Record
 from gasil_jax.host import output_file, plotting
 from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
-#: The color of each agent, the same in all figures.
+#: The color of each agent, the same in all pictures.
 _COLOR_OF = dict(zip(AGENTS, plotting.COLORS, strict=False))
-#: The stored runs of each curve, by panel and curve.
-Records = Mapping[tuple[str, str], Sequence[Record]]
+#: The color of each verdict. The last two have the same intervals and other squares.
+_VERDICTS = {"better": "#0072B2", "not clear": "0.72", "worse": "#D55E00", BELOW: "1.0"}
+#: Largest numbers of lines in a panel and of panels in a row.
+MOST_LINES, _MOST_COLUMNS = 5, 4
 
 
-def draw(figure: Figure, records: Records, scores: Scores) -> Picture:
-    """Return a plot with axes for each panel.
+def curves(results: Results, kind: str = "") -> Picture:
+    """Return learning curves, or final returns over a setting, of a kind of panels.
 
-    Args:
-      figure: what it is a plot of.
-      records: the stored runs of each curve.
-      scores: the final returns of the complete curves.
+    Beside several tasks stands the mean over them.
     """
-    panels = list(dict.fromkeys(panel for panel, _ in records))
-    count = len(panels)
-    # Four panels are drawn in a square, so that none is alone in its row.
-    columns = min({4: 2}.get(count, 4 if count > 6 else 3), count)
+    figure = results.figure
+    panels = [x for x in figure.of_kind(kind) if any(k[0] == x for k in results.curves)]
+    lines, whole = _lines(figure), results.whole(panels)
+    count = len(panels) + bool(whole)
+    columns = 3 if count in (5, 6, 12) else min(_MOST_COLUMNS, count)
     rows = math.ceil(count / columns)
-    width = 3.6 + (0.055 * max(map(len, figure.names())))
-    size = ((width if _has_direct_labels(figure) else 3.6) * columns, 2.8 * rows)
-    picture = Picture(figsize=size, layout="constrained")
+    picture = Picture(figsize=(3.1 * columns, 2.5 * rows + 0.4), layout="constrained")
     grid = picture.subplots(rows, columns, squeeze=False)
+    for axes, panel in zip(grid.flat, panels, strict=False):
+        draw = _draw_over if figure.over else _draw_curves
+        draw(results, panel, axes, lines)
+        _draw_floor(figure, panel, axes)
+        axes.set_title(_short(panel), fontsize=9)
+        axes.tick_params(labelsize=7)
+    if whole:
+        _draw_whole(grid.flat[len(panels)], whole, lines, figure)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
-    for axes, panel in zip(grid.flat, panels, strict=False):
-        if figure.over:
-            _draw_over(figure, panel, scores, axes=axes)
-        else:
-            _draw_curves(figure, panel, records, axes=axes)
-        axes.set_title(panel)
-    if not _has_direct_labels(figure):
-        _draw_legends(figure, picture, list(grid.flat[:count]))
+    shares = figure.solved_from is not None
     for row in grid:
-        is_share = figure.solved_from is not None
-        row[0].set_ylabel("share of seeds" if is_share else "episode return")
+        row[0].set_ylabel("share of seeds" if shares else "episode return", fontsize=8)
+    _draw_legend(picture, [*grid.flat[: len(panels)]], lines)
     return picture
 
 
-def _draw_legends(figure: Figure, picture: Picture, panels: Sequence[Any]) -> None:
-    """Draw a legend in each panel, or below all panels if there are many names."""
-    shown = [axes.get_legend_handles_labels() for axes in panels]
-    handle_of = {
-        name: x
-        for handles, names in shown
-        for x, name in zip(handles, names, strict=True)
-    }
-    if len(panels) > 1 and len(handle_of) > 3:
-        # So many names would hide the curves, so the legend is below the panels. At
-        # this font size a letter is about 0.07 inches wide.
-        width = 0.5 + 0.07 * max(map(len, handle_of))
-        size = picture.get_size_inches()
-        fitting = max(1, min(4, int(size[0] / width)))
-        if figure.solved_from is not None:
-            # Else the legend of many names takes the panels' room.
-            lines = math.ceil(len(handle_of) / fitting)
-            picture.set_size_inches(size[0], size[1] + 0.17 * lines)
-        below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
-        picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
-    else:
-        for axes, (_, names) in zip(panels, shown, strict=True):
-            if names:
-                axes.legend(frameon=False, fontsize=7)
-
-
-#: The styles of lines that have the same color.
-_STYLES = ("-", "--", ":", "-.")
+def _draw_legend(picture: Picture, panels: Sequence[Any], lines: Any) -> None:
+    """Draw one legend below all panels."""
+    handle_of: dict[str, Any] = {}
+    for axes in panels:
+        handles, names = axes.get_legend_handles_labels()
+        handle_of |= dict(zip(names, handles, strict=True))
+    handle_of = {name: handle_of[name] for name in lines if name in handle_of}
+    # At this font size a letter is about 0.07 inches wide.
+    width = 0.6 + 0.07 * max(map(len, handle_of), default=0)
+    fitting = max(1, min(len(handle_of), int(picture.get_figwidth() / width)))
+    below: Any = {"loc": "outside lower center", "ncols": fitting, "fontsize": 8}
+    picture.legend([*handle_of.values()], [*handle_of], frameon=False, **below)
 
 
 def _lines(figure: Figure) -> dict[str, dict[str, Any]]:
-    """Return color, style and width of each curve's line, the same in all panels.
-
-    If there are more names than colors, curves of one agent share its color. If the
-    styles are too few for that, or if the names are numbers, colors go from dark to
-    light. The figure's subject is thick.
-    """
-    names = figure.names()
-    agent_of = {name: curve.agent for _, name, curve in figure.curves()}
-    alike = {
-        name: [x for x in names if agent_of[x] == agent_of[name]] for name in names
-    }
-    many = len(names) > len(plotting.COLORS)
-    few_styles = many and max(map(len, alike.values())) > len(_STYLES)
-    style_of = dict.fromkeys(names, "-")
-    if few_styles or all(map(str.isdecimal, names)):
-        shades = matplotlib.colormaps["viridis"](np.linspace(0.0, 0.9, len(names)))
-        color_of: dict[str, Any] = dict(zip(names, shades, strict=True))
-    elif many:
-        agents = _with_free_colors(dict.fromkeys(agent_of.values()))
-        color_of = {name: agents[agent_of[name]] for name in names}
-        style_of = {name: _STYLES[alike[name].index(name)] for name in names}
-    else:
-        color_of = _with_free_colors(names)
+    """Return color and width of each shown line, the same in all panels."""
+    named: dict[str, str] = {}
+    first: set[str] = set()
+    for panel, curves in figure.panels.items():
+        own = {figure.point_of(panel, x)[0]: curve.agent for x, curve in curves.items()}
+        first |= {*sorted(own, key=lambda x: x != figure.favourite)[:MOST_LINES]}
+        named = {**own, **named}
+    shown = [x for x in named if x in (figure.shown or first)]
+    color_of = _with_free_colors(shown, named)
     return {
         name: {
             "color": color_of[name],
-            "linestyle": style_of[name],
-            "linewidth": 2.4 if name == figure.favourite else 1.2,
+            "linewidth": 2.6 if name == figure.favourite else 1.2,
+            "zorder": 3 if name == figure.favourite else 2,
         }
-        for name in names
+        for name in shown
     }
 
 
-def _with_free_colors(names: Collection[str]) -> dict[str, Any]:
-    """Return each agent's own color, and for other names the colors that are left."""
-    color_of = {name: _COLOR_OF[name] for name in names if name in _COLOR_OF}
-    free = itertools.cycle(
-        [x for x in plotting.COLORS if x not in color_of.values()] or ["gray"]
-    )
-    return {name: color_of.get(name) or next(free) for name in names}
+def _with_free_colors(names: Collection[str], agents: Any) -> dict[str, Any]:
+    """Return each agent's own color, where it is free, and else one that is left."""
+    color_of: dict[str, Any] = {}
+    for name in sorted(names, key=lambda x: x != agents[x]):
+        own = _COLOR_OF.get(agents[name])
+        free = [own, *plotting.COLORS, "gray"]
+        color_of[name] = next(x for x in free if x and x not in color_of.values())
+    return color_of
 
 
-#: Largest number of bands in a panel, and of lines that are labelled at their ends.
-_MOST_BANDS, _MOST_LABELS = 5, 12
-
-
-def _has_direct_labels(figure: Figure) -> bool:
-    """Return whether lines are labelled at their ends, and not in a legend."""
-    if figure.over or figure.solved_from is not None:
-        return False
-    return max(map(len, figure.panels.values())) <= _MOST_LABELS
-
-
-def _draw_curves(figure: Figure, panel: str, records: Records, *, axes: Any) -> None:
-    """Draw learning curves: the interquartile mean over seeds.
-
-    The figure's subject is thick. It and the curves that end highest, at most five in
-    all, have a band, their 95% interval. Where tasks are either solved or not, curves
-    are the share of seeds that solve the task.
-    """
-    lines, drawn = _lines(figure), {}
-    for label in figure.panels[panel]:
-        if (panel, label) not in records:
+def _draw_curves(results: Results, panel: str, axes: Any, lines: Any) -> None:
+    """Draw the interquartile mean over seeds and its 95% interval."""
+    figure = results.figure
+    for name, style in lines.items():
+        if (panel, name) not in results.curves:
             continue
-        seeds = records[panel, label]
-        # Returns are compared at the steps of the record with the fewest rows.
-        steps = min((record.env_steps for record in seeds), key=len)
-        returns = np.array(
-            [np.interp(steps, x.env_steps, x.episode_return) for x in seeds]
-        )
+        steps, returns = _returns(results.curves[panel, name])
         if figure.solved_from is not None:
-            half = figure.solved_from(figure.panels[panel][label].env) / 2
+            half = figure.solved_from(figure.panels[panel][name].env) / 2
             share = np.mean(returns >= half, axis=0)
-            axes.plot(steps / 1e6, share, label=label, **lines[label])
-            axes.set_ylim(-0.03, 1.03)
+            axes.plot(steps / 1e6, share, label=name, **style)
             continue
         finite = np.isfinite(returns).all(axis=0)
-        if finite.any():
-            drawn[label] = steps[finite] / 1e6, returns[:, finite]
-    middle_of = {x: interquartile_mean(returns, 0) for x, (_, returns) in drawn.items()}
-    # The subject first, then the highest.
-    ranked = sorted(middle_of, key=lambda x: -middle_of[x][-1])
-    banded = sorted(ranked, key=lambda x: x != figure.favourite)[:_MOST_BANDS]
-    for label, (steps, returns) in drawn.items():
-        if label in banded:
-            low, high = bootstrap_interval(returns, resamples=500)
-            band = {"color": lines[label]["color"], "alpha": 0.2, "linewidth": 0}
-            axes.fill_between(steps, low, high, **band)
-        axes.plot(steps, middle_of[label], label=label, **lines[label])
-    if figure.floor:
-        # Before labels, whose places depend on the limits.
-        env = next(iter(figure.panels[panel].values())).env
-        floor = doing_nothing.stored()[env].mean
-        axes.axhline(floor, color="gray", linestyle=(0, (1, 1)), linewidth=1.0)
-        at = axes.get_yaxis_transform()
-        words = {"color": "gray", "fontsize": 6, "va": "bottom", "transform": at}
-        axes.text(0.01, floor, "doing nothing", **words)
-    if _has_direct_labels(figure):
-        ends = {label: float(middle_of[label][-1]) for label in ranked}
-        color_of = {label: lines[label]["color"] for label in ends}
-        plotting.label_ends(axes, ends, color_of)
-    axes.set_xlabel("million steps")
-
-
-def _draw_over(figure: Figure, panel: str, scores: Scores, *, axes: Any) -> None:
-    """Draw final returns over a setting; a line joins curves that differ only in it."""
-    curves = figure.panels[panel]
-    color_of = _with_free_colors(dict.fromkeys(x.agent for *_, x in figure.curves()))
-    lines: dict[str, dict[Any, str]] = {}
-    for name in curves:
-        line, value = figure.point_of(panel, name)
-        lines.setdefault(line, {})[value] = name
-    values = sorted({value for points in lines.values() for value in points})
-    drawn: list[str] = []
-    for i, (line, points) in enumerate(lines.items()):
-        complete = [x for x in points if (panel, points[x]) in scores]
-        agent = next(curves[name].agent for name in points.values())
-        style = _STYLES[drawn.count(agent) % len(_STYLES)]
-        drawn.append(agent)
-        if not complete:
+        if not finite.any():
             continue
-        finals = [scores[panel, points[x]] for x in complete]
-        middle = np.array([interquartile_mean(x) for x in finals])
-        low, high = np.array([bootstrap_interval(x) for x in finals]).T
-        axes.errorbar(
-            # Each line is shifted sideways, so that no interval hides another.
-            np.array(complete) * 1.06 ** (i - (len(lines) - 1) / 2),
-            middle,
-            [middle - low, high - middle],
-            color=color_of[agent],
-            linestyle=style,
-            **{"marker": "o", "markersize": 3, "capsize": 2},
-            label=line,
-        )
-    _, label = figure.over or ("", "")
+        steps, returns = steps[finite] / 1e6, returns[:, finite]
+        low, high = bootstrap_interval(returns, resamples=500)
+        band = {"color": style["color"], "alpha": 0.18, "linewidth": 0}
+        axes.fill_between(steps, low, high, **band)
+        axes.plot(steps, interquartile_mean(returns, 0), label=name, **style)
+    if figure.solved_from is not None:
+        axes.set_ylim(-0.03, 1.03)
+    axes.set_xlabel("million steps", fontsize=8)
+
+
+def _draw_floor(figure: Figure, panel: str, axes: Any) -> None:
+    """Draw what doing nothing returns, where that is shown."""
+    if floor := doing_nothing.of(figure, panel):
+        dotted = {"color": "0.4", "linestyle": (0, (1, 1)), "linewidth": 1.0}
+        axes.axhline(floor.mean, **dotted)
+        at = {"transform": axes.get_yaxis_transform(), "va": "bottom", "ha": "right"}
+        axes.text(0.98, floor.mean, "doing nothing", color="0.4", fontsize=6, **at)
+
+
+def _returns(one: CurveResults) -> tuple[np.ndarray, np.ndarray]:
+    """Return the steps of the record with the fewest rows, and returns at these."""
+    seeds = [*one.records.values()]
+    steps = min((record.env_steps for record in seeds), key=len)
+    every = [np.interp(steps, x.env_steps, x.episode_return) for x in seeds]
+    return steps, np.array(every)
+
+
+def _draw_over(results: Results, panel: str, axes: Any, lines: Any) -> None:
+    """Draw final returns over a setting; a line joins curves that differ only in it."""
+    figure = results.figure
+    assert figure.over is not None
+    points: dict[str, dict[Any, np.ndarray]] = {}
+    for name in figure.panels[panel]:
+        if (panel, name) in results.scores:
+            line, value = figure.point_of(panel, name)
+            points.setdefault(line, {})[value] = results.scores[panel, name]
+    values = sorted({value for x in points.values() for value in x})
+    for i, (line, style) in enumerate(lines.items()):
+        if not (finals := points.get(line)):
+            continue
+        middle = np.array([interquartile_mean(x) for x in finals.values()])
+        low, high = np.array([bootstrap_interval(x) for x in finals.values()]).T
+        # Each line is shifted sideways, so that no interval hides another.
+        places = np.array([*finals]) * 1.06 ** (i - (len(lines) - 1) / 2)
+        ends = [middle - low, high - middle]
+        marks = {"marker": "o", "markersize": 3, "capsize": 2}
+        axes.errorbar(places, middle, ends, label=line, **marks, **style)
     limits = (0.7 * values[0], 1.4 * values[-1])
-    axes.set(xlabel=label, xscale="log", xlim=limits)
+    axes.set(xscale="log", xlim=limits)
+    axes.set_xlabel(figure.over[1], fontsize=8)
     axes.set_xticks(values, list(map(str, values)))
     axes.minorticks_off()
 
 
-def save_png(picture: Picture, path: pathlib.Path, dpi: int = 80) -> None:
+def _draw_whole(axes: Any, whole: Whole, lines: Any, figure: Figure) -> None:
+    """Draw the means over all tasks, a row for each curve, shown as a line or not."""
+    at = {"transform": axes.get_yaxis_transform(), "fontsize": 6.5, "va": "bottom"}
+    for row, (name, (middle, low, high)) in enumerate(whole.items()):
+        color = lines[name]["color"] if name in lines else "0.6"
+        width = 4.0 if name == figure.favourite else 2.0
+        axes.plot([low, high], [row, row], color=color, linewidth=width)
+        axes.plot(middle, row, "o", color=color, markersize=4)
+        axes.text(0.02, row - 0.08, name, **at)
+    axes.set(yticks=[], ylim=(len(whole) - 0.5, -0.8))
+    axes.tick_params(axis="x", labelsize=7)
+    axes.set_title("mean over these tasks", fontsize=9)
+    unit = "share of seeds" if figure.solved_from else "return, 1: PPO, dense rewards"
+    axes.set_xlabel(unit, fontsize=8)
+
+
+def forest(results: Results, kind: str = "") -> Picture:
+    """Return a forest plot of what is compared: a line for each pair of curves.
+
+    A line is the difference with its 95% interval; its color is the corrected verdict.
+    Small ticks are the smallest differences that would have been found. Squares are
+    the verdicts on single tasks.
+    """
+    parts = [results.forest(kind)]
+    if results.sooner:
+        parts.append(results.who_is_sooner(kind))
+    rows = parts[0]
+    panels = list(dict.fromkeys(x for row in rows for x in row.verdicts))
+    label = 0.075 * max((len(row.name) for row in rows), default=1)
+    width, height = 3.4 * len(parts) + label, 0.9 + 0.24 * max(len(rows), 2)
+    ratios = [3.4] * len(parts)
+    if panels:
+        ratios.append(0.24 * len(panels))
+        width += ratios[-1]
+        height += 0.065 * max(len(_short(x)) for x in panels)
+    picture = Picture(figsize=(width, height), layout="constrained")
+    (grid,) = picture.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)
+    for i, part in enumerate(parts):
+        null, text = 0.5, "probability that the first returns more"
+        if results.is_of_one_task:
+            null, text = 0.0, "difference of final returns"
+        elif results.sooner:
+            null, text = (
+                (0.0, "difference of shares that solve a task"),
+                (0.5, "probability that the first is sooner"),
+            )[i]
+        _draw_rows(grid[i], part, null)
+        grid[i].set_xlabel(text, fontsize=8)
+        names = [row.name for row in part] if i == 0 else [""] * len(part)
+        grid[i].set_yticks(range(len(part)), names, fontsize=8)
+    if panels:
+        _draw_squares(grid[-1], rows, panels)
+    words = (
+        "first curve: blue better, orange worse, grey not clear; ticks: visible from"
+    )
+    picture.suptitle(words, fontsize=7.5, color="0.3")
+    return picture
+
+
+def _draw_rows(axes: Any, rows: Sequence[Row], null: float) -> None:
+    axes.axvline(null, color="0.3", linewidth=0.8)
+    for y, row in enumerate(rows):
+        one = row.compared
+        color = _VERDICTS["not clear" if one.below else one.verdict]
+        axes.plot([null + one.low, null + one.high], [y, y], color=color, linewidth=3)
+        axes.plot(null + one.middle, y, "o", color=color, markersize=5)
+        for end in (null - one.visible, null + one.visible):
+            if null != 0.5 or 0.0 < end < 1.0:
+                axes.plot(end, y, "|", color="0.3", markersize=6, markeredgewidth=0.8)
+    if null == 0.5:
+        axes.set_xlim(-0.03, 1.03)
+    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
+    axes.tick_params(axis="x", labelsize=7)
+    axes.grid(axis="x", color="0.92")
+    axes.set_axisbelow(True)
+
+
+def _short(panel: str) -> str:
+    """Return a panel's name without the package of its task."""
+    return panel.split(":")[-1].removeprefix("Navix-")
+
+
+def _draw_squares(axes: Any, rows: Sequence[Row], panels: Sequence[str]) -> None:
+    """Draw the verdict on each single panel."""
+    for (y, row), (x, panel) in itertools.product(enumerate(rows), enumerate(panels)):
+        if verdict := row.verdicts.get(panel):
+            face: Any = {
+                "facecolor": _VERDICTS[verdict],
+                "edgecolor": "0.72",
+                "lw": 0.6,
+            }
+            axes.add_patch(Rectangle((x - 0.36, y - 0.36), 0.72, 0.72, **face))
+    axes.set_xticks(range(len(panels)), [*map(_short, panels)], fontsize=7, rotation=90)
+    axes.set_yticks([])
+    axes.set(xlim=(-0.6, len(panels) - 0.4), ylim=(max(len(rows), 2) - 0.5, -0.5))
+    axes.spines[:].set_visible(False)
+    axes.tick_params(length=0)
+
+
+def save_png(picture: Picture, path: pathlib.Path, dpi: int = 100) -> None:
     """Write a small PNG, of 256 colors."""
     with io.BytesIO() as buffer:
         picture.savefig(buffer, format="png", dpi=dpi)

@@ -99,11 +99,7 @@ def generator(name: str) -> np.random.Generator:
 
 
 def _drawn(space: Space, count: int, name: str) -> tuple[Point, ...]:
-    """Return points of a space, all different and the same for the same name.
-
-    Each value of a hyperparameter occurs equally often, or once more than another. The
-    combinations are random.
-    """
+    """Return points of a space, all different and the same for the same name."""
     rng = generator(name)
     rows: list[tuple[Any, ...]] = []
     while len(set(rows)) < count:
@@ -328,6 +324,19 @@ class PaperSearch(SingleStage):
         return tuple({**point, **own} for point in points)
 
 
+class SecondStage(PaperSearch):
+    """`PaperSearch`, whose best points by two seeds get ten before one is chosen.
+
+    The ten seeds are other ones than the search's.
+    """
+
+    _final_seeds = range(10)
+
+    def finalists(self, store: Store) -> tuple[Point, ...]:
+        """Return the best points by the search's two seeds."""
+        return Search.finalists(self, store)
+
+
 #: The sparse tasks, and the ways to explore and imitate that are compared on them.
 SPARSE = tuple(
     f"sparse:{name}"
@@ -435,23 +444,3 @@ class SingleSetting(Search):
                 return None
             ranks.append(_ranks(scores))
         return drawn[int(np.mean(ranks, axis=0).argmax())]
-
-
-def mean_ranks(
-    name: str, env: str, reward_delay: int, *, store: Store
-) -> dict[Any, float]:
-    """Return the mean rank, by value of a hyperparameter, of points on a task.
-
-    An agent's drawn points are ranked from 0, the worst, to 1. The mean is over the
-    points with the value, of all agents whose search has the hyperparameter and whose
-    drawn points are all stored. Without such an agent the result is empty.
-    """
-    ranks: dict[Any, list[float]] = {}
-    for search in searches(env, reward_delay).values():
-        points = draw(search.agent)
-        scores = search.scores(points, store)
-        if scores is not None and name in points[0]:
-            shares = _ranks(scores) / (len(points) - 1)
-            for point, rank in zip(points, shares, strict=True):
-                ranks.setdefault(point[name], []).append(float(rank))
-    return {value: float(np.mean(ranks[value])) for value in sorted(ranks)}

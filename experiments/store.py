@@ -84,10 +84,7 @@ _TABLES = {
 
 
 def _rounded(name: str, values: np.ndarray) -> np.ndarray:
-    """Round to six significant digits, which float32 can hold.
-
-    The differences between seeds are far larger.
-    """
+    """Round to six significant digits, which float32 can hold."""
     if name.endswith("_steps"):
         return values.astype(np.uint32)
     return np.array([float(f"{value:.6g}") for value in values], np.float32)

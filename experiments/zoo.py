@@ -2,7 +2,7 @@
 
 From each run, the policy of the seed with the highest return in training is scored in
 Gymnasium. It replaces the package's policy for the task if its score is higher. The
-table in docs/zoo.md is written from the policies.
+table in docs/data.md is written from the policies.
 """
 
 import json
@@ -20,7 +20,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate_in_gymnasium
 from gasil_jax.host import environments, output_file, sweep
 
-TABLE = pathlib.Path(__file__).parent.parent / "docs" / "zoo.md"
+TABLE = pathlib.Path(__file__).parent.parent / "docs" / "data.md"
 
 
 def parser() -> Parser:

@@ -19,8 +19,8 @@ from .host.fitting import FitProgress as FitProgress
 from .host.fitting import FitResult as FitResult
 from .host.fitting import fit as fit
 from .host.members import member as member
+from .host.saved import load_policy as load_policy
 from .host.saved import load_reward as load_reward
-from .policy import load_policy as load_policy
 from .presets import preset as preset
 from .rewards import Decompose as Decompose
 from .rewards import Normalize as Normalize

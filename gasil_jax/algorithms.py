@@ -48,12 +48,16 @@ class Algorithm:
     @property
     def settings(self) -> dict[str, Any]:
         """Every setting by name, and the switches of the models of rewards."""
-        have = {model.switch for model in self.rewards}
-        switches = sorted(have.union(model.switch for model in REWARD_MODELS))
+        have = {type(model) for model in self.rewards}
         return {
             **{name: getattr(x, name) for x in self.parts for name in names(x)},
-            **{name: name in have for name in switches},
+            **{model.switch: model in have for model in REWARD_MODELS},
         }
+
+    @property
+    def own_models(self) -> tuple[RewardModel, ...]:
+        """The models of rewards that are not the package's."""
+        return tuple(x for x in self.rewards if type(x) not in REWARD_MODELS)
 
     @property
     def hyperparameters(self) -> dict[str, Any]:
@@ -91,8 +95,8 @@ class Algorithm:
             return self
         if is_on:
             later = REWARD_MODELS[REWARD_MODELS.index(model) :]
-            before = [x for x in others if not isinstance(x, later)]
-            others = [*before, model(), *others[len(before) :]]
+            places = [i for i, x in enumerate(others) if isinstance(x, later)]
+            others.insert(min(places, default=len(others)), model())
         return dataclasses.replace(self, rewards=tuple(others))
 
     def why_not(self, name: str) -> str:
@@ -150,8 +154,7 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
 
     Args:
       agent: name of one of the package's agents.
-      **settings: settings of the agent, of PPO and of models of rewards, by name. Those
-        that are not given have their defaults.
+      **settings: as in `Algorithm.replace`; the others have their defaults.
 
     Raises:
       ValueError: if a name is unknown.
@@ -181,14 +184,13 @@ def check(algorithm: Algorithm) -> None:
         raise refusal("config", config, "a gasil_jax.Config")
     if not isinstance(agent, Agent):
         raise refusal("agent", agent, "an instance of a class from gasil_jax.Agent")
-    if not isinstance(rewards, tuple) or not all(
-        isinstance(model, RewardModel) for model in rewards
-    ):
+    models = rewards if isinstance(rewards, tuple) else (None,)
+    if not all(isinstance(model, RewardModel) for model in models):
         raise refusal("rewards", rewards, "a tuple of models of rewards")
     validate_config(config)
     taken = {*_COLUMNS, *names(Config)}
     taken.update(x for model in REWARD_MODELS for x in (model.switch, *names(model)))
-    for part in (agent, *(x for x in rewards if type(x) not in REWARD_MODELS)):
+    for part in (agent, *algorithm.own_models):
         for name in names(part):
             if name in taken:
                 raise ValueError(
@@ -197,7 +199,7 @@ def check(algorithm: Algorithm) -> None:
                 )
         taken.update(names(part))
     for part in (agent, *rewards):
-        validate(part, config.total_steps)
+        validate(part)
     if agent.num_streams > 1 and type(agent).mix is Agent.mix:
         raise ValueError(
             f"agent {agent.name!r} has {agent.num_streams} reward streams: it must "
@@ -219,4 +221,4 @@ def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> N
                 f"{name} is not traced: change it with algorithm.replace instead"
             )
     for part in algorithm.replace(**hyperparameters).parts:
-        validate(part, algorithm.config.total_steps)
+        validate(part)

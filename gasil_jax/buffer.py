@@ -1,12 +1,11 @@
 """The good-trajectory buffer: the steps of the top-K episodes, in fixed arrays.
 
 Paper, section 4.1. An episode is offered to the buffer as a whole once it has ended. It
-is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, or the
-undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
-steps that were ever offered are ordered by (return descending, episode, time), and the
-first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
-a tie the older episode stays. All functions are pure and work under jit, vmap and
-shard_map; an empty buffer is a normal state.
+is ranked by the return of the environment's own reward, R = sum_t gamma^t r_t. The
+capacity is in steps: all steps that were ever offered are ordered by (return
+descending, episode, time), and the first `capacity` of them are kept. So the last
+episode in the buffer may be cut, and on a tie the older episode stays. All functions
+are pure and work under jit, vmap and shard_map; an empty buffer is a normal state.
 """
 
 import chex
@@ -14,8 +13,10 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Shape letters: C capacity in steps, E offered episodes, H steps of history per
-# environment, N environments.
+from gasil_jax.rollout import Rollout
+
+# Shape letters: C capacity in steps, H steps of history per environment, N
+# environments.
 
 
 class GoodTrajectories(struct.PyTreeNode):
@@ -53,8 +54,8 @@ class History(struct.PyTreeNode):
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
       reward: float32 (N, H), the reward, never normalized; in an agent's context it may
-        be decomposed. NaN in faulty steps, and in the last step of an episode that was
-        cut short.
+        be decomposed. NaN in faulty steps, in the last step of an episode that was cut
+        short, and where no step is recorded yet.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
       next_observation: float32 (N, H, obs), after the action; None if it is not kept.
@@ -70,22 +71,6 @@ class History(struct.PyTreeNode):
     def in_time(self, ring: jax.Array) -> jax.Array:
         """Return a ring (N, H, ...) of this history in time order, oldest first."""
         return jnp.roll(ring, -self.cursor, axis=1)
-
-
-class Episodes(struct.PyTreeNode):
-    """Ended episodes that are offered to the buffer; length 0 marks an empty entry.
-
-    Attributes:
-      return_: float32 (E,), the return that the episode is ranked by.
-      length: int32 (E,), number of steps.
-      env: int32 (E,), index of the environment that the episode ran in.
-      last: int32 (E,), index of its last step in that environment's ring.
-    """
-
-    return_: jax.Array
-    length: jax.Array
-    env: jax.Array
-    last: jax.Array
 
 
 def init_buffer(
@@ -127,45 +112,32 @@ def init_history(
     return History(
         observation=observations(),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
-        reward=jnp.zeros((num_envs, length), jnp.float32),
-        # No episode begins before the first recorded step.
+        # No episode begins before the first recorded step, and none is valid there.
+        reward=jnp.full((num_envs, length), jnp.nan, jnp.float32),
         ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
         next_observation=observations() if keep_next else None,
     )
 
 
-def record(
-    history: History,
-    observation: jax.Array,
-    action: jax.Array,
-    *,
-    reward: jax.Array,
-    ended: jax.Array,
-    next_observation: jax.Array | None = None,
-) -> History:
-    """Return the history with a batch written over the oldest steps.
+@jax.named_scope("good_trajectories")
+def record(history: History, batch: Rollout) -> History:
+    """Return the history with a batch, (time, N, ...), written over the oldest steps.
 
-    Args:
-      history: the history before the batch.
-      observation: float32 (time, N, obs).
-      action: float32 (time, N, action).
-      reward: float32 (time, N).
-      ended: bool (time, N).
-      next_observation: float32 (time, N, obs), needed if the history keeps it.
+    The batch's rewards are the environment's own.
     """
-    chex.assert_equal_shape_prefix([observation, action, reward, ended], 2)
-    num_steps = observation.shape[0]
     cursor, next_ring = history.cursor, history.next_observation
     if next_ring is not None:
-        assert next_observation is not None, "this history keeps next observations"
-        next_ring = write(next_ring, next_observation, cursor)
+        next_ring = write(next_ring, batch.next_observation, cursor)
+    # A NaN marks an episode without a valid return: one with a faulty step, or one that
+    # was cut short.
+    reward = jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward)
     return History(
-        observation=write(history.observation, observation, cursor),
-        action=write(history.action, action, cursor),
+        observation=write(history.observation, batch.observation, cursor),
+        action=write(history.action, batch.action, cursor),
         reward=write(history.reward, reward, cursor),
-        ended=write(history.ended, ended, cursor),
-        cursor=(cursor + num_steps) % history.observation.shape[1],
+        ended=write(history.ended, batch.ended, cursor),
+        cursor=(cursor + batch.reward.shape[0]) % history.reward.shape[1],
         next_observation=next_ring,
     )
 
@@ -174,32 +146,6 @@ def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
     """Return a ring (N, H, ...) with a batch (time, N, ...) written at `cursor`."""
     return jax.lax.dynamic_update_slice_in_dim(
         ring, jnp.swapaxes(new, 0, 1), cursor, axis=1
-    )
-
-
-def ended_episodes(
-    history: History, ended: jax.Array, return_: jax.Array, *, length: jax.Array
-) -> Episodes:
-    """Return the episodes that ended in the last recorded batch, oldest first.
-
-    Args:
-      history: the history after `record` of that batch.
-      ended: bool (time, N), whether the episode ended with this step.
-      return_: float32 (time, N), the episode's return up to this step, by which it is
-        ranked.
-      length: int32 (time, N), the episode's number of steps up to this one.
-    """
-    chex.assert_equal_shape([ended, return_, length])
-    num_steps, num_envs = ended.shape
-    ring = history.observation.shape[1]
-    first = history.cursor - num_steps  # the batch's first index in the ring
-    index = (first + jnp.arange(num_steps, dtype=jnp.int32)) % ring
-    env = jnp.arange(num_envs, dtype=jnp.int32)
-    return Episodes(
-        return_=return_.ravel(),
-        length=jnp.where(ended, length, 0).ravel(),
-        env=jnp.broadcast_to(env, ended.shape).ravel(),
-        last=jnp.broadcast_to(index[:, None], ended.shape).ravel(),
     )
 
 
@@ -218,27 +164,34 @@ def _kept_lengths(buffer: GoodTrajectories) -> jax.Array:
 def insert(
     buffer: GoodTrajectories,
     history: History,
-    episodes: Episodes,
+    ended: jax.Array,
+    return_: jax.Array,
     *,
+    length: jax.Array,
     max_episodes: int | None = None,
 ) -> GoodTrajectories:
-    """Return the buffer with the best of its own and the offered episodes.
+    """Return the buffer with the best of its own episodes and of a batch's.
 
-    The function sorts whole episodes, not steps, and then gathers every kept step.
+    Whole episodes are sorted, not steps; then every kept step is gathered.
 
     Args:
-      buffer: the buffer before the insertion.
-      history: the history that holds the steps of the offered episodes.
-      episodes: the offered episodes. Those whose return is not finite are rejected, so
-        an episode in which any number is not finite must have such a return.
+      buffer: the buffer before the batch.
+      history: the history after `record` of the batch.
+      ended: bool (time, N), whether an episode ended with this step. All that did are
+        offered to the buffer.
+      return_: float32 (time, N), the return that such an episode is ranked by. If it is
+        not finite, the episode is rejected; so an episode in which any number is not
+        finite must have such a return.
+      length: int32 (time, N), the episode's number of steps up to this one.
       max_episodes: number of episodes to keep at most; None for any number.
     """
-    capacity = buffer.capacity
+    chex.assert_equal_shape([ended, return_, length])
+    capacity, (num_steps, num_envs) = buffer.capacity, ended.shape
     slot = jnp.arange(capacity, dtype=jnp.int32)
-    kept_length = _kept_lengths(buffer)
-    offered = jnp.isfinite(episodes.return_) & (episodes.length > 0)
-    length = jnp.concatenate([kept_length, jnp.where(offered, episodes.length, 0)])
-    return_ = jnp.concatenate([buffer.return_, episodes.return_])
+    # An entry of length 0 is no episode.
+    offered = jnp.where(ended & jnp.isfinite(return_), length, 0).ravel()
+    length = jnp.concatenate([_kept_lengths(buffer), offered])
+    return_ = jnp.concatenate([buffer.return_, return_.ravel()])
     # The sort is stable and the buffer's own episodes come first, so that on a tie the
     # older episode stays.
     order = jnp.argsort(jnp.where(length > 0, -return_, jnp.inf), stable=True)
@@ -253,10 +206,11 @@ def insert(
     time = slot - (end[rank] - length[source])
     is_kept = source < capacity
     kept_index = jnp.where(is_kept, source + time, 0)
+    # The offered entries are the batch's steps, one time step after the other.
     offer = jnp.where(is_kept, 0, source - capacity)
-    env = episodes.env[offer]
-    ring = history.observation.shape[1]
-    recorded_index = (episodes.last[offer] - episodes.length[offer] + 1 + time) % ring
+    last = history.cursor - num_steps + offer // num_envs
+    env, ring = offer % num_envs, history.observation.shape[1]
+    recorded_index = (last - offered[offer] + 1 + time) % ring
 
     filled = slot < size
 
@@ -274,44 +228,17 @@ def insert(
 
 
 def sample(
-    key: jax.Array,
-    buffer: GoodTrajectories,
-    num_samples: int,
-    *,
-    by_return: bool = False,
+    key: jax.Array, buffer: GoodTrajectories, num_samples: int
 ) -> tuple[jax.Array, jax.Array]:
     """Draw observations (samples, obs) and actions (samples, action) with replacement.
 
-    From an empty buffer they are zeros, so check ``size`` first.
-
-    Args:
-      key: random key; consumed.
-      buffer: the buffer.
-      num_samples: number of steps.
-      by_return: draw with probabilities proportional to `return_weights`; otherwise
-        uniformly.
+    Every step is equally probable. From an empty buffer they are zeros, so check
+    ``size`` first. The key is consumed.
     """
     uniform = jax.random.uniform(key, (num_samples,))
-    if by_return:
-        cumulative = jnp.cumsum(return_weights(buffer))
-        index = jnp.searchsorted(cumulative, uniform * cumulative[-1], side="right")
-    else:
-        index = (uniform * buffer.size).astype(jnp.int32)
+    index = (uniform * buffer.size).astype(jnp.int32)
     index = jnp.clip(index, 0, jnp.maximum(buffer.size - 1, 0))
     return buffer.observation[index], buffer.action[index]
-
-
-def return_weights(buffer: GoodTrajectories) -> jax.Array:
-    """Return exp((R - best R) / standard deviation of R), (C,); 0 where empty.
-
-    R is the return of the step's episode.
-    """
-    filled = buffer.filled
-    return_ = jnp.where(filled, buffer.return_, 0.0)
-    std = jnp.std(return_, where=filled)
-    # The best episode comes first.
-    excess = (return_ - return_[0]) / jnp.maximum(std, 1e-8)
-    return jnp.where(filled, jnp.exp(excess), 0.0)
 
 
 def mean_return(buffer: GoodTrajectories) -> jax.Array:

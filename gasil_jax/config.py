@@ -28,41 +28,96 @@ SCHEDULE_SUFFIX = "_schedule"
 
 #: Counts are int32, and all other numbers float32.
 _LARGEST_COUNT, _LARGEST_FLOAT = 2**31 - 1, 3.4e38
+#: Numbers that are smaller are 0 in float32.
+_SMALLEST_FLOAT = 1.2e-38
 
 
 class Range(NamedTuple):
-    """The range of finite numbers that a field allows.
-
-    Attributes:
-      low: the lowest number.
-      high: the highest number.
-      excludes_low: whether `low` itself is not allowed.
-      whole: whether only whole numbers are allowed.
-    """
+    """The range of finite numbers that a field allows."""
 
     low: float
     high: float = _LARGEST_FLOAT
-    excludes_low: bool = False
-    whole: bool = False
+    excludes_low: bool = False  # Whether `low` itself is not allowed.
+    whole: bool = False  # Whether only whole numbers are allowed.
 
     def __contains__(self, value: Any) -> bool:
         kind: Any = numbers.Integral if self.whole else numbers.Real
         if not isinstance(value, kind) or isinstance(value, bool):
             return False
         is_above = value > self.low if self.excludes_low else value >= self.low
+        if self.excludes_low and self.low == 0:
+            is_above = value >= _SMALLEST_FLOAT
         return bool(is_above and value <= self.high)
 
     def __str__(self) -> str:
         if self.whole:
             most = "" if self.high >= _LARGEST_COUNT else f", at most {self.high:.0f}"
             return f"a whole number, {self.low:g} or more{most}"
-        least = f"{'more than ' * self.excludes_low}{self.low:g}"
-        least += "" if self.excludes_low else " or more"
+        least = (
+            f"more than {self.low:g}" if self.excludes_low else f"{self.low:g} or more"
+        )
+        least += " in float32" if self.excludes_low else ""
         most = f"at most {self.high:g}" if self.high < _LARGEST_FLOAT else "finite"
         return f"{least} and {most}"
 
 
 _COUNT = Range(1, _LARGEST_COUNT, whole=True)
+#: What checks the value of a field: a range, or a function of its name and value.
+Check = Range | Callable[[str, Any], None]
+
+
+def validate_switch(name: str, value: Any) -> None:
+    """Raise `ValueError` unless a value is true or false."""
+    if not isinstance(value, bool):
+        raise refusal(name, value, "True or False")
+
+
+def validate_number(name: str, value: Any, allowed: Range) -> None:
+    """Raise `ValueError` unless a value is a number in the range, or traced."""
+    if shape := getattr(value, "shape", ()):
+        raise ValueError(
+            f"{name} has shape {shape}: it must be a single number (to train with "
+            "several, use jax.vmap)"
+        )
+    if isinstance(value, jax.core.Tracer):
+        return
+    is_array = isinstance(value, np.ndarray | jax.Array)
+    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
+        value = value.item()
+    if value not in allowed:
+        raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
+
+
+def _validate_widths(name: str, value: Any) -> None:
+    if not isinstance(value, tuple):
+        raise refusal(name, value, "a tuple of sizes")
+    for size in value:
+        validate_number(name, size, _COUNT)
+
+
+def _validate_text(name: str, value: Any) -> None:
+    if not isinstance(value, str | None):
+        raise refusal(name, value, "a string or None")
+
+
+def _validate_schedule(name: str, schedule: Any) -> None:
+    """Check points, or the factor of a function at the start of training."""
+    if callable(schedule):
+        what = f"{name} gives no number at step 0"
+        with user_code.refused(what), jax.ensure_compile_time_eval():
+            factor = schedule(jax.numpy.float32(0))
+            factor = factor if isinstance(factor, jax.core.Tracer) else float(factor)
+        validate_number(f"{name}(0)", factor, Range(0.0))
+        return
+    form = "(steps, factor) points, steps increasing"
+    pairs = schedule if isinstance(schedule, tuple) else (None,)
+    if not all(isinstance(point, tuple) and len(point) == 2 for point in pairs):
+        raise refusal(name, schedule, form)
+    for number in (number for point in pairs for number in point):
+        validate_number(name, number, Range(0.0))
+    steps = [point[0] for point in pairs]
+    if steps != sorted(set(steps)):
+        raise refusal(name, schedule, form)
 
 
 def number(
@@ -72,49 +127,51 @@ def number(
     *,
     excludes_low: bool = False,
 ) -> Any:
-    """Declare a number, a traced leaf of the pytree: each run may have its own.
+    """Declare a number from low to high, a traced leaf: each run may have its own.
 
-    Args:
-      default: the default value.
-      low: the lowest value.
-      high: the highest value.
-      excludes_low: whether the value must be more than `low`.
+    With `excludes_low` it must be more than `low`.
     """
-    return _field(default, traced=True, range=Range(low, high, excludes_low))
+    return _field(default, Range(low, high, excludes_low), traced=True)
 
 
 def count(default: int | None, most: float = _LARGEST_COUNT) -> Any:
     """Declare a whole number from 1 on, or None if that is the default."""
-    return _field(default, range=Range(1, most, whole=True))
+    return _field(default, Range(1, most, whole=True))
 
 
 def widths(*default: int) -> Any:
     """Declare the widths of a network's hidden layers, a tuple."""
-    return _field(default, widths=True)
+    return _field(default, _validate_widths)
 
 
 def switch(default: bool) -> Any:
     """Declare a setting that is true or false."""
-    return _field(default, switch=True)
+    return _field(default, validate_switch)
 
 
 def choice(default: str, allowed: Iterable[str]) -> Any:
     """Declare a setting that is one of several names."""
-    return _field(default, choices=tuple(allowed))
+    names = tuple(allowed)
+
+    def check(name: str, value: Any) -> None:
+        if value not in names:
+            raise ValueError(unknown(name, value, names))
+
+    return _field(default, check)
 
 
 def schedule() -> Any:
     """Declare NAME_schedule, which multiplies the number NAME."""
-    return _field((), schedule=True)
+    return _field((), _validate_schedule)
 
 
 def text(default: str | None = None) -> Any:
     """Declare a name or a path, or None."""
-    return _field(default, text=True)
+    return _field(default, _validate_text)
 
 
-def _field(default: Any, traced: bool = False, **allowed: Any) -> Any:
-    metadata = {"pytree_node": traced, "allowed": allowed}
+def _field(default: Any, check: Check, *, traced: bool = False) -> Any:
+    metadata = {"pytree_node": traced, "check": check}
     return dataclasses.field(default=default, metadata=metadata)
 
 
@@ -207,48 +264,30 @@ def traced_names(kind: Any) -> tuple[str, ...]:
 
 def ranges(kind: Any) -> Mapping[str, Range]:
     """Return the allowed range of each number and count of a class, by name."""
-    return {
-        field.name: field.metadata["allowed"]["range"]
-        for field in dataclasses.fields(kind)
-        if "range" in field.metadata["allowed"]
-    }
+    checks = {x.name: x.metadata["check"] for x in dataclasses.fields(kind)}
+    return {name: check for name, check in checks.items() if isinstance(check, Range)}
 
 
-def validate(settings: Any, total_steps: int) -> None:
-    """Check that every setting of a part of an algorithm is allowed.
+def validate(settings: Any) -> None:
+    """Check that every setting of a config, an agent or a reward model is allowed.
 
     Numbers that are traced have no value yet: of those only the shapes are checked.
-
-    Args:
-      settings: a config, an agent or a reward model.
-      total_steps: the length of training, for schedules.
 
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
     for field in dataclasses.fields(settings):
         name, value = field.name, getattr(settings, field.name)
-        if "allowed" not in field.metadata:
+        if "check" not in field.metadata:
             raise ValueError(
                 f"setting {name!r} has no range: it must be declared with "
                 "gasil_jax.config.number, or another function there"
             )
-        allowed = field.metadata["allowed"]
-        if "range" in allowed and not (value is None and field.default is None):
-            validate_number(name, value, allowed["range"])
-        elif "switch" in allowed:
-            validate_switch(name, value)
-        elif "choices" in allowed and value not in allowed["choices"]:
-            raise ValueError(unknown(name, value, allowed["choices"]))
-        elif "widths" in allowed:
-            if not isinstance(value, tuple):
-                raise refusal(name, value, "a tuple of sizes")
-            for size in value:
-                validate_number(name, size, _COUNT)
-        elif "schedule" in allowed:
-            _validate_schedule(name, value, total_steps)
-        elif "text" in allowed and not isinstance(value, str | None):
-            raise refusal(name, value, "a string or None")
+        check = field.metadata["check"]
+        if not isinstance(check, Range):
+            check(name, value)
+        elif not (value is None and field.default is None):
+            validate_number(name, value, check)
 
 
 def validate_config(config: Config) -> None:
@@ -257,61 +296,14 @@ def validate_config(config: Config) -> None:
     Raises:
       ValueError: if a value is not allowed; the message names the value and the range.
     """
-    validate(config, config.total_steps)
+    validate(config)
     for name in ("num_envs", "minibatch_size"):
         size, batch_steps = getattr(config, name), config.batch_steps
         if batch_steps % size:
-            # Up to the root, or a large batch would take minutes.
-            root = math.isqrt(batch_steps)
-            small = [n for n in range(1, root + 1) if batch_steps % n == 0]
-            divisors = sorted([*small, *(batch_steps // n for n in small)])
+            most = min(size, batch_steps)
+            near = (n for x in range(most) for n in (most - x, most + x))
+            nearest = next(n for n in near if batch_steps % n == 0)
             raise ValueError(
                 f"{name} is {size}, which does not divide batch_steps {batch_steps}: "
-                f"the nearest that does is {min(divisors, key=lambda n: abs(n - size))}"
+                f"the nearest that does is {nearest}"
             )
-
-
-def validate_switch(name: str, value: Any) -> None:
-    """Raise `ValueError` unless a value is true or false."""
-    if not isinstance(value, bool):
-        raise refusal(name, value, "True or False")
-
-
-def validate_number(name: str, value: Any, allowed: Range) -> None:
-    """Raise `ValueError` unless a value is a number in the range, or traced."""
-    if shape := getattr(value, "shape", ()):
-        raise ValueError(
-            f"{name} has shape {shape}: it must be a single number (to train with "
-            "several, use jax.vmap)"
-        )
-    if isinstance(value, jax.core.Tracer):
-        return
-    is_array = isinstance(value, np.ndarray | jax.Array)
-    if is_array and jax.numpy.issubdtype(value.dtype, np.number):
-        value = value.item()
-    if value not in allowed:
-        raise refusal(name, value, "a number" if isinstance(value, str) else allowed)
-
-
-def _validate_schedule(name: str, schedule: Any, total_steps: int) -> None:
-    """Check points, or the factors of a function at the start and end of training."""
-    if callable(schedule):
-        for step in (0, total_steps):
-            what = f"{name} gives no number at step {step}"
-            with user_code.refused(what), jax.ensure_compile_time_eval():
-                factor = schedule(jax.numpy.float32(step))
-                if isinstance(factor, jax.core.Tracer):
-                    return
-                factor = float(factor)
-            validate_number(f"{name}({step})", factor, Range(0.0))
-        return
-    pairs = "(steps, factor) points, steps increasing"
-    if not isinstance(schedule, tuple) or not all(
-        isinstance(point, tuple) and len(point) == 2 for point in schedule
-    ):
-        raise refusal(name, schedule, pairs)
-    for number in (number for point in schedule for number in point):
-        validate_number(name, number, Range(0.0))
-    steps = [point[0] for point in schedule]
-    if steps != sorted(set(steps)):
-        raise refusal(name, schedule, pairs)

@@ -9,16 +9,11 @@ from flax import struct
 
 
 class Learner(struct.PyTreeNode):
-    """A network's parameters and its optimizer's state, one pytree.
-
-    Attributes:
-      params: the parameters.
-      optimizer_state: the optimizer's state.
-      network: the Flax module, if it is none of the package's.
-    """
+    """A network's parameters and its optimizer's state, one pytree."""
 
     params: Any
     optimizer_state: Any
+    #: The Flax module, if it is none of the package's.
     network: Any = struct.field(pytree_node=False, default=None)
 
 
@@ -42,14 +37,7 @@ def descend(
     *,
     step_size: jax.Array | float,
 ) -> Learner:
-    """Take one gradient step.
-
-    Args:
-      learner: the learner before the step.
-      gradient: gradient of the loss, with the parameters' structure.
-      transform: the optimizer without a step size.
-      step_size: (), factor of the transformed gradient; it may be traced.
-    """
+    """Take one gradient step: the transformed gradient times a step size, ()."""
     updates, optimizer_state = transform.update(gradient, learner.optimizer_state)
     params = jax.tree.map(lambda p, u: p - step_size * u, learner.params, updates)
     return learner.replace(params=params, optimizer_state=optimizer_state)
@@ -68,17 +56,10 @@ def select(condition: jax.Array, new: Any, old: Any) -> Any:
 
 
 def keep_if_finite(new: Any, old: Any) -> tuple[jax.Array, Any]:
-    """Undo an update that is not finite.
+    """Undo an update from `old` to `new` if any number that it made is not finite.
 
-    Leaves that the update did not touch are neither read nor copied, see `select`.
-
-    Args:
-      new: a pytree after the update.
-      old: the same pytree before the update.
-
-    Returns:
-      Whether every number that the update made is finite, bool (), and `new` if so,
-      else `old`.
+    Returns whether all are finite, bool (), and the result. Leaves that the update did
+    not touch are neither read nor copied.
     """
     pairs = zip(jax.tree.leaves(new), jax.tree.leaves(old), strict=True)
     made = [x for x, y in pairs if x is not y]

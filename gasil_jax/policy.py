@@ -1,6 +1,5 @@
 """Turn training states and saved policies into JAX functions."""
 
-import pathlib
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -60,30 +59,8 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
     return arrays
 
 
-def load_policy(
-    path: str | pathlib.Path, seed: int | None = None
-) -> Callable[..., jax.Array]:
-    """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
-
-    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
-    float32. It clips actions to their range. Without a key the action is the policy's
-    mean, or that of a mixture's most probable Gaussian; with a key it is drawn from the
-    policy. The key is consumed. Discrete actions are int32 (...), without a key the
-    most probable ones.
-
-    Args:
-      path: the folder of a finished run, its file ``policy.npz``, or "zoo:NAME", one of
-        the policies that come with the package.
-      seed: number of the seed; default the one with the highest final return.
-
-    Raises:
-      ValueError: if it is not a saved policy, or has no such seed.
-    """
-    return make(numpy_policy.read(path, seed))
-
-
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """Return the policy of a single `TrainState`, as `load_policy` does for a file.
+    """Return the policy of a single `TrainState`, as `saved.load_policy` does.
 
     Raises:
       ValueError: if it is a batch of states, or none.
@@ -93,13 +70,13 @@ def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
 
 
 def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
-    """Return the policy with these arrays, as `load_policy` does for a file."""
+    """Return the policy with these arrays, as `saved.load_policy` does."""
 
     def float32(x: Any) -> jax.Array:
         return jnp.asarray(x, jnp.float32)
 
     arrays = jax.tree.map(float32, dict(weights))
-    network = arrays.pop("network", None)
+    network, log_std = arrays.pop("network", None), arrays.get("log_std")
     discrete = numpy_policy.is_discrete(arrays)
     mixture = numpy_policy.is_mixture(arrays)
     distribution = CATEGORICAL if discrete else MIXTURE if mixture else GAUSSIAN
@@ -114,11 +91,10 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
             else:
                 parameters = numpy_policy.output(arrays, float32(observation), jnp)
                 if mixture:
-                    log_std = arrays["log_std"]
                     mean, logits = numpy_policy.components(parameters, len(log_std))
                     parameters = mean, log_std, logits
                 elif not discrete:
-                    parameters = parameters, arrays["log_std"]
+                    parameters = parameters, log_std
             if key is None:
                 action = distribution.mode(parameters)
             else:

@@ -1,6 +1,5 @@
 """Proximal policy optimization (Schulman et al. 2017) on one batch."""
 
-from collections.abc import Callable
 from typing import Any
 
 import chex
@@ -12,18 +11,12 @@ from flax import struct
 from gasil_jax import learner, normalization
 from gasil_jax.config import Config
 from gasil_jax.context import Context, Metrics
-from gasil_jax.distributions import Distribution
 from gasil_jax.learner import Learner
 from gasil_jax.permutation import permutation
 
 
 class ActorCritic(struct.PyTreeNode):
-    """The policy and one value for each reward stream, all with their own optimizers.
-
-    Attributes:
-      policy: parameters and optimizer state of the policy's network.
-      values: the same of a `networks.Value` for each stream.
-    """
+    """The policy and a value for each reward stream, all with their own optimizers."""
 
     policy: Learner
     values: tuple[Learner, ...]
@@ -38,21 +31,13 @@ class ActorCritic(struct.PyTreeNode):
 
 
 class Batch(struct.PyTreeNode):
-    """The steps that PPO learns from; the leading axis is (steps,) or (minibatch,).
+    """The steps that PPO learns from, all of a batch or a minibatch; float32."""
 
-    Attributes:
-      observation: float32 (steps, obs), normalized.
-      action: float32 (steps, action).
-      log_prob: float32 (steps,), log density under the policy that acted.
-      advantage: float32 (steps,).
-      returns: float32 (steps, stream), targets of the values.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    log_prob: jax.Array
-    advantage: jax.Array
-    returns: jax.Array
+    observation: jax.Array  # (steps, obs), normalized
+    action: jax.Array  # (steps, action)
+    log_prob: jax.Array  # (steps,), under the policy that acted
+    advantage: jax.Array  # (steps,)
+    returns: jax.Array  # (steps, stream), targets of the values
 
 
 def generalized_advantage_estimation(
@@ -111,16 +96,10 @@ def standardize(advantage: jax.Array) -> jax.Array:
 def advantages(
     actor_critic: ActorCritic, rewards: jax.Array, context: Context
 ) -> tuple[jax.Array, jax.Array, Metrics]:
-    """Return the standardized advantages and the returns of every reward stream.
+    """Return standardized advantages and returns, float32 (time, env, stream) each.
 
-    Args:
-      actor_critic: the networks, with a value for each stream.
-      rewards: float32 (time, env) for one stream, or (time, env, stream).
-      context: the iteration's data.
-
-    Returns:
-      Two arrays, float32 (time, env, stream), and as metric "explained_variance", the
-      share of the returns' variance that the values explain, averaged over streams.
+    Rewards are float32 (time, env) for one stream, or (time, env, stream). The metric
+    is the share of the returns' variance that the values explain, a mean over streams.
     """
     batch = context.rollout
     rewards = rewards[..., None] if rewards.ndim == 2 else rewards
@@ -149,38 +128,14 @@ def advantages(
 
 
 def batch_of(context: Context, advantage: jax.Array, returns: jax.Array) -> Batch:
-    """Return PPO's batch, (steps, ...), of an iteration.
-
-    Args:
-      context: the iteration's data.
-      advantage: float32 (time, env), mixed from those of all streams.
-      returns: float32 (time, env, stream).
-    """
+    """Return the steps of an iteration, with their mixed advantage (time, env)."""
     steps = context.rollout
-
-    def flat(x: jax.Array) -> jax.Array:
-        return x.reshape(-1, *x.shape[2:])
-
-    return Batch(
-        observation=flat(
-            normalization.normalize(context.normalizer, steps.observation)
-        ),
-        action=flat(steps.action),
-        log_prob=flat(steps.log_prob),
-        advantage=flat(advantage),
-        returns=flat(returns),
-    )
+    observation = normalization.normalize(context.normalizer, steps.observation)
+    batch = Batch(observation, steps.action, steps.log_prob, advantage, returns)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
 
 
-def loss(
-    params: Any,
-    batch: Batch,
-    *,
-    policy: Callable[[Any, jax.Array], Any],
-    distribution: Distribution,
-    value: Callable[[Any, jax.Array], jax.Array],
-    config: Config,
-) -> tuple[jax.Array, Metrics]:
+def loss(params: Any, batch: Batch, context: Context) -> tuple[jax.Array, Metrics]:
     """Return PPO's loss: clipped surrogate, value error and entropy.
 
     See Schulman et al. 2017, equations 7 and 9.
@@ -188,10 +143,7 @@ def loss(
     Args:
       params: {"policy": ..., "values": (stream)}.
       batch: a minibatch.
-      policy: (params, observation) -> the parameters of the actions' distribution.
-      distribution: the distribution of actions.
-      value: (params, observation) -> value.
-      config: clip range and weights.
+      context: the iteration's data, with the networks and the config.
 
     Returns:
       The loss, (), and its parts as metrics.
@@ -200,16 +152,16 @@ def loss(
     chex.assert_equal(
         batch.returns.shape, (*batch.log_prob.shape, len(params["values"]))
     )
-    parameters = policy(params["policy"], batch.observation)
-    log_prob = distribution.log_prob(parameters, batch.action)
-    log_ratio = log_prob - batch.log_prob
+    config, distribution = context.config, context.distribution
+    parameters = context.policy(params["policy"], batch.observation)
+    log_ratio = distribution.log_prob(parameters, batch.action) - batch.log_prob
     ratio = jnp.exp(log_ratio)
     epsilon = config.clip_epsilon
     clipped = jnp.clip(ratio, 1.0 - epsilon, 1.0 + epsilon)
     surrogate = jnp.minimum(ratio * batch.advantage, clipped * batch.advantage)
     policy_loss = -jnp.mean(surrogate)
     squared_errors = [
-        (value(critic, batch.observation) - batch.returns[:, i]) ** 2
+        (context.value(critic, batch.observation) - batch.returns[:, i]) ** 2
         for i, critic in enumerate(params["values"])
     ]
     value_loss = jnp.stack([0.5 * jnp.mean(x) for x in squared_errors]).sum()
@@ -242,22 +194,12 @@ def optimizer(config: Config) -> optax.GradientTransformation:
 
 
 def descend(actor_critic: ActorCritic, gradient: Any, config: Config) -> ActorCritic:
-    """Take one gradient step of every network; each gradient's norm is clipped alone.
-
-    Args:
-      actor_critic: the networks before the step.
-      gradient: {"policy": ..., "values": (stream)}.
-      config: the step size and the largest norm of a gradient.
-    """
-    return ActorCritic(
-        policy=descend_one(actor_critic.policy, gradient["policy"], config),
-        values=tuple(
-            descend_one(value, value_gradient, config)
-            for value, value_gradient in zip(
-                actor_critic.values, gradient["values"], strict=True
-            )
-        ),
-    )
+    """Take one gradient step of every network; each clips its own gradient's norm."""
+    networks = (actor_critic.policy, *actor_critic.values)
+    gradients = (gradient["policy"], *gradient["values"])
+    pairs = zip(networks, gradients, strict=True)
+    policy, *values = (descend_one(x, y, config) for x, y in pairs)
+    return ActorCritic(policy, tuple(values))
 
 
 def descend_one(network: Learner, gradient: Any, config: Config) -> Learner:
@@ -272,12 +214,6 @@ def update(
 ) -> tuple[ActorCritic, Metrics]:
     """Train for `num_epochs` passes over the batch, in shuffled minibatches.
 
-    Args:
-      actor_critic: the networks before the update.
-      batch: the batch, (steps, ...), whose advantages are standardized and mixed.
-      key: random key; consumed.
-      context: the iteration's data, with the networks and the config.
-
     Returns:
       The networks after the update, and the mean of each metric over all minibatches.
     """
@@ -285,12 +221,7 @@ def update(
 
     def minibatch_step(actor_critic: ActorCritic, rows: jax.Array) -> Any:
         gradient, metrics = jax.grad(loss, has_aux=True)(
-            actor_critic.params,
-            jax.tree.map(lambda x: x[rows], batch),
-            policy=context.policy,
-            distribution=context.distribution,
-            value=context.value,
-            config=config,
+            actor_critic.params, jax.tree.map(lambda x: x[rows], batch), context
         )
         return descend(actor_critic, gradient, config), metrics
 

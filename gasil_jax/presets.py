@@ -6,8 +6,8 @@ the settings; a flag overrides a row.
 "tuned" has the settings that a search chose for an agent on a task, with the number of
 environments and the normalization of rewards that it ran with. Alpha suits only that
 normalization. Where the agent returns more with the learning rate, lambda, gamma and
-initial std that PPO's or PPO+GASIL's search chose, it has those
-(experiments/results/ppo_values.md). The rows of locomotion tasks, and those of PPO and
+initial std that PPO's or PPO+GASIL's search chose, it has these
+(docs/results/ablations.md). The rows of locomotion tasks, and those of PPO and
 PPO+GASIL on the dense point mass, are from the stored searches; the other rows of the
 point mass are from earlier ones. Adaptive imitation has one setting for all tasks of
 MuJoCo but ant and humanoid with delayed rewards, where what its searches chose returns
@@ -21,7 +21,7 @@ for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy 
 
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
-each task (experiments/results/paper_protocol.md), and the defaults where we did not
+each task (docs/results/paper_figures.md), and the defaults where we did not
 search. Rewards are normalized.
 """
 
@@ -44,11 +44,9 @@ Overrides = Mapping[str, Any]
 #: (environment, agent) -> overrides.
 Rows = Mapping[tuple[str, str], Overrides]
 
-
-#: File of the settings that searches chose: by "dense", "delayed", "paper dense" or
-#: "paper delayed"; then by environment; then by agent.
-#: `python -m experiments report` writes the rows of complete searches and leaves the
-#: others as they are.
+#: The settings that searches chose: by "dense", "delayed", "paper dense" or "paper
+#: delayed"; then by environment; then by agent. `python -m experiments report` writes
+#: the rows of complete searches, and leaves the others as they are.
 TUNED = pathlib.Path(__file__).with_name("tuned_presets.json")
 
 _CHOSEN: Mapping[str, Any] = json.loads(TUNED.read_text())
@@ -92,29 +90,25 @@ _GYMNAX = {
 }
 
 
-def _searched(rewards: str) -> Rows:
-    """Return the rows that searches chose."""
-    return {
-        (env, agent): row
-        for env, agents in _CHOSEN.get(rewards, {}).items()
-        for agent, row in agents.items()
-    }
-
-
-def _tuned(rewards: str, adaptive: Overrides) -> Rows:
+def _searched(rewards: str, adaptive: Overrides | None = None) -> Rows:
     """Return the rows that searches chose, and adaptive imitation's elsewhere."""
-    rows = {(env, "ppo+gasil-adaptive"): adaptive for env in ACTION_SIZES}
-    return {**rows, **_searched(rewards)}
+    tasks = ACTION_SIZES if adaptive is not None else ()
+    rows: dict[tuple[str, str], Any] = {
+        (env, "ppo+gasil-adaptive"): adaptive for env in tasks
+    }
+    for env, agents in _CHOSEN.get(rewards, {}).items():
+        rows |= {(env, agent): row for agent, row in agents.items()}
+    return rows
 
 
 def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     """Return settings of PPO that depend on the dimension of an action.
 
     The searches suggest that the learning rate and the exploration must be smaller for
-    actions with more dimensions (experiments/results/matrix.md). Noise in more
+    actions with more dimensions (docs/results/paper_figures.md). Noise in more
     dimensions also makes the returns after an action vary more, so lambda falls too.
     All three fall linearly from two dimensions to eight; more dimensions have the
-    values of eight (experiments/results/action_dimension.md).
+    values of eight (docs/results/ablations.md).
     """
     share = min(max((action_size - 2) / 6, 0.0), 1.0)
 
@@ -140,21 +134,17 @@ def _scaled(decompose_rewards: bool) -> Rows:
 
 
 class Preset(NamedTuple):
-    """The overrides of a preset, by environment and agent.
+    """The overrides of a preset, by environment and agent."""
 
-    Attributes:
-      dense: rows for rewards that are given at every step.
-      delayed: rows for delayed rewards.
-      every: overrides for all tasks and agents; a row takes precedence.
-    """
-
-    dense: Rows
-    delayed: Rows
-    every: Overrides = types.MappingProxyType({})
+    dense: Rows  # for rewards that are given at every step
+    delayed: Rows  # for delayed rewards
+    every: Overrides = types.MappingProxyType({})  # for all; a row takes precedence
 
 
 PRESETS: Mapping[str, Preset] = {
-    "tuned": Preset(_tuned("dense", _ADAPTIVE), _tuned("delayed", ADAPTIVE_DELAYED)),
+    "tuned": Preset(
+        _searched("dense", _ADAPTIVE), _searched("delayed", ADAPTIVE_DELAYED)
+    ),
     "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
@@ -227,6 +217,7 @@ def preset(
     if name == "scaled" and kind.name == "ppo" and action_size is not None:
         row = scaled(action_size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
+    rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and (name, kind.name) == ("scaled", "ppo"):
         raise ValueError(
@@ -234,25 +225,14 @@ def preset(
             "actions, which is env.action_size"
         )
     if lacking is not None and name != DEFAULT:
-        raise ValueError(f"{lacking}: it has {_listed(_rows(name, reward_delay))}")
-    row = _rows(name, reward_delay).get((env, kind.name), {})
+        tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
+        raise ValueError(f"{lacking}: it has {agents} on {tasks}")
+    row = rows.get((env, kind.name), {})
     return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
-def _listed(rows: Rows) -> str:
-    """Return the agents and environments of rows in words."""
-    by_agent: dict[str, list[str]] = {}
-    for env, agent in rows:
-        by_agent.setdefault(agent, []).append(env)
-    words = [f"{agent} on {', '.join(envs)}" for agent, envs in by_agent.items()]
-    return "; ".join(words)
-
-
 def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str | None:
-    """Return in words that a preset changes no default for an agent on a task.
-
-    The result is None if the preset changes any.
-    """
+    """Return in words that a preset has nothing for an agent on a task, or None."""
     if PRESETS[name].every or (env, agent) in _rows(name, reward_delay):
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"

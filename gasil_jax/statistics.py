@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from gasil_jax.errors import refusal
+
 #: Fewer seeds tell too little for an interval.
 FEWEST_SEEDS = 5
 _FEWEST_POINTS = 8
@@ -19,6 +21,9 @@ def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
     count in part. The package rliable drops whole scores instead, so that the two agree
     for multiples of four only.
     """
+    scores = np.asarray(scores)
+    if scores.dtype.kind not in "biuf" or not scores.size or not scores.ndim:
+        raise refusal("scores", scores.tolist(), "an array of numbers, one or more")
     ordered = np.moveaxis(np.sort(scores, axis=axis), axis, -1)
     count = ordered.shape[-1]
     # The weight of score i is how much of [i, i + 1] lies in [count / 4, 3 count / 4].
@@ -35,7 +40,7 @@ def bootstrap_interval(
 
     Args:
       scores: (seeds, ...). Seeds are drawn with replacement, the same ones for all
-        trailing entries; each trailing entry has its own interval.
+        trailing entries, which have an interval each.
       resamples: number of resamples; their draws are the same in every call.
 
     Returns:
@@ -111,18 +116,12 @@ def are_numbers(values: Sequence[Any]) -> bool:
 
 
 def groups(values: Sequence[Any]) -> list[np.ndarray]:
-    """Return the groups of points that have the same value, or neighbouring ones.
+    """Return the indices of points that have the same value, or neighbouring ones.
 
     Neighbouring numbers form a group if there are eight points or more, and fewer than
     two for each value. A group then has about three values, or more where that would
-    make more than eight groups.
-
-    Args:
-      values: each point's value of one hyperparameter.
-
-    Returns:
-      The indices of each group's points. Groups are in the order of their values, which
-      is that of their first points if they are not all numbers.
+    make more than eight groups. Groups are in the order of their values, which is that
+    of their first points if they are not all numbers.
     """
     distinct = list(dict.fromkeys(values))
     count = len(distinct)

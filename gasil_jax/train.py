@@ -4,8 +4,8 @@ Everything is a pure function of a key: `jax.jit` it, `jax.vmap` it over keys or
 any hyperparameter, shard it over devices, call it from other JAX code.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -52,19 +52,9 @@ class TrainState(struct.PyTreeNode):
     iteration: jax.Array
 
 
-class Train(Protocol):
-    """The type of the function that `make_train` returns."""
-
-    def __call__(
-        self,
-        key: jax.Array,
-        hyperparameters: Mapping[str, Any] | None = None,
-        data: Any = None,
-    ) -> tuple[TrainState, Metrics]:
-        """Return the last state, and metrics (iterations,); consumes the key."""
-
-
-def make_train(env: Any, algorithm: Algorithm) -> Train:
+def make_train(
+    env: Any, algorithm: Algorithm
+) -> Callable[..., tuple[TrainState, Metrics]]:
     """Return a pure function that trains from scratch for `total_steps`.
 
     Args:
@@ -121,6 +111,55 @@ def init(
     return _begin(env, algorithm, key, hyperparameters)
 
 
+def _begin(
+    env: Any,
+    algorithm: Algorithm,
+    key: jax.Array,
+    hyperparameters: Mapping[str, Any] | None,
+) -> TrainState:
+    checks.check_key(key)
+    own = {} if hyperparameters is None else hyperparameters
+    check_numbers(algorithm, own)
+    return first_state(env, algorithm.replace(**own), key)
+
+
+@full_precision
+def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
+    """Return the same state as `init`, without checking the arguments.
+
+    So a stored run can be loaded where it could not be trained, for example because its
+    expert's file is gone.
+    """
+    agent, config, models = algorithm.agent, algorithm.config, algorithm.rewards
+    numbers = {
+        name: jnp.asarray(value, jnp.float32)
+        for name, value in algorithm.hyperparameters.items()
+    }
+    key, policy_key, value_key, env_key, agent_key, rewards_key = jax.random.split(
+        key, 6
+    )
+    age_limit = max_episode_steps(env) if config.stagger_episodes else None
+    history = _init_history(env, algorithm)
+    history_steps = 0 if history is None else history.reward.shape[1]
+    sizes = sizes_of(env, config.num_envs, history_steps)
+    return TrainState(
+        actor_critic=_init_actor_critic(
+            env, algorithm, numbers["initial_std"], keys=(policy_key, value_key)
+        ),
+        normalizer=normalization.init(env.observation_size),
+        environments=rollout.init(env, env_key, config.num_envs, age_limit=age_limit),
+        history=history,
+        rewards=tuple(
+            model.init(model_key, sizes)
+            for model, model_key in zip(models, _keys(rewards_key, len(models)))
+        ),
+        agent=agent.init(agent_key, sizes),
+        hyperparameters=numbers,
+        key=key,
+        iteration=jnp.int32(0),
+    )
+
+
 @full_precision
 def train_step(
     env: Any, algorithm: Algorithm, state: TrainState, *, data: Any = None
@@ -148,7 +187,7 @@ def train_step(
     algorithm = algorithm.at(state.hyperparameters, state.iteration)
     keys = Keys(*jax.random.split(state.key, 6))
     experience = collect(env, algorithm, state, keys=keys, data=data)
-    return learn(algorithm, state, experience, keys=keys)
+    return learn(algorithm, experience, keys=keys)
 
 
 class Keys(NamedTuple):
@@ -163,25 +202,13 @@ class Keys(NamedTuple):
 
 
 class Experience(NamedTuple):
-    """What is known of a batch before the agent and the policy learn from it.
+    """What is known of a batch before the agent and the policy learn from it."""
 
-    Attributes:
-      batch: the batch, (time, env, ...), with the environment's own rewards.
-      context: the data that the agent gets, with the rewards of the models.
-      environments: the running episodes after the batch.
-      history: the history after the batch, with the environment's own rewards.
-      rewards: the states of the models of rewards after the batch.
-      healthy: bool (), false if a model's update was not finite and was undone.
-      metrics: metrics of the models of rewards.
-    """
-
-    batch: Rollout
-    context: Context
-    environments: rollout.EnvironmentStates
-    history: History | None
-    rewards: tuple[Any, ...]
-    healthy: jax.Array
-    metrics: Metrics
+    state: TrainState  # after the batch; networks and agent are still the old ones
+    steps: Rollout  # (time, env, ...), with the environment's own rewards
+    context: Context  # what the agent gets, with the rewards of the models
+    healthy: jax.Array  # bool (), false if a model's update was undone
+    metrics: Metrics  # of the models of rewards
 
 
 def collect(
@@ -203,7 +230,7 @@ def collect(
             max_episode_steps=max_episode_steps(env),
             gamma=algorithm.config.gamma,
         )
-    history = None if state.history is None else _record(state.history, batch)
+    history = None if state.history is None else record(state.history, batch)
     context = Context(
         rollout=batch,
         history=history,
@@ -217,65 +244,48 @@ def collect(
         data=jax.tree.map(jnp.asarray, data),
     )
     metrics: Metrics = {}
-    states, healthy = [], jnp.bool_(True)
+    rewards, healthy = [], jnp.bool_(True)
     model_keys = _keys(keys.rewards, len(algorithm.rewards))
     with jax.named_scope("rewards"):
         for model, before, key in zip(algorithm.rewards, state.rewards, model_keys):
-            after, context, is_sound, own = model.update(before, context, key)
-            states.append(after)
-            healthy &= is_sound
-            metrics = merge_metrics(type(model).__name__, metrics, own)
-    return Experience(
-        batch, context, environments, history, tuple(states), healthy, metrics
+            after, context, is_finite, own = call(model, "update", before, context, key)
+            rewards.append(after)
+            healthy &= is_finite
+            metrics = merge_metrics(f"model of rewards {model.name!r}", metrics, own)
+    state = state.replace(
+        environments=environments, history=history, rewards=tuple(rewards)
     )
+    return Experience(state, batch, context, healthy, metrics)
 
 
 def learn(
-    algorithm: Algorithm, state: TrainState, experience: Experience, *, keys: Keys
+    algorithm: Algorithm, experience: Experience, *, keys: Keys
 ) -> tuple[TrainState, Metrics]:
     """Update the agent and the policy from a batch."""
     agent, config = algorithm.agent, algorithm.config
-    batch, context = experience.batch, experience.context
+    state, steps, context, healthy, model_metrics = experience
     # Update the good-trajectory buffer, which ranks episodes by the environment's own
     # rewards.
-    (remembered,) = call(agent, "remember", state.agent, context, state=state.agent)
+    remembered = call(agent, "remember", state.agent, context)
     # Sample good trajectories, update the discriminator (equation 8) and shape the
     # reward with it (section 4.3); agents without a discriminator do other things here.
-    streams = jnp.stack([batch.reward] * agent.num_streams, axis=-1)
     agent_state, rewards, agent_metrics = call(
-        agent,
-        "update_and_reward",
-        remembered,
-        context,
-        keys.agent,
-        state=remembered,
-        rewards=streams if agent.num_streams > 1 else batch.reward,
+        agent, "update_and_reward", remembered, context, keys.agent
     )
     # Update the policy (equations 9 and 11), by PPO and then by the agent's own steps.
     with jax.named_scope("update_policy"):
         advantages, returns, value_metrics = ppo.advantages(
             state.actor_critic, rewards, context
         )
-        advantage, mix_metrics = call(
-            agent, "mix", agent_state, advantages, context, advantage=batch.reward
-        )
+        advantage, mix_metrics = call(agent, "mix", agent_state, advantages, context)
+        batch = ppo.batch_of(context, advantage, returns)
         actor_critic, ppo_metrics = ppo.update(
-            state.actor_critic,
-            ppo.batch_of(context, advantage, returns),
-            keys.ppo,
-            context,
+            state.actor_critic, batch, keys.ppo, context
         )
         agent_state, actor_critic, policy_metrics = call(
-            agent,
-            "update_policy",
-            agent_state,
-            actor_critic,
-            context,
-            keys.policy,
-            state=agent_state,
-            actor_critic=actor_critic,
+            agent, "update_policy", agent_state, actor_critic, context, keys.policy
         )
-    healthy, (actor_critic, agent_state) = learner.keep_if_finite(
+    is_finite, (actor_critic, agent_state) = learner.keep_if_finite(
         (actor_critic, agent_state), (state.actor_critic, remembered)
     )
     metrics = merge_metrics(
@@ -283,27 +293,24 @@ def learn(
         {
             "env_steps": (state.iteration + 1).astype(jnp.float32) * config.batch_steps,
             "learning_rate": jnp.asarray(config.learning_rate),
-            "skipped_updates": ~(healthy & experience.healthy),
+            "skipped_updates": ~(is_finite & healthy),
         },
-        rollout.metrics(batch),
-        experience.metrics,
+        rollout.metrics(steps),
         agent_metrics,
         ppo_metrics,
         value_metrics,
         mix_metrics,
         policy_metrics,
     )
+    metrics = merge_metrics("a model of rewards", metrics, model_metrics)
     return state.replace(
         actor_critic=actor_critic,
         # Observations are normalized with the same numbers in acting and in learning,
         # so the normalizer is updated at the end. Those with a NaN are ignored.
         normalizer=normalization.update(
             state.normalizer,
-            jnp.where(batch.faulty[..., None], jnp.nan, batch.observation),
+            jnp.where(steps.faulty[..., None], jnp.nan, steps.observation),
         ),
-        environments=experience.environments,
-        history=experience.history,
-        rewards=experience.rewards,
         agent=agent_state,
         key=keys.state,
         iteration=state.iteration + 1,
@@ -313,60 +320,6 @@ def learn(
 def max_episode_steps(env: Any) -> int:
     """Return the environment's limit, after which an episode is truncated, or 1000."""
     return int(getattr(env, "episode_length", 1000))
-
-
-def _begin(
-    env: Any,
-    algorithm: Algorithm,
-    key: jax.Array,
-    hyperparameters: Mapping[str, Any] | None,
-) -> TrainState:
-    """Return the first state, with checked key and numbers."""
-    checks.check_key(key)
-    own = {} if hyperparameters is None else hyperparameters
-    check_numbers(algorithm, own)
-    return first_state(env, algorithm.replace(**own), key)
-
-
-@full_precision
-def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
-    """Return the same state as `init`, without checking the arguments.
-
-    So a stored run can be loaded where it could not be trained, for example because its
-    expert's file is gone.
-    """
-    agent, config, models = algorithm.agent, algorithm.config, algorithm.rewards
-    numbers = {
-        name: jnp.asarray(value, jnp.float32)
-        for name, value in algorithm.hyperparameters.items()
-    }
-    key, policy_key, value_key, env_key, agent_key, rewards_key = jax.random.split(
-        key, 6
-    )
-    history = _init_history(env, algorithm)
-    history_steps = 0 if history is None else history.reward.shape[1]
-    sizes = sizes_of(env, config.num_envs, history_steps)
-    return TrainState(
-        actor_critic=_init_actor_critic(
-            env, algorithm, numbers["initial_std"], keys=(policy_key, value_key)
-        ),
-        normalizer=normalization.init(env.observation_size),
-        environments=rollout.init(
-            env,
-            env_key,
-            config.num_envs,
-            age_limit=max_episode_steps(env) if config.stagger_episodes else None,
-        ),
-        history=history,
-        rewards=tuple(
-            model.init(model_key, sizes)
-            for model, model_key in zip(models, _keys(rewards_key, len(models)))
-        ),
-        agent=agent.init(agent_key, sizes),
-        hyperparameters=numbers,
-        key=key,
-        iteration=jnp.int32(0),
-    )
 
 
 def _init_actor_critic(
@@ -402,20 +355,6 @@ def _init_history(env: Any, algorithm: Algorithm) -> History | None:
         action_size=wrappers.action_size(env),
         keep_next=any(model.keeps_next_observation for model in models),
         num_episodes=max(asked),
-    )
-
-
-@jax.named_scope("good_trajectories")
-def _record(history: History, batch: Rollout) -> History:
-    return record(
-        history,
-        batch.observation,
-        batch.action,
-        # A NaN marks an episode without a valid return: one with a faulty step, or one
-        # that was cut short.
-        reward=jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward),
-        ended=batch.ended,
-        next_observation=batch.next_observation,
     )
 
 

@@ -1,10 +1,85 @@
-"""The interface of all environments here: Brax's `Env`, `State` and `Wrapper`."""
+"""The interface of all environments here: Brax's `Env`, `State` and `Wrapper`.
 
-import contextlib
-import io
+They have the same fields and functions as the classes of ``brax.envs``, and each works
+where the other is expected. They are written out because importing Brax, with all of
+its physics, takes longer than everything else that a command needs to start.
+"""
 
-# MJX prints at its first import that its optional Warp backend is absent.
-with contextlib.redirect_stdout(io.StringIO()):
-    from brax.envs import Env, PipelineEnv, State, Wrapper
+from typing import Any
 
-__all__ = ["Env", "PipelineEnv", "State", "Wrapper"]
+import jax
+from flax import struct
+
+
+class State(struct.PyTreeNode):
+    """The state of an environment.
+
+    Attributes:
+      pipeline_state: the state of its physics, any pytree.
+      obs: float32 (obs,), the observation.
+      reward: float32 (), the reward of the last step.
+      done: float32 (), 1 if the episode has ended, else 0.
+      metrics: arrays to report, by name.
+      info: all else that the environment and its wrappers keep, by name.
+    """
+
+    pipeline_state: Any
+    obs: jax.Array
+    reward: jax.Array
+    done: jax.Array
+    metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
+    info: dict[str, Any] = struct.field(default_factory=dict)
+
+
+class Env:
+    """An environment: pure functions of its states.
+
+    Attributes:
+      observation_size: number of numbers in an observation.
+      action_size: dimension of an action.
+      num_actions: number of discrete actions, of an environment without `action_size`.
+      episode_length: number of steps after which an episode is truncated, if it is.
+    """
+
+    observation_size: Any
+    action_size: Any
+    num_actions: Any
+    episode_length: Any
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; consumes the key."""
+        raise NotImplementedError
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one step."""
+        raise NotImplementedError
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment without wrappers."""
+        return self
+
+
+class Wrapper(Env):
+    """An environment that changes what another one does."""
+
+    def __init__(self, env: Any):
+        self.env = env
+
+    def reset(self, rng: jax.Array) -> State:
+        """Start an episode; consumes the key."""
+        return self.env.reset(rng)
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Take one step."""
+        return self.env.step(state, action)
+
+    @property
+    def unwrapped(self) -> Any:
+        """The environment without wrappers."""
+        return self.env.unwrapped
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):  # Those of pickle and copy, before there is an env.
+            raise AttributeError(name)
+        return getattr(self.env, name)

@@ -6,12 +6,12 @@ reward, termination, start and frame skip are those of ``gymnasium.envs.mujoco.*
 """
 
 import dataclasses
+import importlib.util
 import pathlib
 import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import gymnasium
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -113,8 +113,11 @@ class Task:
     episode_length: int = 1000
 
 
+# Found without importing it, which takes as long as all of our own modules.
+_gymnasium = importlib.util.find_spec("gymnasium")
+assert _gymnasium is not None and _gymnasium.origin is not None  # A dependency.
 #: The folder of Gymnasium's models.
-ASSETS = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+ASSETS = pathlib.Path(_gymnasium.origin).parent / "envs/mujoco/assets"
 
 
 def _torso_position(model: mujoco.MjModel, fields: Fields) -> jax.Array:

@@ -1,10 +1,19 @@
 """The environments of ``brax.envs`` by name, as brax:NAME."""
 
-import brax.envs
+import contextlib
+import functools
+import io
+from typing import Any
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from gasil_envs.base import Env, Wrapper
+# MJX, which Brax imports, prints that its optional Warp backend is absent.
+with contextlib.redirect_stdout(io.StringIO()):
+    import brax.envs
+
+from gasil_envs.base import Wrapper
 
 
 class _OfBrax(Wrapper):
@@ -13,7 +22,7 @@ class _OfBrax(Wrapper):
     Brax runs a reset, operation by operation, each time that it is asked for the size.
     """
 
-    def __init__(self, env: Env, observation_size: int):
+    def __init__(self, env: Any, observation_size: int):
         super().__init__(env)
         self._observation_size = observation_size
 
@@ -28,9 +37,19 @@ def names() -> tuple[str, ...]:
     return tuple(brax.envs._envs)
 
 
-def build(name: str) -> Env:
+def build(name: str) -> Any:
     """Build an environment of Brax, and trace a step without running it."""
-    env = brax.envs.get_environment(name)
+    env: Any = brax.envs.get_environment(name)
+    # "fast" has no robot.
+    if getattr(env, "sys", None) is not None:
+        env.draw = functools.partial(_draw, env.sys)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
     return _OfBrax(env, state.obs.shape[-1])
+
+
+def _draw(system: Any, state: Any, size: tuple[int, int]) -> np.ndarray:
+    """Return Brax's own picture of a state, which MuJoCo draws."""
+    from brax.io import image
+
+    return image.render_array(system, state, height=size[1], width=size[0])

@@ -9,8 +9,11 @@ from typing import Any
 
 import gymnax
 import jax
+import jax.numpy as jnp
 import numpy as np
 from gymnax.environments import spaces
+from matplotlib.colors import hsv_to_rgb
+from PIL import Image
 
 from gasil_envs.worlds import Unfit, World
 
@@ -63,9 +66,26 @@ def build(name: str) -> World:
         episode_length=int(params.max_steps_in_episode),
         part=part or None,
     )
+    _, seen = jax.eval_shape(begin, jax.random.key(0))
     if hasattr(env, "render"):
         world.draw = functools.partial(_draw, env, params)
+    elif len(getattr(seen, "shape", ())) == 3:
+        world.draw = functools.partial(_draw_planes, env, params)
     return world
+
+
+def _draw_planes(
+    env: Any, params: Any, state: Any, size: tuple[int, int]
+) -> np.ndarray:
+    """Return a picture of MinAtar's planes, each in a color of its own."""
+    planes = np.asarray(env.get_obs(jax.tree.map(jnp.asarray, state[0]), params=params))
+    colors = 255 * hsv_to_rgb(
+        [(i / planes.shape[-1], 0.8, 1.0) for i in range(planes.shape[-1])]
+    )
+    last = planes.shape[-1] - 1 - planes[..., ::-1].argmax(axis=-1)
+    picture = np.where(planes.any(axis=-1, keepdims=True), colors[last], 0.0)
+    image = Image.fromarray(picture.astype(np.uint8))
+    return np.asarray(image.resize(size, Image.Resampling.NEAREST))
 
 
 def _draw(env: Any, params: Any, state: Any, size: tuple[int, int]) -> np.ndarray:

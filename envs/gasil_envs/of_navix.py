@@ -3,7 +3,10 @@
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import navix
+import numpy as np
+from PIL import Image
 
 from gasil_envs.worlds import World
 
@@ -32,10 +35,18 @@ def build(name: str) -> World:
         terminated = timestep.is_termination()
         return timestep, timestep.observation, timestep.reward, terminated
 
-    return World(
+    world = World(
         begin,
         advance,
         actions=len(env.action_set),
         episode_length=int(env.max_steps),
         part=part or None,
     )
+    world.draw = _draw
+    return world
+
+
+def _draw(state: Any, size: tuple[int, int]) -> np.ndarray:
+    """Return navix' own picture of the whole grid."""
+    grid = navix.observations.rgb(jax.tree.map(jnp.asarray, state[0].state))
+    return np.asarray(Image.fromarray(np.asarray(grid)).resize(size))

@@ -9,16 +9,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from gasil_envs import (
-    locomotion,
-    point_mass,
-    user_environment,
-    worlds,
-    wrappers,
-)
+# `gasil_envs.locomotion` is imported when it is first used: MuJoCo takes a while.
+import gasil_envs
+from gasil_envs import point_mass, user_environment, worlds, wrappers
 from gasil_envs.base import Env
 from gasil_envs.errors import InputError, nearest, refusal, unknown
-from gasil_envs.physics import batching, native
+from gasil_envs.physics import batching, host_threads
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,7 +66,7 @@ def _refuse_unknown(
 
 def names() -> tuple[str, ...]:
     """Return the names of this package's environments."""
-    return ("point_mass", *locomotion.TASKS)
+    return ("point_mass", *gasil_envs.locomotion.TASKS)
 
 
 def _constructor(name: str) -> Callable[[Settings], Env]:
@@ -119,7 +115,7 @@ def _build_of_others(name: str) -> Env:
 def _build_ours(name: str, settings: Settings) -> Env:
     if name == "point_mass":
         return point_mass.PointMass()
-    return locomotion.Locomotion(
+    return gasil_envs.locomotion.Locomotion(
         name, physics=settings.physics, integrator=settings.integrator
     )
 
@@ -151,8 +147,10 @@ def check(name: str, settings: Settings) -> None:
                 raise ValueError(
                     f"{field} is {value!r}: leave it out, {name} has its own physics"
                 )
-    _refuse_unknown("physics", settings.physics, locomotion.PHYSICS)
-    _refuse_unknown("integrator", settings.integrator, locomotion.INTEGRATORS)
+    _refuse_unknown("physics", settings.physics, gasil_envs.locomotion.PHYSICS)
+    _refuse_unknown(
+        "integrator", settings.integrator, gasil_envs.locomotion.INTEGRATORS
+    )
     for field in ("terminal_limits", "observe_phase"):
         if not isinstance(value := getattr(settings, field), bool):
             raise refusal(field, value, "True or False")
@@ -180,7 +178,7 @@ def without_effect(name: str, settings: Settings) -> list[str]:
       name: one of `names()`, or another name that `check` accepts.
       settings: settings that `check` accepts.
     """
-    if ":" in name or name in locomotion.TASKS:
+    if ":" in name or name in gasil_envs.locomotion.TASKS:
         return []
     of_physics = ("physics", "integrator")
     return [x for x in of_physics if getattr(settings, x) != getattr(Settings, x)]
@@ -190,7 +188,7 @@ def prepare(settings: Settings, num_devices: int) -> None:
     """Prepare the process for `num_devices` CPU devices; call it before JAX starts."""
     batching.keep_loops(settings.physics)
     if settings.physics == "mujoco":
-        native.reserve_threads(num_devices)
+        host_threads.reserve(num_devices)
 
 
 def make(name: str, **settings: Any) -> Env:
@@ -212,7 +210,7 @@ def make(name: str, **settings: Any) -> Env:
     chosen = Settings(**settings)
     check(name, chosen)
     batching.keep_loops(chosen.physics)
-    env = _constructor(name)(chosen)
+    env: Any = _constructor(name)(chosen)
     limit = int(getattr(env, "episode_length", _EPISODE_LENGTH))
     if chosen.max_episode_steps is not None:
         if not _is_whole(chosen.max_episode_steps, 1, limit):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_envs.base import Env, PipelineEnv, State, Wrapper
+from gasil_envs.base import Env, State, Wrapper
 
 #: C MuJoCo's mjMAXVAL: a larger number means that the simulation has failed.
 _LARGEST = 1e10
@@ -75,7 +75,7 @@ def zero_action(env: Any) -> jax.Array:
 
 def resets_slowly(env: Any) -> bool:
     """Return whether a reset takes about as long as a step: with Brax's own physics."""
-    return isinstance(getattr(env, "unwrapped", env), PipelineEnv)
+    return hasattr(env, "pipeline_init")
 
 
 def _refuse_taken(state: State, *names: str) -> None:

@@ -16,8 +16,7 @@ Standardized advantages have no unit, so there is no alpha to tune. The weight w
   latest episodes, both discounted as the buffer ranks them: imitation counts more, the
   better the buffer is than the policy.
 
-`imitation_rule` names the factors that are used. While the buffer is empty, w
-is 0.
+`imitation_rule` names the factors that are used. While the buffer is empty, w is 0.
 """
 
 from collections.abc import Callable, Mapping
@@ -49,22 +48,13 @@ RULES: Mapping[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 
 
 class Adaptive(struct.PyTreeNode):
-    """The state of the agent.
-
-    Attributes:
-      discriminator: the discriminator D.
-      bonus_normalizer: normalizes the bonus, so that the targets of its value have the
-        same scale as those of a normalized reward's.
-      policy_return: float32 (), moving mean of the returns of the policy's latest
-        episodes, discounted as the buffer ranks them; 0 before the first episode.
-      has_episodes: bool (), whether an episode has been counted.
-      buffer: the good-trajectory buffer.
-    """
+    """The state of the agent."""
 
     discriminator: Learner
+    # The targets of the bonus's value have the scale of a normalized reward's.
     bonus_normalizer: reward_normalization.RewardNormalizer
-    policy_return: jax.Array
-    has_episodes: jax.Array
+    policy_return: jax.Array  # float32 (), moving mean over the latest whole episodes
+    has_episodes: jax.Array  # bool (), whether an episode has been counted
     buffer: GoodTrajectories
 
 
@@ -75,15 +65,13 @@ def follow_return(
     *,
     return_: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of the policy's returns after a batch's episodes.
+    """Return the first two arguments, as in `Adaptive`, after a batch's episodes.
 
     Args:
-      policy_return: float32 (), the mean before the batch.
-      has_episodes: bool (), whether there were episodes before the batch; whether there
-        are after it is returned too.
+      policy_return: float32 (), the moving mean before the batch.
+      has_episodes: bool (), whether an episode was counted before the batch.
       completed: bool (time, env), whether a whole episode ended with this step.
-      return_: float32 (time, env), the episode's return up to this step; NaN if it does
-        not count.
+      return_: float32 (time, env), its return; NaN if it does not count.
     """
     counted = completed & jnp.isfinite(return_)
     count = jnp.sum(counted)
@@ -93,20 +81,10 @@ def follow_return(
     return jnp.where(count > 0, moved, policy_return), has_episodes | (count > 0)
 
 
-def correlation(advantages: jax.Array) -> jax.Array:
-    """Return the correlation of two standardized advantages (time, env, 2), ()."""
-    return jnp.mean(advantages[..., 0] * advantages[..., 1])
-
-
 def gap(good_return: jax.Array, policy_return: jax.Array) -> jax.Array:
     """Return how much better the buffer is than the policy, from 0 to 1, ()."""
     spread = _FULL_GAP * jnp.abs(good_return) + 1e-8
     return jnp.clip((good_return - policy_return) / spread, 0.0, 1.0)
-
-
-def mix(advantages: jax.Array, weight: jax.Array | float) -> jax.Array:
-    """Return (1 - w) A_r + w A_b of advantages (time, env, 2): (time, env)."""
-    return (1.0 - weight) * advantages[..., 0] + weight * advantages[..., 1]
 
 
 class PPOGASILAdaptive(SelfImitatingAgent):
@@ -141,20 +119,17 @@ class PPOGASILAdaptive(SelfImitatingAgent):
         self, state: Adaptive, context: Context, key: jax.Array
     ) -> tuple[Adaptive, jax.Array, Metrics]:
         """Train the discriminator, and return both streams, (time, env, 2)."""
-        discriminator, bonus, metrics = self.update_and_score(
-            state.discriminator, self.source(state.buffer), context, key
-        )
+        discriminator, bonus, metrics = self.update_and_score(state, context, key)
         batch = context.rollout
         normalizer = reward_normalization.update(
             state.bonus_normalizer, bonus, batch.ended, gamma=context.config.gamma
         )
+        past = (state.policy_return, state.has_episodes)
         policy_return, has_episodes = follow_return(
-            state.policy_return,
-            state.has_episodes,
-            batch.completed,
-            return_=self.ranked_by(batch),
+            *past, batch.completed, return_=batch.discounted_return
         )
         metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
+        metrics |= self.buffer_metrics(state.buffer)
         normalized = reward_normalization.normalize(
             normalizer, bonus, reward_normalization.CLIP
         )
@@ -165,22 +140,21 @@ class PPOGASILAdaptive(SelfImitatingAgent):
             policy_return=policy_return,
             has_episodes=has_episodes,
         )
-        return state, streams, {**metrics, **self.buffer_metrics(state.buffer)}
+        return state, streams, metrics
 
     def mix(
         self, state: Adaptive, advantages: jax.Array, context: Context
     ) -> tuple[jax.Array, Metrics]:
-        advantage_correlation = correlation(advantages)
-        good_return = mean_return(state.buffer)
-        return_gap = gap(good_return, state.policy_return)
-        factor = RULES[self.imitation_rule](
-            jnp.maximum(advantage_correlation, 0.0), return_gap
-        )
+        reward, bonus = advantages[..., 0], advantages[..., 1]
+        # They are standardized, so this is their correlation.
+        agreement = jnp.mean(reward * bonus)
+        return_gap = gap(mean_return(state.buffer), state.policy_return)
+        factor = RULES[self.imitation_rule](jnp.maximum(agreement, 0.0), return_gap)
         weight = self.imitation_weight * factor
         weight = jnp.where(state.buffer.size > 0, weight, 0.0)
         metrics = {
             "imitation_weight": weight,
-            "advantage_correlation": advantage_correlation,
+            "advantage_correlation": agreement,
             "return_gap": return_gap,
         }
-        return mix(advantages, weight), metrics
+        return (1.0 - weight) * reward + weight * bonus, metrics

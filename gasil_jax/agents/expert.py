@@ -1,10 +1,8 @@
 """Load expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
 
-import contextlib
-import functools
 import importlib
 import pathlib
-from typing import Any
+from collections.abc import Mapping
 
 import jax
 import numpy as np
@@ -19,7 +17,7 @@ _NAMES = ("observation", "action")
 def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     """Return the expert's observations (steps, obs) and actions (steps, action).
 
-    Both are float32 and read-only. Discrete actions may also be numbers, (steps,).
+    Both are float32. Discrete actions may also be numbers, (steps,).
 
     Args:
       source: the path of an ``.npz`` file with arrays "observation" and "action", or
@@ -28,53 +26,40 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     Raises:
       ValueError: if it can't be read, or its arrays have wrong names, shapes or values.
     """
-    return _load(source, _version(source))
-
-
-def _version(source: str) -> Any:
-    """Return names, times and sizes of an expert's files; None if they are not read."""
-    paths = [pathlib.Path(source)]
-    if source.startswith(_MINARI):
-        try:
-            from minari.storage import get_dataset_path
-        except ImportError:
-            return None
-        folder = pathlib.Path(get_dataset_path(source.removeprefix(_MINARI)))
-        paths = sorted(folder.rglob("*"))
-    with contextlib.suppress(OSError):
-        return tuple((x.name, x.stat().st_mtime_ns, x.stat().st_size) for x in paths)
-    return None
-
-
-@functools.lru_cache(maxsize=4)
-def _load(source: str, version: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Load an expert; `version` makes the cache read a changed file again."""
-    is_minari = source.startswith(_MINARI)
     form = "an .npz file with arrays 'observation' and 'action'"
-    if is_minari:
+    if source.startswith(_MINARI):
         _require_minari(source)
         form = "a local data set with arrays as observations and actions"
     # What is wrong in a data set decides the type of the error.
     try:
-        arrays = (
-            _read_minari(source.removeprefix(_MINARI))
-            if is_minari
-            else npz.read(pathlib.Path(source), lambda name: name in _NAMES)
-        )
-        numbered = np.ndim(arrays.get("action", 0)) == 1
-        shapes = (None, None), (None,) if numbered else (None, None)
-        observation, action = (
-            npz.numbers(arrays, x, shape).astype(np.float32)
-            for x, shape in zip(_NAMES, shapes, strict=True)
-        )
+        if source.startswith(_MINARI):
+            arrays = _read_minari(source.removeprefix(_MINARI))
+        else:
+            arrays = npz.read(pathlib.Path(source), _NAMES)
+        observation, action = (_numbers(arrays, name) for name in _NAMES)
+        dimensions = observation.ndim, action.ndim
+        if dimensions not in ((2, 1), (2, 2)) or not observation.size * action.size:
+            raise ValueError(f"shapes are {observation.shape} and {action.shape}")
         if len(observation) != len(action):
             raise ValueError(f"{len(observation)} observations, {len(action)} actions")
     except Exception as error:
         why = str(error).partition("\n")[0] or type(error).__name__
         raise ValueError(f"expert is {source!r}: it must be {form} ({why})") from None
-    for array in (observation, action):
-        array.setflags(write=False)
     return observation, action
+
+
+def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
+    """Return an array as float32; raise `ValueError` unless its numbers are finite."""
+    if name not in arrays:
+        raise ValueError(f"{name} is missing")
+    array = np.asarray(arrays[name])
+    if array.dtype.kind not in "iuf":
+        raise ValueError(f"{name} holds no numbers, it is {array.dtype}")
+    with np.errstate(over="ignore"):
+        array = array.astype(np.float32)
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} has numbers that aren't finite")
+    return array
 
 
 def _require_minari(source: str) -> None:
@@ -106,33 +91,28 @@ def vectors(action: jax.Array, size: int) -> jax.Array:
 
 
 def check(source: str | None, sizes: Sizes) -> None:
-    """Check that an expert is given and fits the environment's sizes.
-
-    Raises:
-      ValueError: if it is missing, can't be read, or does not fit the sizes.
-    """
+    """Raise `ValueError` unless an expert can be read and fits the environment."""
     if source is None:
         raise ValueError(
             "expert is missing: agent 'gail' needs a file, FILE.npz, or a data set, "
             "minari:NAME"
         )
     observation, action = load(source)
-    numbered = action.ndim == 1
-    if numbered and not sizes.discrete:
+    size = sizes.action if action.ndim == 1 else action.shape[1]
+    if action.ndim == 1 and not sizes.discrete:
         raise ValueError(
             f"expert {source!r} has numbers as actions: the environment's are vectors "
-            f"of size {sizes.action}"
+            f"of size {size}"
         )
-    if numbered and not np.isin(action, np.arange(sizes.action)).all():
+    if action.ndim == 1 and not np.isin(action, np.arange(size)).all():
         raise ValueError(
             f"expert {source!r} has actions from {action.min():g} to "
             f"{action.max():g}: the environment's are whole numbers from 0 to "
-            f"{sizes.action - 1}"
+            f"{size - 1}"
         )
-    given = (observation.shape[1], sizes.action if numbered else action.shape[1])
-    if given != (sizes.observation, sizes.action):
+    if (observation.shape[1], size) != (sizes.observation, sizes.action):
         raise ValueError(
-            f"expert {source!r} has observations of size {given[0]} and actions of "
-            f"size {given[1]}: the environment's are of size {sizes.observation} and "
-            f"{sizes.action}"
+            f"expert {source!r} has observations of size {observation.shape[1]} and "
+            f"actions of size {size}: the environment's are of size "
+            f"{sizes.observation} and {sizes.action}"
         )

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import user_code
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
 
@@ -52,7 +52,7 @@ class Agent(struct.PyTreeNode):
 
         It maps normalized observations, (..., obs), to the mean of actions, or to the
         logits of discrete ones, (..., action), and may only have parameters. It should
-        start near 0: so an untrained policy explores alike in every state.
+        start near 0, so that an untrained policy explores alike in every state.
         """
         return None
 
@@ -127,39 +127,43 @@ class Agent(struct.PyTreeNode):
         """
         return advantages[..., 0], {}
 
-    def good_trajectories(self, state: Any) -> GoodTrajectories | None:
-        """Return the good-trajectory buffer in a state; None if the agent has none."""
-        return None
 
-
-def call(agent: Agent, function: str, *arguments: Any, **like: Any) -> Any:
-    """Call a function of an agent, and return the values that it returns.
-
-    Args:
-      agent: the agent.
-      function: the function's name.
-      *arguments: its arguments.
-      **like: what it returns by name, as arrays of the same shapes and dtypes, in
-        order; all functions but `remember` return metrics besides.
+def call(part: Any, function: str, *arguments: Any) -> Any:
+    """Call a function of an agent or a model of rewards, and return what it returns.
 
     Raises:
-      ValueError: if it returns anything else. The loop would broadcast or convert it.
+      ValueError: if that has other shapes or dtypes than the interface says. The loop
+        would broadcast or convert it.
     """
-    what = f"{function} of agent {agent.name!r}"
-    outputs = getattr(agent, function)(*arguments)
+    kind = "agent" if isinstance(part, Agent) else "model of rewards"
+    what = f"{function} of {kind} {part.name!r}"
+    outputs = getattr(part, function)(*arguments)
+    context = next(x for x in arguments if isinstance(x, Context))
+    reward = context.rollout.reward
+    # Arrays of the shapes and dtypes that are expected, by name.
+    like = {"advantage": reward} if function == "mix" else {"state": arguments[0]}
+    if function == "update":
+        like |= {"context": context, "learned": jnp.bool_(True)}
+    if function == "update_and_reward":
+        streams = [reward] * part.num_streams
+        like["rewards"] = jnp.stack(streams, -1) if len(streams) > 1 else reward
+    if function == "update_policy":
+        like["actor_critic"] = arguments[1]
     names = [*like, *["metrics"] * (function != "remember")]
-    outputs = (outputs,) if len(names) == 1 else outputs
-    if not isinstance(outputs, tuple | list) or len(outputs) != len(names):
-        count = len(outputs) if isinstance(outputs, tuple | list) else 1
+    returned = (outputs,) if len(names) == 1 else outputs
+    if not isinstance(returned, tuple | list) or len(returned) != len(names):
+        count = len(returned) if isinstance(returned, tuple | list) else 1
         raise ValueError(
             f"{what} returns {count} value{'s' * (count != 1)}: it must return "
             f"{len(names)}, {', '.join(names)}"
         )
-    returned = dict(zip(names, outputs))
-    if not isinstance(metrics := returned.pop("metrics", {}), Mapping):
+    values = dict(zip(names, returned))
+    if not isinstance(metrics := values.pop("metrics", {}), Mapping):
         raise ValueError(f"{what} returns metrics {metrics!r}: they must be a dict")
     # Leaves may be Python's numbers until their shapes are evaluated.
-    if change := user_code.first_change(*jax.eval_shape(lambda: (like, returned))):
+    with user_code.refused(f"{what} returns what is no array"):
+        shapes = jax.eval_shape(lambda: (like, values))
+    if change := user_code.first_change(*shapes):
         path, expected, given = change
         path = path.replace("['", "", 1).replace("']", "", 1)
         raise ValueError(

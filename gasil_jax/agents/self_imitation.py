@@ -18,7 +18,7 @@ R is a sum of rewards that were not clipped, but V learns from PPO's rewards. So
 normalized rewards are clipped (the metric `clipped_rewards`), R - V is too large.
 """
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import chex
 import jax
@@ -32,42 +32,19 @@ from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
 
-_PRIORITY_EXPONENT = 0.6
-_IMPORTANCE_EXPONENT = 0.1
-_MIN_PRIORITY = 1e-6
+_PRIORITY_EXPONENT, _IMPORTANCE_EXPONENT = 0.6, 0.1
+_MIN_PRIORITY, _MIN_SCALE, _MIN_SAMPLES = 1e-6, 1e-8, 64
 _MAX_ADVANTAGE = 1.0
-_MIN_SCALE = 1e-8
-_MIN_SAMPLES = 64
-
-
-class Steps(NamedTuple):
-    """Steps of a `Replay`, (samples, ...) each."""
-
-    observation: jax.Array
-    action: jax.Array
-    return_: jax.Array
 
 
 class Replay(struct.PyTreeNode):
-    """The last `capacity` steps of ended episodes, as a ring buffer.
+    """The last `capacity` steps of ended episodes, as a ring buffer; float32."""
 
-    Attributes:
-      observation: float32 (capacity, obs), not normalized.
-      action: float32 (capacity, action).
-      return_: float32 (capacity,), discounted return from the step on.
-      priority: float32 (capacity,), 0 where empty.
-      cursor: int32 (), index at which the next step is written.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    return_: jax.Array
-    priority: jax.Array
-    cursor: jax.Array
-
-    def at(self, index: jax.Array) -> Steps:
-        """Return the steps at these indices, int32 (samples,)."""
-        return Steps(self.observation[index], self.action[index], self.return_[index])
+    observation: jax.Array  # (capacity, obs), not normalized
+    action: jax.Array  # (capacity, action)
+    return_: jax.Array  # (capacity,), discounted return from the step on
+    priority: jax.Array  # (capacity,), 0 where empty
+    cursor: jax.Array  # int32 (), index at which the next step is written
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
@@ -84,20 +61,13 @@ def init_replay(capacity: int, observation_size: int, action_size: int) -> Repla
 def returns_to_go(
     history: History, num_steps: int, gamma: jax.Array | float
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the discounted returns of steps whose episode ended in the last batch.
+    """Return the discounted returns of a history's steps, and which of them count.
 
-    Args:
-      history: the history after `record` of the batch.
-      num_steps: number of steps of each environment in a batch.
-      gamma: discount.
-
-    Returns:
-      Two arrays (env, steps of history), oldest step first: the discounted return from
-      the step on, and a mask of the steps whose episode ended in the last batch and
-      whose return is finite.
+    Both are (env, steps), oldest step first. Those count that are finite and of
+    episodes that ended in the last `num_steps` steps, the batch.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
-    length = reward.shape[1]
+    num_envs, length = reward.shape
 
     def backward(carry: Any, step: Any) -> Any:
         return_, is_complete = carry
@@ -106,7 +76,6 @@ def returns_to_go(
         is_complete = jnp.where(ended, is_new, is_complete)
         return (return_, is_complete), (return_, is_complete)
 
-    num_envs = reward.shape[0]
     start = (jnp.zeros(num_envs), jnp.zeros(num_envs, bool))
     is_new = jnp.arange(length) >= length - num_steps
     _, (return_, is_complete) = jax.lax.scan(
@@ -138,9 +107,10 @@ def insert(replay: Replay, history: History, num_steps: int, *, gamma: Any) -> R
     def write(ring: jax.Array, new: Any) -> jax.Array:
         return ring.at[index].set(new, mode="drop")
 
-    observation = flat(history.in_time(history.observation))
     return Replay(
-        observation=write(replay.observation, observation),
+        observation=write(
+            replay.observation, flat(history.in_time(history.observation))
+        ),
         action=write(replay.action, flat(history.in_time(history.action))),
         return_=write(replay.return_, flat(return_)),
         priority=write(replay.priority, _MAX_ADVANTAGE),
@@ -158,9 +128,8 @@ def sample(
     mass = jnp.where(replay.priority > 0, replay.priority**_PRIORITY_EXPONENT, 0.0)
     cumulative = jnp.cumsum(mass)
     total = cumulative[-1]
-    index = jnp.searchsorted(
-        cumulative, jax.random.uniform(key, (num_samples,)) * total, side="right"
-    )
+    drawn = jax.random.uniform(key, (num_samples,)) * total
+    index = jnp.searchsorted(cumulative, drawn, side="right")
     # In float32 the total may come out higher than the sum up to the last filled index.
     last = jnp.max(jnp.where(mass > 0, jnp.arange(mass.shape[0]), 0))
     index = jnp.minimum(index, last)
@@ -182,13 +151,6 @@ def return_scale(replay: Replay) -> jax.Array:
     return jnp.maximum(jnp.sqrt(square), _MIN_SCALE)
 
 
-def clipped_advantage(
-    return_: jax.Array, value: jax.Array, scale: jax.Array | float
-) -> jax.Array:
-    """Return (R - V)+ in units of `scale`, clipped at 1: (samples,)."""
-    return jnp.clip((return_ - value) / scale, 0.0, _MAX_ADVANTAGE)
-
-
 def loss(
     log_prob: jax.Array,
     value: jax.Array,
@@ -198,7 +160,7 @@ def loss(
     scale: jax.Array | float,
     value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return a minibatch's loss, (), and its fraction of positive advantages, ().
+    """Return a minibatch's loss, (), and its clipped advantages, (samples,).
 
     Args:
       log_prob: float32 (samples,), log pi(a | s) of the replayed actions.
@@ -209,17 +171,15 @@ def loss(
       value_coefficient: weight of the value's loss.
     """
     chex.assert_equal_shape([log_prob, value, return_, weight])
-    advantage = clipped_advantage(return_, value, scale)
-    num_positive = jnp.sum(advantage > 0)
-    num_samples = jnp.maximum(num_positive, _MIN_SAMPLES)
+    advantage = jnp.clip((return_ - value) / scale, 0.0, _MAX_ADVANTAGE)
+    num_samples = jnp.maximum(jnp.sum(advantage > 0), _MIN_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
     policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
     # Its gradient with respect to the value is minus the clipped advantage, in the unit
     # of the returns. That is the gradient of half the square where the advantage is not
     # clipped; where it is, the gradient is a constant instead of 0.
     value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
-    fraction = num_positive / advantage.shape[0]
-    return policy_loss + value_coefficient * value_loss, fraction
+    return policy_loss + value_coefficient * value_loss, advantage
 
 
 class PPOSIL(Agent):
@@ -257,41 +217,35 @@ class PPOSIL(Agent):
         # that of the normalized reward.
         scale = return_scale(state) / context.reward_scale
 
-        def objective(params: Any, rows: Steps, weight: jax.Array) -> Any:
-            observation = normalization.normalize(context.normalizer, rows.observation)
+        def objective(params: Any, index: jax.Array, weight: jax.Array) -> Any:
+            observation = state.observation[index]
+            observation = normalization.normalize(context.normalizer, observation)
             parameters = context.policy(params["policy"], observation)
-            log_prob = context.distribution.log_prob(parameters, rows.action)
             (critic,) = params["values"]
-            value = context.value(critic, observation)
-            total, fraction = loss(
-                log_prob,
-                value,
-                rows.return_,
+            total, advantage = loss(
+                context.distribution.log_prob(parameters, state.action[index]),
+                context.value(critic, observation),
+                state.return_[index] / context.reward_scale,
                 weight=weight,
                 scale=scale,
                 value_coefficient=self.sil_value_coefficient,
             )
-            return self.sil_coefficient * total, (value, fraction)
+            return self.sil_coefficient * total, advantage
 
         def step(carry: Any, key: jax.Array) -> Any:
             actor_critic, priority = carry
-            index, weight = sample(
-                key, state.replace(priority=priority), self.sil_minibatch_size
-            )
-            rows = state.at(index)
-            rows = rows._replace(return_=rows.return_ / context.reward_scale)
-            gradient, (value, fraction) = jax.grad(objective, has_aux=True)(
-                actor_critic.params, rows, weight
+            replay = state.replace(priority=priority)
+            index, weight = sample(key, replay, self.sil_minibatch_size)
+            gradient, advantage = jax.grad(objective, has_aux=True)(
+                actor_critic.params, index, weight
             )
             actor_critic = ppo.descend(actor_critic, gradient, context.config)
-            advantage = clipped_advantage(rows.return_, value, scale)
             priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
-            return (actor_critic, priority), fraction
+            return (actor_critic, priority), jnp.mean(advantage > 0)
 
         before = (actor_critic, state.priority)
-        after, fraction = jax.lax.scan(
-            step, before, jax.random.split(key, self.sil_updates)
-        )
+        keys = jax.random.split(key, self.sil_updates)
+        after, fraction = jax.lax.scan(step, before, keys)
         filled = jnp.any(state.priority > 0)
         actor_critic, priority = learner.select(filled, after, before)
         metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}

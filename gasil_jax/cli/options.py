@@ -7,10 +7,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
-import jax
-
-from gasil_envs import user_code
-from gasil_jax import algorithms, checks, presets, train
+from gasil_jax import algorithms, presets
 from gasil_jax.agents import PPOGASIL
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli import parsing
@@ -24,6 +21,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
+    saved,
     sweep,
     trackers,
 )
@@ -48,6 +46,8 @@ COMMON = frozenset(
 class Options:
     """Train an agent on an environment, many seeds at once.
 
+    In a checkout, python -m experiments trains the figures of the documentation.
+
     Attributes:
       env: the environment: point_mass, hopper, walker2d, halfcheetah, swimmer, ant,
         humanoid or another of Gymnasium's MuJoCo tasks; one of another package as
@@ -56,7 +56,9 @@ class Options:
         --list-envs prints all names.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
-        settings: this help shows those of the one that is named beside it.
+        settings: this help shows those of the one that is named beside it. Several,
+        separated by commas, are trained side by side, each from its own preset: the
+        points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule of PPO for all continuous tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -69,20 +71,16 @@ class Options:
       resume: train what is missing in the folder `out`, with its settings. total_steps
         and seeds may grow; checkpoint_every, keep_checkpoints, devices and log may
         differ. If the folder holds nothing yet, training begins.
-      checkpoint_every: environment steps per seed between two checkpoints; by
-        default a checkpoint is written every ten minutes.
-      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
-        with the best evaluation or, without evaluate_every, with the best returns.
-      evaluate_every: environment steps per seed between two evaluations of the
-        policy's mean action in fresh environments, rounded up to whole iterations;
-        by default none. The untrained policy is evaluated too. The scores are undelayed
-        returns, in evaluations.csv.
-      evaluate_episodes: episodes per seed in each evaluation; default 10.
-      log: trackers to log to besides metrics.csv: tensorboard, wandb.
+      config: the config.json of another run: what it holds is used for all options that
+        are not given.
+      init_from: folder of a run, whose best seed's policy, values and normalizer of
+        observations training starts from, instead of new ones.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
         learns from the delayed sums, instead of from the delayed reward itself.
+      rewards: your own models of rewards, as MODULE:CLASS; each gets the rewards that
+        the one before it has made, and the package's come after them.
       normalize_rewards: whether to divide PPO's rewards by the standard deviation of
         their running discounted sum (as in OpenAI baselines' ppo2). Alpha is then in
         that unit, not in the environment's. It has no effect on the agents gasil and
@@ -96,12 +94,10 @@ class Options:
     first_seed: int = 0
     out: pathlib.Path | None = None
     resume: bool = False
-    checkpoint_every: int | None = None
-    keep_checkpoints: int = 2
-    evaluate_every: int | None = None
-    evaluate_episodes: int | None = None
-    log: tuple[str, ...] = ()
+    config: pathlib.Path | None = None
+    init_from: pathlib.Path | None = None
     devices: int | None = None
+    rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
     normalize_rewards: bool = False
 
@@ -137,7 +133,7 @@ def read(
     """Return the options of a command line, and what they train.
 
     With --resume, options that are not given are those of the sweep in the folder,
-    whose points come first; otherwise they are the preset's.
+    whose points come first; with --config those of a file; otherwise the preset's.
     """
     if "--list-envs" in parsing.words(arguments):
         print(*environments.names(), sep="\n")
@@ -148,56 +144,70 @@ def read(
             raise InputError("resume needs --out and the folder to continue")
         if folders.has_config(first.out):
             stored = sweep.read(first.out)
-        elif first.env is None:
+        elif first.env is None and first.config is None:
             raise InputError(
                 f"out is {first.out}, which holds no run to continue: to begin one "
                 "there, give --env"
             )
-    algorithm, default = _defaults(kind, first, stored)
+    is_begun, origin = stored is not None, f"out is {first.out}"
+    if first.config is not None and stored is None:
+        origin = f"config is {first.config}"
+        if not first.config.is_file():
+            raise InputError(f"{origin}: it must be the config.json of a run")
+        stored = sweep.read(first.config)
+    every, default = _defaults(kind, first, stored, origin)
+    algorithm = every[0]
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
-    settings = Settings() if stored is None else stored.settings
-    parser.add_fields(Settings, "environment", settings)
+    parser.add_fields(Recording, "recording", stored and stored.recording)
+    parser.add_fields(Settings, "environment", stored and stored.settings)
     agent = algorithm.agent
     own = {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
     for model in REWARD_MODELS:
         parser.add_fields(model, model.switch, own.get(model, model()))
+    for each in algorithm.own_models:
+        parser.add_fields(type(each), each.name, each, all_shown=True)
+    for other in every[1:]:
+        parser.add_fields(type(other.agent), other.agent.name, other.agent)
     values = parser.read(arguments, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
-    switches = {model.switch: getattr(options, model.switch) for model in REWARD_MODELS}
-    on = [switch for switch, is_on in switches.items() if is_on]
-    changes = [parser.fields(values, title) for title in ("training", "agent", *on)]
+    given = {name: getattr(values, name) for name in parser.given(arguments)}
+    switches = [model.switch for model in REWARD_MODELS]
+
+    def changed(algorithm: Algorithm) -> Algorithm:
+        """Return an algorithm with those of the given values that it has."""
+        on_or_off = {x: value for x, value in given.items() if x in switches}
+        algorithm = algorithm.replace(**on_or_off)
+        own = {x: value for x, value in given.items() if x in algorithm.settings}
+        return algorithm.replace(**own)
+
     with input_checked():
-        changed = algorithm.replace(**switches).replace(
-            **{name: value for part in changes for name, value in part.items()}
-        )
+        algorithms_ = tuple(map(changed, every))
     requested = Sweep(
         options.env,
-        changed,
+        algorithms_[0],
         _seeds(options, stored),
+        others=algorithms_[1:],
         settings=Settings(**parser.fields(values, "environment")),
-        recording=Recording(
-            options.checkpoint_every,
-            options.keep_checkpoints,
-            options.evaluate_every,
-            options.evaluate_episodes or Recording.evaluate_episodes,
-            options.log,
-        ),
+        recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
+        start=None if stored is None else stored.start,
     )
+    if options.init_from is not None:
+        requested = dataclasses.replace(
+            requested, start=saved.find_start(options.init_from)
+        )
     _check(options, requested)
+    if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
+        raise InputError(
+            f"evaluate_episodes is {values.evaluate_episodes}: it needs evaluate_every"
+        )
     requested = _with_points(options, requested, stored)
-    if stored is not None:
-        assert options.out is not None
+    if is_begun and options.out is not None:
         requested = requested.continued_from(options.out)
-    _note_without_effect(
-        options,
-        requested,
-        default=algorithm,
-        off={x: parser.fields(values, x) for x in switches if x not in on},
-    )
+    _note_without_effect(given, requested)
     return options, requested
 
 
@@ -211,70 +221,80 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
             return 1
 
     parser = Parser("gasil_jax", "", Options)
-    parser.add_argument("--out", type=pathlib.Path, nargs="?")
+    for name in ("out", "config"):
+        parser.add_argument(f"--{name}", type=pathlib.Path, nargs="?")
     for name in ("env", "agent", "preset"):
         parser.add_argument(f"--{name}", nargs="?")
+    parser.add_argument("--rewards", nargs="*")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
     return parser.parse_known_args(parsing.words(arguments))[0]
 
 
 def _defaults(
-    kind: type[Options], first: argparse.Namespace, stored: Sweep | None
-) -> tuple[Algorithm, Options]:
-    """Return the algorithm and the options that hold where none are given."""
+    kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
+) -> tuple[Sequence[Algorithm], Options]:
+    """Return the agents' algorithms and the options that hold where none are given."""
     if stored is not None:
+        own_models = [model.name for model in stored.algorithm.own_models]
         for name, given, own in (
-            ("agent", first.agent, stored.algorithm.agent.name),
+            ("agent", first.agent, stored.agent),
             ("preset", first.preset, stored.preset),
+            ("rewards", first.rewards, own_models),
         ):
             if given not in (None, own):
                 raise InputError(
-                    f"out is {first.out}, where {name} was {own}, is {given}: leave it "
-                    "out or name another folder"
+                    f"{origin}, where {name} was {own}, is {given}: leave it "
+                    "out or name another one"
                 )
-        recording = stored.recording
-        return stored.algorithm, kind(
+        return stored.algorithms, kind(
             env=stored.env,
-            agent=stored.algorithm.agent.name,
+            agent=stored.agent,
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
-            checkpoint_every=recording.checkpoint_every,
-            keep_checkpoints=recording.keep_checkpoints,
-            evaluate_every=recording.evaluate_every,
-            evaluate_episodes=(
-                None
-                if recording.evaluate_every is None
-                else recording.evaluate_episodes
-            ),
-            log=recording.log,
+            rewards=tuple(own_models),
             **_switches(stored.algorithm),
         )
-    name = first.agent or Options.agent
-    preset = first.preset or presets.DEFAULT
+    agents = (first.agent or Options.agent).split(",")
+    for name in agents:
+        if agents.count(name) > 1:
+            raise InputError(f"agent has {name!r} twice: name it once")
     with input_checked():
-        agent = descriptions.find_agent(name)
-        algorithm = Algorithm(agent())
-        if first.env is not None:
-            algorithm = presets.preset(
-                first.env,
-                agent,
-                preset,
-                reward_delay=first.reward_delay,
-                action_size=_action_size(first.env, preset),
-            )
+        every = [_default(name, first) for name in agents]
+    missing: Any = dataclasses.MISSING
+    return every, kind(
+        env=missing,
+        agent=",".join(agents),
+        preset=first.preset or presets.DEFAULT,
+        **_switches(every[0]),
+    )
+
+
+def _default(name: str, first: argparse.Namespace) -> Algorithm:
+    """Return the algorithm from which an agent starts."""
+    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
+    algorithm = Algorithm(agent())
+    if first.env is not None:
+        algorithm = presets.preset(
+            first.env,
+            agent,
+            preset,
+            reward_delay=first.reward_delay,
+            action_size=_action_size(first.env, preset),
+        )
+    models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
+    algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
+    algorithms.check(algorithm)
     taken = {*names(SweepOptions), *names(Settings)}
-    for setting in names(agent):
-        if setting in taken:
+    parts: tuple[Any, ...] = (algorithm.agent, *models)
+    for part in parts:
+        for setting in taken.intersection(names(part)):
             raise InputError(
-                f"agent {name!r} has a setting {setting!r}, a name that is taken by an "
+                f"{part.name!r} has a setting {setting!r}, a name that is taken by an "
                 "option: it must be a new one"
             )
-    missing: Any = dataclasses.MISSING
-    return algorithm, kind(
-        env=missing, agent=name, preset=preset, **_switches(algorithm)
-    )
+    return algorithm
 
 
 def _switches(algorithm: Algorithm) -> dict[str, Any]:
@@ -323,29 +343,35 @@ def _seeds(options: Options, stored: Sweep | None) -> Sequence[int]:
 
 def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sweep:
     """Return the sweep with the points that the options name."""
-    if not isinstance(options, SweepOptions):
-        return (
-            requested
-            if stored is None
-            else dataclasses.replace(requested, points=stored.points)
-        )
-    new = bool(options.grid) or options.random is not None
-    if not new and options.points_file is None:
-        if stored is None:
-            raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or "
-                "--points-file"
+    named: Sequence[points.Point] | None = None
+    if isinstance(options, SweepOptions):
+        new = bool(options.grid) or options.random is not None
+        if new or options.points_file is not None:
+            named = points.make_points(
+                options.grid,
+                options.random,
+                options.points_file,
+                seed=options.first_seed,
+                algorithms=requested.algorithms,
             )
+        elif stored is None and not requested.others:
+            raise InputError(
+                "grid is empty: it must be NAME=VALUE,..., or use --random, "
+                "--points-file or several agents"
+            )
+    if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
-    named = points.make_points(
-        options.grid,
-        options.random,
-        options.points_file,
-        seed=options.first_seed,
-        algorithm=requested.algorithm,
-    )
-    points.check(named, requested.algorithm)
-    every = points.completed(named, requested.algorithm)
+    named = named or [{}]
+    if requested.others:
+        agents = [each.agent.name for each in requested.algorithms]
+        named = [
+            {"agent": agent, **point}
+            for agent in agents
+            for point in named
+            if point.get("agent", agent) == agent
+        ]
+    points.check(named, *requested.algorithms)
+    every = points.completed(named, *requested.algorithms)
     return dataclasses.replace(requested, points=every)
 
 
@@ -354,49 +380,31 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        algorithms.check(requested.algorithm)
-        trackers.check(options.log)
-    check_minimum(
-        options,
-        devices=1,
-        checkpoint_every=1,
-        keep_checkpoints=1,
-        evaluate_every=1,
-        evaluate_episodes=1,
-    )
+        for each in requested.algorithms:
+            algorithms.check(each)
+        trackers.check(requested.recording.log)
+    check_minimum(options, devices=1)
+    counts = ("checkpoint_every", "keep_checkpoints", "evaluate_every")
+    check_minimum(requested.recording, **dict.fromkeys(counts, 1), evaluate_episodes=1)
     check_minimum(requested.settings, max_episode_steps=1)
-    if options.evaluate_episodes is not None and options.evaluate_every is None:
-        raise InputError(
-            f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
-        )
     if options.out is not None:
         if not options.resume and getattr(options, "shard", None) is None:
             folders.refuse_used(options.out)
         folders.check_writable(options.out)
 
 
-def _note_without_effect(
-    options: Options,
-    requested: Sweep,
-    *,
-    default: Algorithm,
-    off: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Print a note for each option that was changed but has no effect."""
-    algorithm, settings = requested.algorithm, requested.settings
-    for name in environments.without_effect(options.env, settings):
-        value = getattr(settings, name)
-        note(f"{name} is {value}, which has no effect: {options.env} has none")
+def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
+    """Print a note for each option that is given but has no effect."""
+    algorithm, env = requested.algorithm, requested.env
+    unused = environments.without_effect(env, requested.settings)
+    reasons = dict.fromkeys(unused, f"{env} has none")
     for model in REWARD_MODELS:
-        for name, value in off.get(model.switch, {}).items():
-            if value != getattr(model(), name):
-                note(f"{name} is {value}, which has no effect: {model.switch} is off")
-    unchanged = {x: y for model in REWARD_MODELS for x, y in vars(model()).items()}
-    unchanged |= default.settings
-    for name, reason in points.without_effect(algorithm).items():
-        value = algorithm.settings.get(name)
-        if value not in (None, unchanged[name]):
-            note(f"{name} is {value}, which has no effect: {reason}")
+        if not algorithm.settings[model.switch]:
+            reasons |= dict.fromkeys(names(model), f"{model.switch} is off")
+    reasons |= points.without_effect(algorithm)
+    for name, value in given.items():
+        if name in reasons and value is not False:
+            note(f"{name} is {value}, which has no effect: {reasons[name]}")
 
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
@@ -404,17 +412,20 @@ def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
 
     Other presets refuse an agent or a task that they have nothing for.
     """
-    lacking = presets.describe_lack(
-        options.env,
-        requested.algorithm.agent.name,
-        presets.DEFAULT,
-        reward_delay=requested.settings.reward_delay,
-    )
-    if options.preset == presets.DEFAULT and lacking is not None and not options.resume:
-        more = ""
-        if environments.is_discrete(env):
-            more = " (--preset gymnax has one setting for discrete actions)"
-        note(f"{lacking}: options that are not given have their defaults{more}")
+    for each in requested.algorithms:
+        lacking = presets.describe_lack(
+            options.env,
+            each.agent.name,
+            presets.DEFAULT,
+            reward_delay=requested.settings.reward_delay,
+        )
+        default = options.preset == presets.DEFAULT
+        default &= not options.resume and options.config is None
+        if default and lacking is not None:
+            more = ""
+            if environments.is_discrete(env):
+                more = " (--preset gymnax has one setting for discrete actions)"
+            note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:
@@ -424,20 +435,3 @@ def make_folder(options: Options) -> pathlib.Path:
     stamp = time.strftime("%Y%m%d-%H%M%S")
     name = f"{options.env}-{options.agent}-{stamp}".replace(":", "-")
     return folders.create_new(name)
-
-
-def check_agent(env: Any, algorithm: Algorithm) -> None:
-    """Check that the agent can run in the environment; trace an agent of the user's."""
-
-    def begin() -> Any:
-        state = train.init(env, algorithm, jax.random.key(0))
-        return train.train_step(env, algorithm, state)
-
-    with input_checked():
-        checks.check(env, algorithm)
-        if ":" in algorithm.agent.name:
-            package = pathlib.Path(train.__file__).parent
-            what = f"agent {algorithm.agent.name!r} can't be traced"
-            with user_code.refused(what, package):
-                with announced(algorithm.agent.name, "tracing the agent"):
-                    jax.eval_shape(begin)

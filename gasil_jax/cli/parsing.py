@@ -49,7 +49,7 @@ class Parser(argparse.ArgumentParser):
         super().__init__(
             prog=f"python -m {program}",
             usage=f"python -m {program} {usage}",
-            description=(inspect.getdoc(kind) or "").partition("\n\n")[0],
+            description=(inspect.getdoc(kind) or "").partition("\n\nAttributes:")[0],
             epilog=None if shown is None else "--help-all shows all options.",
             add_help=False,
             allow_abbrev=False,
@@ -79,6 +79,8 @@ class Parser(argparse.ArgumentParser):
             value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
+            if field.name in self._names:  # Two agents may share a setting.
+                continue
             own.append(field.name)
             if field.metadata.get("positional"):
                 of_type = _of_type(hints[field.name]) | {"metavar": field.name.upper()}
@@ -127,6 +129,12 @@ class Parser(argparse.ArgumentParser):
             )
             raise InputError(f"option {flag} is unknown: {meant}")
         return values
+
+    def given(self, arguments: Sequence[str] | None) -> list[str]:
+        """Return the names of the options that a command line has."""
+        flags = (word.partition("=")[0] for word in words(arguments))
+        bare = {x.removeprefix("--").replace("-", "_") for x in flags if x[:2] == "--"}
+        return [x for x in self._names if x in bare or f"no_{x}" in bare]
 
     def fields(self, values: argparse.Namespace, title: str) -> dict[str, Any]:
         """Return the values of a group's fields by name."""

@@ -14,6 +14,7 @@ training continues from an older one.
 
 import contextlib
 import hashlib
+import json
 import logging
 import math
 import os
@@ -214,6 +215,11 @@ class Checkpoint(NamedTuple):
         """Return the saved state; see the function `restore`."""
         return restore(self.folder / _STATE, like)
 
+    def digest(self) -> str:
+        """Return a hash of its files."""
+        files = json.dumps(_manifest(self.folder)["files"], sort_keys=True)
+        return hashlib.sha256(files.encode()).hexdigest()
+
 
 class WriteError(output_file.WriteError):
     """A checkpoint could not be written; older ones are unharmed."""
@@ -310,8 +316,9 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
     for folder in reversed(_folders(root)):
         try:
             return read(folder), errors
-        except ValueError as error:
-            errors.append(str(error))
+        except (ValueError, FileNotFoundError) as error:
+            if folder.exists():  # Training may delete it meanwhile.
+                errors.append(str(error))
     return None, errors
 
 

@@ -1,6 +1,7 @@
 """Algorithms as plain values, by name: for config.json, trackers and stored runs.
 
-Here names become objects: an agent is one of the package's, or MODULE:CLASS.
+Here names become objects: an agent is one of the package's, or MODULE:CLASS; of models
+of rewards your own are MODULE:CLASS.
 """
 
 from collections.abc import Mapping
@@ -12,42 +13,60 @@ from gasil_jax.algorithms import Algorithm, check
 from gasil_jax.config import names
 from gasil_jax.errors import InputError, NotImportable, refusal, unknown
 from gasil_jax.host import json_files
-from gasil_jax.rewards import REWARD_MODELS
+from gasil_jax.rewards import REWARD_MODELS, RewardModel
 
 
 def find_agent(name: Any) -> type[Agent]:
     """Return the class of an agent's name."""
-    if not isinstance(name, str):
-        raise refusal("agent", name, "a string")
-    if ":" not in name:
+    if isinstance(name, str) and ":" not in name:
         if name not in AGENTS:
             raise ValueError(
                 unknown("agent", name, tuple(AGENTS), forms=["MODULE:CLASS"])
             )
         return AGENTS[name]
-    try:
-        agent = user_code.find("agent", name)
-    except ValueError as error:
-        raise NotImportable(str(error)) from None
-    if not (isinstance(agent, type) and issubclass(agent, Agent)):
-        raise ValueError(
-            f"agent {name!r} is of type {type(agent).__name__}: it must be a class "
-            "that is derived from gasil_jax.Agent"
-        )
-    # In config.json it has its own name.
-    if agent.name != name:
-        raise ValueError(
-            f"agent {name!r} calls itself {agent.name!r}: name the module that "
-            "defines the class, or remove the class's attribute `name`"
-        )
+    agent: type[Agent] = _find("agent", name, Agent)
     with user_code.refused(f"agent {name!r} can't be made", passing=ValueError):
         check(Algorithm(agent()))
     return agent
 
 
+def find_model(name: Any) -> type[RewardModel]:
+    """Return the class of the name of one's own model of rewards."""
+    model: type[RewardModel] = _find("rewards", name, RewardModel)
+    if model in REWARD_MODELS:
+        raise ValueError(f"rewards is {name!r}: use {model.switch} instead")
+    with user_code.refused(f"rewards {name!r} can't be made", passing=ValueError):
+        check(Algorithm(Agent(), (model(),)))
+    return model
+
+
+def _find(kind: str, name: Any, base: Any) -> Any:
+    """Return the class that MODULE:CLASS names, which is derived from another one."""
+    if not isinstance(name, str) or ":" not in name:
+        raise refusal(kind, name, "MODULE:CLASS")
+    try:
+        found = user_code.find(kind, name)
+    except ValueError as error:
+        raise NotImportable(str(error)) from None
+    is_derived = isinstance(found, type) and issubclass(found, base)
+    if not is_derived:
+        raise ValueError(
+            f"{kind} {name!r} is of type {type(found).__name__}: it must be a class "
+            f"that is derived from gasil_jax.{base.__name__}"
+        )
+    # In config.json it has its own name.
+    if found.name != name:
+        raise ValueError(
+            f"{kind} {name!r} calls itself {found.name!r}: name the module that "
+            "defines the class, or remove the class's attribute `name`"
+        )
+    return found
+
+
 def describe(algorithm: Algorithm) -> dict[str, Any]:
-    """Return the agent's name and every setting by name."""
-    return {"agent": algorithm.agent.name, **algorithm.settings}
+    """Return the names of the agent and of one's own models, and every setting."""
+    own = tuple(model.name for model in algorithm.own_models)
+    return {"agent": algorithm.agent.name, "rewards": own, **algorithm.settings}
 
 
 def read(values: Mapping[str, Any]) -> Algorithm:
@@ -59,7 +78,8 @@ def read(values: Mapping[str, Any]) -> Algorithm:
         raise InputError("agent is missing")
     settings = dict(values)
     agent = find_agent(settings.pop("agent"))
-    algorithm = Algorithm(agent())
+    own = json_files.as_type(tuple[str, ...], settings.pop("rewards", ()), "rewards")
+    algorithm = Algorithm(agent(), tuple(find_model(name)() for name in own))
     switches = {
         model.switch: json_files.as_type(
             bool, settings.pop(model.switch, False), model.switch

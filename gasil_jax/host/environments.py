@@ -3,15 +3,16 @@
 import contextlib
 from typing import Any
 
+import gasil_envs
 from gasil_envs import registry, worlds
-from gasil_envs.locomotion import Locomotion
-from gasil_envs.physics.native import available_cores
-from gasil_envs.pictures import can_draw as can_be_drawn
+from gasil_envs.physics.host_threads import available_cores
 from gasil_envs.registry import Settings, check, made_with, prepare, without_effect
 from gasil_envs.registry import make as make_env
+from gasil_envs.worlds import FAMILIES
 from gasil_envs.wrappers import is_discrete
 
 __all__ = [
+    "FAMILIES",
     "Settings",
     "available_cores",
     "can_be_drawn",
@@ -30,10 +31,15 @@ __all__ = [
 def names() -> list[str]:
     """Return the names of all environments, also of other packages, if installed."""
     every = list(registry.names())
-    for family in worlds.FAMILIES:
+    for family in FAMILIES:
         with contextlib.suppress(ValueError):
             every += worlds.names(family)
     return every
+
+
+def can_be_drawn(env: Any) -> bool:
+    """Return whether `render` can draw an environment."""
+    return gasil_envs.pictures.can_draw(env)
 
 
 def ends_early(env: Any) -> bool:
@@ -43,4 +49,4 @@ def ends_early(env: Any) -> bool:
 
 def is_locomotion(env: Any) -> bool:
     """Return whether an environment, wrapped or not, is one of the MuJoCo tasks."""
-    return isinstance(env.unwrapped, Locomotion)
+    return isinstance(env.unwrapped, gasil_envs.Locomotion)

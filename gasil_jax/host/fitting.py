@@ -81,11 +81,11 @@ def fit(
         point first.
       folder: folder for the files of a run or a sweep, created if it is missing; None
         keeps nothing. All commands can read it, if a command line can name what was
-        trained: an environment from `gasil_jax.make_env`, an agent that can be
-        imported, the package's models of rewards, and schedules of points. Otherwise
-        config.json says why not in "only_python", and `gasil_jax.load_policy`,
-        `gasil_jax.load_reward` with its arguments `env` and `algorithm`, and
-        ``python -m gasil_jax.plot`` can read it.
+        trained: an environment from `gasil_jax.make_env`, an agent and models of
+        rewards that can be imported, your own before the package's, and schedules of
+        points. Otherwise config.json says why not in "only_python", and
+        `gasil_jax.load_policy` and `gasil_jax.load_reward`, with their arguments `env`
+        and `algorithm`, and ``python -m gasil_jax.plot`` can read it.
       resume: train what is missing in the folder. The algorithm and evaluations must be
         the same, but `total_steps` may be larger, and there may be more seeds and
         points. An environment from `gasil_jax.make_env` is compared by its name and
@@ -226,7 +226,7 @@ def _describe(
     try:
         stored = json_files.to_json(descriptions.describe(algorithm))
         if descriptions.read(json.loads(stored)) != algorithm:
-            why = why or "an agent or a model of rewards without a name"
+            why = why or "an agent or models of rewards that a command can't name"
     except TypeError:
         why = why or "a schedule that is a function"
     except ValueError as error:

@@ -32,12 +32,15 @@ def member(states: Any, index: int) -> Any:
 
     Raises:
       IndexError: if there is no such entry. JAX alone would return the last one.
-      ValueError: if the index is no whole number.
+      ValueError: if the index is no whole number, or the states have no axis.
     """
     traced = isinstance(index, jax.Array) and jnp.issubdtype(index.dtype, np.integer)
     if index not in Range(-math.inf, whole=True) and not traced:
         raise refusal("index", index, "a whole number")
-    count = jax.tree.leaves(states)[0].shape[0]
+    shapes = [np.shape(leaf) for leaf in jax.tree.leaves(states)]
+    if not shapes or not all(shapes):
+        raise refusal("states", states, "arrays with an axis of members")
+    count = shapes[0][0]
     if not traced and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
@@ -61,13 +64,6 @@ def advance_members(
     env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
-
-    Args:
-      env: one environment.
-      algorithm: the algorithm of all members.
-      states: the members' training states, (members, ...) each leaf.
-      num_iterations: the number of iterations, int32 ().
-      data: the agent's data, which the members share.
 
     Returns:
       The new states, and metrics (members, chunk). The first `num_iterations` columns
@@ -208,8 +204,7 @@ class Members:
     def compile(self, states: Any = None) -> tuple[Any, Callable[..., Any]]:
         """Return the states to start from, and the compiled `advance`.
 
-        Args:
-          states: states to continue from, (members, ...); default the first states.
+        They are the first states or those to continue from, (members, ...).
         """
         shapes = jax.tree.map(
             lambda x: x.update(sharding=self._sharding_of(x)),
@@ -236,17 +231,10 @@ class Members:
     def train(
         self, advance: Callable[..., Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
-        """Train for some iterations, at most `chunk`.
+        """Train for `count` iterations, at most `chunk`, after the `first` ones.
 
-        Args:
-          advance: the compiled function from `compile`.
-          states: the states before; their memory is reused.
-          first: number of iterations before this call.
-          count: number of iterations in this call.
-
-        Returns:
-          The states after it, and the metrics, (members, iterations) each. "env_steps"
-          holds whole numbers.
+        The memory of the states is reused. Metrics are (members, iterations) each, and
+        "env_steps" holds whole numbers.
         """
         states, metrics = advance(states, np.int32(count), self.data)
         metrics = {
@@ -314,11 +302,9 @@ def make_members(
     Args:
       env: one environment.
       algorithm: the algorithm that the members share.
-      seeds: absolute seed number of each member. Its key is ``jax.random.key(seed)``.
-      hyperparameters: for each member, values that replace numbers of the algorithm, by
-        name; default none.
-      devices: the devices to shard over, default all. At most one for each member is
-        used.
+      seeds: absolute seed number of each member.
+      hyperparameters: for each member, values that replace numbers of the algorithm.
+      devices: the devices to shard over, default all, at most one for each member.
     """
     every = hyperparameters or [{}] * len(seeds)
     numbers = [{**algorithm.hyperparameters, **one} for one in every]

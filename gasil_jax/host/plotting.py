@@ -55,6 +55,28 @@ def binned_returns(
     return steps, np.stack(means, axis=1)
 
 
+def smoothed(returns: np.ndarray, window: int) -> np.ndarray:
+    """Return the means over each point and those before it, `window` in all."""
+    sums = np.cumsum(returns, axis=-1)
+    sums[..., window:] -= sums[..., :-window].copy()
+    return sums / np.minimum(np.arange(1, returns.shape[-1] + 1), window)
+
+
+def unit_of_steps(most: float) -> tuple[float, str]:
+    """Return the unit in which steps up to `most` are drawn, and its name."""
+    if most >= 500_000:
+        return 1e6, "million steps of a seed"
+    return (1e3, "thousand steps of a seed") if most >= 5_000 else (1.0, "steps")
+
+
+def plain_ticks(axes: Any) -> None:
+    """Let ticks of linear axes be whole numbers without an offset, and not too many."""
+    for name, axis in (("x", axes.xaxis), ("y", axes.yaxis)):
+        if axis.get_scale() == "linear":
+            axes.ticklabel_format(axis=name, useOffset=False, style="plain")
+            axes.locator_params(axis=name, nbins=6)
+
+
 def draw_returns(
     axes: Any,
     env_steps: np.ndarray,
@@ -65,11 +87,12 @@ def draw_returns(
     label: str = "training",
     evaluated: str = "evaluations",
     style: str = "-",
+    unit: float = 1e6,
 ) -> None:
     """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
 
     Args:
-      axes: where to draw; steps are in millions.
+      axes: where to draw.
       env_steps: (points,).
       returns: (seeds, points).
       evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
@@ -78,37 +101,18 @@ def draw_returns(
       label: label in the legend.
       evaluated: label of the evaluations.
       style: style of the line.
+      unit: number of steps that is 1 on the axis.
     """
     if len(env_steps):
-        steps, middle = env_steps / 1e6, interquartile_mean(returns, axis=0)
+        steps, middle = env_steps / unit, interquartile_mean(returns, axis=0)
         if len(returns) >= FEWEST_SEEDS:
             low, high = bootstrap_interval(returns)
             axes.fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
         axes.plot(steps, middle, style, color=color, label=label)
     if evaluations is not None:
-        steps = evaluations["env_steps"][0] / 1e6
+        steps = evaluations["env_steps"][0] / unit
         middle = interquartile_mean(evaluations["mean"], axis=0)
         axes.plot(steps, middle, "--", color=color, linewidth=1, label=evaluated)
-    axes.set(xlabel="million steps of a seed", ylabel="episode return")
-
-
-def label_ends(
-    axes: Any, ends: Mapping[str, float], color_of: Mapping[str, Any]
-) -> None:
-    """Write names beside the ends of lines, apart from each other."""
-    low, high = axes.get_ylim()
-    gap = 0.06  # Of the height of the axes, for this font size.
-    heights = [(y - low) / (high - low) for y in ends.values()]
-    for i in range(1, len(heights)):
-        heights[i] = min(heights[i], heights[i - 1] - gap)
-    # What was moved below the axes is moved up again, and pushes the others.
-    floor = 0.0
-    for i in reversed(range(len(heights))):
-        heights[i] = max(heights[i], floor)
-        floor = heights[i] + gap
-    for name, height in zip(ends, heights, strict=True):
-        style = {"xycoords": "axes fraction", "va": "center", "fontsize": 7}
-        axes.annotate(name, (1.02, height), color=color_of[name], **style)
 
 
 def write_caption(figure: Any, num_seeds: Sequence[int], more: str = "") -> None:
@@ -133,21 +137,20 @@ def learning_curve(
 ) -> None:
     """Save the returns over environment steps as a PNG: all seeds, mean and interval.
 
-    Args:
-      path: the image file.
-      env_steps: (iterations,).
-      episode_return: (seeds, iterations); NaN where no episode ended.
-      title: title of the plot.
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each; None if there are none.
+    Steps are (iterations,), and returns (seeds, iterations), NaN where no episode
+    ended; evaluations are as in `draw_returns`.
     """
     from matplotlib.figure import Figure
 
     steps, returns = binned_returns(env_steps, episode_return)
     figure = Figure(figsize=(6.4, 4.2), layout="constrained")
     axes = figure.subplots()
-    axes.plot(steps / 1e6, returns.T, color="0.75", linewidth=0.8)
-    draw_returns(axes, steps, returns, evaluations=evaluations, color=COLORS[0])
+    unit, words = unit_of_steps(env_steps[-1] if len(env_steps) else 0)
+    axes.plot(steps / unit, returns.T, color="0.75", linewidth=0.8)
+    shown: dict[str, Any] = {"evaluations": evaluations, "color": COLORS[0]}
+    draw_returns(axes, steps, returns, unit=unit, **shown)
+    axes.set(xlabel=words, ylabel="episode return")
+    plain_ticks(axes)
     if evaluations is not None:
         axes.legend(frameon=False)
     elif not len(steps):
@@ -158,43 +161,64 @@ def learning_curve(
     figure.savefig(path, dpi=150)
 
 
+#: The number of best points whose learning curves stand beside their final returns.
+_MOST_CURVES = 5
+
+
 def final_returns(
     path: pathlib.Path,
     labels: Sequence[str],
     returns: np.ndarray,
     *,
-    best: int | None,
+    title: str,
+    env_steps: np.ndarray,
+    curves: np.ndarray,
 ) -> None:
-    """Save every seed's final return and their mean, in a row for each point.
+    """Save every seed's final return in a row for each point, the best mean first.
+
+    Beside them are the learning curves of the best points.
 
     Args:
       path: the image file.
       labels: the name of each point.
       returns: (points, seeds).
-      best: index of the best point by mean, which is marked; None if there is none.
+      title: title of the picture.
+      env_steps: of each point's curves, (points, iterations).
+      curves: returns during training, (points, seeds, iterations).
     """
     from matplotlib.figure import Figure
 
-    # A label is no wider than half of the figure. Its numbers have hyphens: 3e-05.
+    order = np.argsort(-np.nan_to_num(returns.mean(axis=1), nan=-np.inf), kind="stable")
+    # A label is no wider than half of the rows. Its numbers have hyphens: 3e-05.
     wrapped = [
-        textwrap.fill(f"{number}: {label}", 48, break_on_hyphens=False)
-        for number, label in enumerate(labels)
+        textwrap.fill(f"{number}: {labels[number]}", 48, break_on_hyphens=False)
+        for number in order
     ]
     lines = 1 + max(label.count("\n") for label in wrapped)
     # Matplotlib refuses pictures of more than 2**16 pixels.
-    size = (8.0, min(1.4 + (0.22 + 0.13 * lines) * len(labels), 400.0))
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots()
-    for row, seeds in enumerate(returns):
-        axes.plot(seeds, [row] * len(seeds), "o", color="0.7", markersize=4)
-        color = COLORS[1] if row == best else COLORS[0]
-        axes.plot(seeds.mean(), row, "|", color=color, markersize=14, mew=2)
-    axes.set_yticks(range(len(labels)), wrapped, fontsize=8)
-    if best is not None:
-        axes.get_yticklabels()[best].set(color=COLORS[1], weight="bold")
+    height = min(max(1.6 + (0.22 + 0.13 * lines) * len(labels), 3.6), 400.0)
+    figure = Figure(figsize=(13.0, height), layout="constrained")
+    axes, beside = figure.subplots(1, 2, width_ratios=(8, 5))
+    unit, words = unit_of_steps(np.nanmax(env_steps))
+    for row, point in enumerate(order):
+        color = COLORS[row] if row < _MOST_CURVES else "0.4"
+        axes.plot(returns[point], [row] * returns.shape[1], "o", color="0.7", ms=4)
+        mean = {"color": color, "markersize": 14, "mew": 2}
+        axes.plot(returns[point].mean(), row, "|", **mean)
+        if row < _MOST_CURVES:
+            whole = np.isfinite(env_steps[point])
+            own = binned_returns(env_steps[point, whole], curves[point][:, whole])
+            look: dict[str, Any] = {"evaluations": None, "color": color}
+            draw_returns(beside, *own, label=f"{point}", unit=unit, **look)
+    axes.set_yticks(range(len(order)), wrapped, fontsize=8)
+    axes.get_yticklabels()[0].set(color=COLORS[0], weight="bold")
     axes.set(xlabel="final return of each seed; the bar is their mean")
-    axes.set_title("the best mean is orange" if best is not None else "", fontsize=9)
     axes.invert_yaxis()
+    beside.set(xlabel=words, ylabel="episode return", title="the best points")
+    beside.legend(frameon=False, title="point")
+    axes.ticklabel_format(axis="x", useOffset=False, style="plain")
+    plain_ticks(beside)
+    figure.suptitle(title)
     figure.savefig(path, dpi=150)
 
 
@@ -203,6 +227,7 @@ def marginals(
     values: Mapping[str, Sequence[Any]],
     returns: np.ndarray,
     *,
+    title: str,
     best: int | None,
     left_out: int,
 ) -> None:
@@ -212,6 +237,7 @@ def marginals(
       path: the image file.
       values: each point's value of every hyperparameter that varies, by name.
       returns: each point's mean final return, (points,), all finite.
+      title: title of the picture.
       best: index of the point that is marked as the best; None for none.
       left_out: number of points without a return, which are not among these.
     """
@@ -229,9 +255,11 @@ def marginals(
         axes.remove()
     for axes in grid[:, 0]:
         axes.set_ylabel("final return")
+        axes.ticklabel_format(axis="y", useOffset=False, style="plain")
     handles, labels = grid[0, 0].get_legend_handles_labels()
     above: dict[str, Any] = {"loc": "outside upper center", "ncols": len(labels)}
-    figure.legend(handles, labels, frameon=False, **above)
+    named: dict[str, Any] = {"title": title, "title_fontsize": "large"}
+    figure.legend(handles, labels, frameon=False, **named, **above)
     text = "point: mean over its seeds; mean: over the points of each value"
     if any(len(groups(x)) < len(set(x)) for x in values.values()):
         text += ", or of neighbouring values with fewer than two points each"
@@ -241,6 +269,23 @@ def marginals(
     text = textwrap.fill(text, 10 + 50 * columns)
     figure.supxlabel(text, fontsize="small", color="0.3")
     figure.savefig(path, dpi=150)
+
+
+#: With more values than these, ticks are where Matplotlib puts them.
+_MOST_TICKS = 10
+
+
+def _mark_tried(axes: Any, values: np.ndarray) -> None:
+    """Put a tick at each value, with its number where there is room for it."""
+    places = axes.xaxis.get_transform().transform(values)
+    names, free = [], -np.inf
+    for value, place in zip(values, places, strict=True):
+        name = f"{value:g}"
+        half = 0.015 * len(name) * np.ptp(places)
+        names.append(name if place - half >= free else "")
+        free = place + half if names[-1] else free
+    axes.set_xticks(values, names)
+    axes.set_xticks([], minor=True)
 
 
 def _draw_marginal(
@@ -257,10 +302,8 @@ def _draw_marginal(
             linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
             axes.set_xscale("symlog" if linear else "log", **linear)
         distinct = np.unique(places)
-        shown = axes.xaxis.get_transform().transform(distinct)
-        if np.diff(shown).min(initial=np.inf) > 0.15 * np.ptp(shown):
-            axes.set_xticks(distinct, [f"{value:g}" for value in distinct])
-            axes.set_xticks([], minor=True)
+        if len(distinct) <= _MOST_TICKS:
+            _mark_tried(axes, distinct)
     else:
         names = list(dict.fromkeys(values))
         places, style = np.array([names.index(x) for x in values]), "D"

@@ -1,4 +1,7 @@
-"""Read or draw the points of a sweep. A point holds changed settings, by name."""
+"""Read or draw the points of a sweep.
+
+A point holds changed settings, by name; of a sweep over agents its "agent", too.
+"""
 
 import itertools
 import json
@@ -9,11 +12,11 @@ from typing import Any
 
 import numpy as np
 
-from gasil_jax import algorithms
 from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.algorithms import check as check_algorithm
 from gasil_jax.config import names, ranges
-from gasil_jax.errors import InputError, did_you_mean, refusal
+from gasil_jax.errors import InputError, did_you_mean, refusal, unknown
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -49,33 +52,59 @@ def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
     }
 
 
-def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
+def in_words(point: Point) -> str:
+    """Return the values of a point as text."""
+    return ", ".join(
+        str(value) if name == "agent" else f"{name}={value:g}"
+        for name, value in point.items()
+    )
+
+
+def algorithm_of(
+    point: Point, algorithms: Sequence[Algorithm]
+) -> tuple[Algorithm, dict[str, Any]]:
+    """Return the algorithm of a point's agent, and the values that the point changes.
+
+    A point without an agent has the first algorithm.
+    """
+    values = dict(point)
+    agent = values.pop("agent", algorithms[0].agent.name)
+    for algorithm in algorithms:
+        if algorithm.agent.name == agent:
+            return algorithm, values
+    raise InputError(unknown("agent", agent, [x.agent.name for x in algorithms]))
+
+
+def completed(every: Iterable[Point], *algorithms: Algorithm) -> tuple[Point, ...]:
     """Return points that all have the same names, without repetitions.
 
-    A point that lacks a name has the algorithm's own value.
+    A point that lacks a name has its algorithm's own value.
     """
     listed = list(every)
     varied = list(dict.fromkeys(name for point in listed for name in point))
-    own = algorithm.settings
-    kinds = _kinds(algorithm)
-    whole = [
-        {x: kinds.get(x, float)(point.get(x, own[x])) for x in varied}
-        for point in listed
-    ]
+    whole = []
+    for point in listed:
+        algorithm, _ = algorithm_of(point, algorithms)
+        values = {"agent": algorithm.agent.name, **algorithm.settings, **point}
+        kinds = {"agent": str, **_kinds(algorithm)}
+        whole.append({x: kinds.get(x, float)(values[x]) for x in varied})
     return tuple(x for i, x in enumerate(whole) if x not in whole[:i])
 
 
-def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
+def _grid(
+    grid: Sequence[str], algorithms: Sequence[Algorithm]
+) -> dict[str, tuple[Any, ...]]:
     """Return the values by name from entries NAME=VALUE,VALUE,..."""
     values: dict[str, tuple[Any, ...]] = {}
-    kinds = _kinds(algorithm)
+    kinds = _kinds(algorithms[0])
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
-        if name not in kinds:
-            raise InputError(f"grid: {_why_not(name, algorithm)}")
+        for algorithm in algorithms:
+            if name not in _kinds(algorithm):
+                raise InputError(f"grid: {_why_not(name, algorithm)}")
         number = whole_number if kinds[name] is int else float
         try:
             values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
@@ -92,7 +121,7 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
     return values
 
 
-def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
+def _read(path: pathlib.Path, algorithms: Sequence[Algorithm]) -> list[Point]:
     """Return the points that a JSON file lists."""
     source = f"points_file is {path}"
     try:
@@ -103,24 +132,24 @@ def _read(path: pathlib.Path, algorithm: Algorithm) -> list[Point]:
         raise InputError(f"{source}: it must hold a list of points, one or more")
     if not all(isinstance(point, dict) for point in every):
         raise InputError(f"{source}: each point must be an object, NAME: VALUE")
-    check(every, algorithm, f"{source}: ")
+    check(every, *algorithms, source=f"{source}: ")
     return every
 
 
-def check(every: Iterable[Point], algorithm: Algorithm, source: str = "") -> None:
+def check(every: Iterable[Point], *algorithms: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed."""
-    allowed = _kinds(algorithm)
-    unused = without_effect(algorithm)
     try:
         for point in every:
-            for name, value in point.items():
+            algorithm, values = algorithm_of(point, algorithms)
+            allowed, unused = _kinds(algorithm), without_effect(algorithm)
+            for name, value in values.items():
                 if name not in allowed:
                     raise InputError(_why_not(name, algorithm))
                 if value is None:
                     raise refusal(name, value, "a number")
                 if name in unused:
                     raise InputError(f"{name} can't vary: {unused[name]}")
-            algorithms.check(algorithm.replace(**point))
+            check_algorithm(algorithm.replace(**values))
     except ValueError as error:
         raise InputError(f"{source}{error}") from None
 
@@ -136,6 +165,8 @@ def without_effect(algorithm: Algorithm) -> dict[str, str]:
 
 def _why_not(name: str, algorithm: Algorithm) -> str:
     """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
+    if name == "agent":
+        return "'agent' can't vary here: name several agents as --agent A,B"
     allowed = tuple(_kinds(algorithm))
     of_models = {x for model in REWARD_MODELS for x in names(model)}
     if name not in algorithm.settings and (name in of_models or agents_with(name)):
@@ -149,19 +180,19 @@ def make_points(
     points_file: pathlib.Path | None,
     *,
     seed: int,
-    algorithm: Algorithm,
+    algorithms: Sequence[Algorithm],
 ) -> list[Point]:
-    """Return the points of a sweep."""
+    """Return the points of a sweep, of all its agents."""
     if points_file is not None:
         if grid or random is not None:
             raise InputError("points_file can't be combined with grid or random")
-        return _read(points_file, algorithm)
-    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
+        return _read(points_file, algorithms)
+    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithms)
     if random is None:
         every = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in every]
-    kinds = _kinds(algorithm)
-    values = values or {name: x for name, x in PAPER_RANGES.items() if name in kinds}
+    known = set.intersection(*({*_kinds(algorithm)} for algorithm in algorithms))
+    values = values or {name: x for name, x in PAPER_RANGES.items() if name in known}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)
     if not 1 <= random <= min(count, 10_000):

@@ -6,12 +6,13 @@ import functools
 import math
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import json_files, output_file, plotting, policy_file, tables
+from gasil_jax.host.points import in_words
 from gasil_jax.host.programs import Program, Training
 from gasil_jax.host.runs import Run
 from gasil_jax.host.sweep import LABELS, Sweep
@@ -104,20 +105,17 @@ def _equal(first: Columns, second: Columns) -> bool:
 
 
 def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
-    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row."""
-    (first, *_), columns = sweep.runs, every[0]
-    for (point, seed), own in zip(sweep.runs, every, strict=True):
-        if differing := ", ".join(sorted(columns.keys() ^ own.keys())):
-            raise InputError(
-                f"point {point}, seed {seed} was trained with other metrics than point "
-                f"{first[0]}, seed {first[1]}: {differing}"
-            )
+    """Return all runs' columns, (points, seeds, rows).
+
+    A run has NaN after its last row, and where it lacks a metric of another agent.
+    """
     curves = {}
-    for name in columns:
+    for name in dict.fromkeys(name for own in every for name in own):
+        columns = [own.get(name, np.empty(0)) for own in every]
         # Points may differ in batch_steps, and so in iterations.
-        values = np.full((len(every), max(len(own[name]) for own in every)), np.nan)
-        for row, own in zip(values, every, strict=True):
-            row[: len(own[name])] = own[name]
+        values = np.full((len(every), max(map(len, columns))), np.nan)
+        for row, own in zip(values, columns, strict=True):
+            row[: len(own)] = own
         curves[name] = values.reshape(len(sweep.points), len(sweep.seeds), -1)
     return curves
 
@@ -139,18 +137,24 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     best = told["best_by_mean"]
     shown = 0 if best is None else best
     scores = {x: y[shown] for x, y in results.evaluations.items()}
+    title = ", ".join([sweep.env, *sweep.agent.split(",")])
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
             results.metrics["env_steps"][shown, 0],
             results.metrics["episode_return"][shown],
-            title=f"{sweep.env}, {sweep.algorithm.agent.name}",
+            title=f"{sweep.env}, {sweep.points[shown].get('agent', sweep.agent)}",
             evaluations=scores or None,
         )
     if len(sweep.points) > 1:
         with output_file.atomic(folder / "sweep.png") as partial:
             plotting.final_returns(
-                partial, _labels(results), results.finals["final_return"], best=best
+                partial,
+                _labels(results),
+                results.finals["final_return"],
+                title=title,
+                env_steps=results.metrics["env_steps"][:, 0],
+                curves=results.metrics["episode_return"],
             )
         known = np.flatnonzero(np.isfinite(results.mean)).tolist()
         varied = {
@@ -164,6 +168,7 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
                     partial,
                     varied,
                     results.mean[known],
+                    title=title,
                     best=None if best is None else known.index(best),
                     left_out=len(sweep.points) - len(known),
                 )
@@ -203,7 +208,7 @@ def _summary(results: Results) -> dict[str, Any]:
 
     return {
         "env": sweep.env,
-        "agent": sweep.algorithm.agent.name,
+        "agent": sweep.agent,
         "env_steps_per_seed": int(np.nanmax(results.metrics["env_steps"])),
         "points": [
             {
@@ -225,8 +230,21 @@ def _summary(results: Results) -> dict[str, Any]:
         ],
         "best_by_mean": results.best(results.mean),
         "best_by_worst_seed": results.best(final.min(axis=1)),
+        "best_of_agents": _best_of_agents(results),
         **_speed(trainings),
         "versions": _joined([x["versions"] for x in trainings]),
+    }
+
+
+def _best_of_agents(results: Results) -> dict[str, int | None]:
+    """Return the best point of each agent by mean; none for a single agent."""
+    own = np.array([str(point.get("agent")) for point in results.sweep.points])
+    return {
+        each.agent.name: results.best(
+            np.where(own == each.agent.name, results.mean, np.nan)
+        )
+        for each in results.sweep.algorithms
+        if results.sweep.others
     }
 
 
@@ -261,7 +279,7 @@ def speed_in_words(trainings: Sequence[Training]) -> str:
     return f"{f'{steps:,.0f} steps/s ' if steps else ''}on {speed['device']}"
 
 
-def in_words(results: Results) -> list[str]:
+def best_in_words(results: Results) -> list[str]:
     """Return the lines that are printed of several points."""
     lines, summary = [], results.summary
     for key, name in (("mean", "best mean"), ("worst_seed", "best worst seed")):
@@ -284,13 +302,29 @@ def _labels(results: Results) -> list[str]:
     points = results.sweep.points
     varied = [x for x in points[0] if len({point[x] for point in points}) > 1]
     varied = varied or [*points[0]]
-    return [", ".join(f"{x}={point[x]:g}" for x in varied) for point in points]
+    return [in_words({x: point[x] for x in varied}) for point in points]
+
+
+class _Best(TypedDict, total=False):
+    """What other commands read of summary.json."""
+
+    best_by_mean: int | None
+    best_of_agents: dict[str, int | None]
 
 
 def best_point(folder: pathlib.Path) -> int | None:
     """Return the point with the best mean, from summary.json; None if unknown."""
+    return _best(folder).get("best_by_mean")
+
+
+def best_of_agents(folder: pathlib.Path) -> dict[str, int]:
+    """Return the best point of each agent of a sweep over agents, if it is known."""
+    every = _best(folder).get("best_of_agents", {}).items()
+    return {agent: point for agent, point in every if point is not None}
+
+
+def _best(folder: pathlib.Path) -> _Best:
     try:
-        summary = json_files.read(folder / "summary.json", dict[str, Any])
-        return json_files.as_type(int | None, summary["best_by_mean"], "best_by_mean")
-    except (FileNotFoundError, KeyError):
-        return None
+        return json_files.read(folder / "summary.json", _Best)
+    except FileNotFoundError:
+        return {}

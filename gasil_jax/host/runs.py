@@ -41,6 +41,8 @@ REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
     "value_coefficient": (("learning_rate",), 1.0),
     "admission": (("buffer_steps",), "all"),
     "ties": (("buffer_steps",), "oldest"),
+    "sample_by_return": (("buffer_steps",), False),
+    "buffer_discounts": (("buffer_steps",), True),
     "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
     "discriminator_gradient_penalty": (("bonus",), 0.0),
     "discriminator_normalizes_actions": (("bonus",), False),
@@ -60,7 +62,8 @@ def removed(settings: Mapping[str, Any]) -> dict[str, Any]:
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The physics engine and the device are not among them, because they compute the same
+    `start` is the hash of the policy that it starts from, if that is a trained one. The
+    physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -69,6 +72,7 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
+    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -80,6 +84,8 @@ class Run:
     def _fields(self) -> dict[str, Any]:
         """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
+        if not values["rewards"]:  # Stored runs had no models of the user's.
+            del values["rewards"]
         for name, value in values.items():
             if callable(value):
                 values[name] = "a function"
@@ -99,6 +105,7 @@ class Run:
                     del group[name]
         return {
             "env": self.env,
+            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": {

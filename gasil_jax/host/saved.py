@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_envs import wrappers
+from gasil_envs import user_code, wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import numpy_policy, policy, train
 from gasil_jax.agents.adversarial import AdversarialAgent
@@ -23,6 +23,7 @@ from gasil_jax.errors import InputError, refusal
 from gasil_jax.host import (
     checkpoint,
     environments,
+    folders,
     programs,
     results,
     sweep,
@@ -30,10 +31,11 @@ from gasil_jax.host import (
     training,
 )
 from gasil_jax.host.driver import Outcome
-from gasil_jax.host.members import member
+from gasil_jax.host.members import make_members, member
 from gasil_jax.host.output_file import note
+from gasil_jax.host.points import in_words
 from gasil_jax.host.programs import Program
-from gasil_jax.host.sweep import Sweep
+from gasil_jax.host.sweep import Start, Sweep
 
 
 def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
@@ -49,23 +51,20 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     Raises:
       InputError: if it is no such folder, or has no such point.
     """
-    described = sweep.described(folder)
-    agent = str(described["algorithm"].get("agent"))
-    chosen = _choose_point(folder, described["points"], point)
-    if described["only_python"] is None:
-        return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
-    return described["env"], agent, programs.labelled(folder / "programs", chosen)
+    stored = sweep.described(folder)
+    chosen = _choose_point(folder, stored["points"], point)
+    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
+    if stored["only_python"] is None:
+        every = _programs(folder, sweep.made(folder, stored), chosen)
+    else:
+        every = programs.labelled(folder / "programs", chosen)
+    return stored["env"], str(agent), every
 
 
-def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
-    """Return the seed with the highest final return of a point; None if unknown.
-
-    A policy of the zoo has one seed, which needs no name.
-    """
-    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        return None
+def best_seed(every: Sequence[Program]) -> int | None:
+    """Return the seed with the highest final return of programs; None if unknown."""
     scores = {}
-    for each in find(folder, point)[2]:
+    for each in every:
         table = each.table("metrics.csv", ("episode_return",))
         for i, columns in zip(each.indices, table, strict=True):
             if columns:
@@ -74,6 +73,11 @@ def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
                     np.nan_to_num(final, nan=-np.inf)
                 )
     return max(scores, key=scores.__getitem__) if scores else None
+
+
+def choose_point(folder: pathlib.Path, point: int | None) -> int:
+    """Return the number of the requested point of a folder; by default the best."""
+    return _choose_point(folder, sweep.described(folder)["points"], point)
 
 
 def _choose_point(
@@ -88,8 +92,9 @@ def _choose_point(
                 f"to {last}"
             )
         if point <= last:
-            values = ", ".join(f"{x}={y:g}" for x, y in points[point].items())
-            note(f"{folder}: point {point}, the best by mean ({values})")
+            note(
+                f"{folder}: point {point}, the best by mean ({in_words(points[point])})"
+            )
     point = point or 0
     if not 0 <= point <= last:
         raise InputError(f"point is {point}: {folder} has points 0 to {last}")
@@ -174,22 +179,12 @@ def restore(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        root = each.path / "checkpoints"
-        if which == "best":
-            with _named(folder):
-                chosen = checkpoint.best(root)
-        else:
-            chosen, errors = checkpoint.latest(root)
-            for error in errors:
-                print(f"warning: {error}", file=sys.stderr)
-        if chosen is None:
-            scored = " with a score" if which == "best" else ""
-            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
         init = functools.partial(train.first_state, env, each.algorithm)
         keys = jax.random.split(jax.random.key(0), each.num_members)
         with _named(folder):
             # The leaves of all members have the same shapes.
-            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
+            like = jax.eval_shape(jax.vmap(init), keys)
+            restored = _read_checkpoint(each.path / "checkpoints", which, like)
         own = zip(each.seeds, each.indices, strict=True)
         states |= {number: member(restored, i) for number, i in own}
     seeds = [x for x in stored.seeds if x in states]
@@ -206,6 +201,111 @@ def restore(
 
     stacked = jax.tree.map(stack, *(states[x] for x in seeds))
     return every[0].algorithm, seeds, stacked
+
+
+def find_start(folder: pathlib.Path) -> Start:
+    """Return the policy of a run's best seed, in its newest checkpoint."""
+    stored = sweep.read(folder)
+    every = _programs(folder, stored, _choose_point(folder, stored.points, None))
+    seed = best_seed(every)
+    if seed is None:
+        seed = every[0].seeds[0]
+    (path,) = (x.path for x in every if seed in x.seeds)
+    newest, _ = checkpoint.latest(path / "checkpoints")
+    if newest is None:
+        raise InputError(f"run is {folder}: it has no whole checkpoint")
+    return Start(str(folder.absolute()), seed, newest.digest())
+
+
+def load_start(start: Start, env: Any, every: Sequence[Program]) -> Any:
+    """Return the trained state that programs start from; None if all have begun.
+
+    Raises:
+      InputError: if it is gone or has changed, or has networks of another form.
+    """
+    if not (fresh := _without_checkpoint(every)):
+        return None
+    folder = pathlib.Path(start.run)
+    if find_start(folder).sha256 != start.sha256:
+        raise InputError(
+            f"init_from is {folder}, which has been trained since: what began from its "
+            "earlier policy can't begin anew"
+        )
+    *_, trained = load(folder, seed=start.seed)
+    for each in fresh:
+        first = functools.partial(train.first_state, env, each.algorithm)
+        parts = [
+            (x.actor_critic.policy.params, x.normalizer)
+            for x in (jax.eval_shape(first, jax.random.key(0)), member(trained, 0))
+        ]
+        if change := user_code.first_change(*parts):
+            where, own, other = change
+            raise InputError(
+                f"init_from is {folder}, whose policy has another form: {where} is "
+                f"{other} and not {own}"
+            )
+    return trained
+
+
+def begin(trained: Any, env: Any, every: Sequence[Program]) -> None:
+    """Write a first checkpoint, with a trained policy, in programs that have none.
+
+    The networks' parameters and the normalizer of observations are the trained ones;
+    all else, such as optimizers, buffers and discriminators, is as in a new run.
+    """
+
+    def spread(new: Any, old: Any) -> Any:
+        return jax.tree.map(lambda x, y: jnp.broadcast_to(y, x.shape), new, old)
+
+    old = trained.actor_critic
+    for each in _without_checkpoint(every):
+        own = make_members(env, each.algorithm, each.seeds, each.hyperparameters)
+        states = own.trim(own.init())
+        now = states.actor_critic
+        policy, values = spread(now.policy.params, old.policy.params), now.values
+        # Another agent may have more streams of rewards, each with its values.
+        if len(values) == len(old.values):
+            values = tuple(
+                x.replace(params=spread(x.params, y.params))
+                for x, y in zip(values, old.values)
+            )
+        states = states.replace(
+            actor_critic=now.replace(
+                policy=now.policy.replace(params=policy), values=values
+            ),
+            normalizer=spread(states.normalizer, trained.normalizer),
+        )
+        record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
+        with each.opened():
+            checkpoint.write(each.path / "checkpoints", 0, states, record)
+
+
+def _without_checkpoint(every: Sequence[Program]) -> list[Program]:
+    return [x for x in every if checkpoint.latest(x.path / "checkpoints")[0] is None]
+
+
+def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:
+    """Return the states in a checkpoint, which training may delete meanwhile."""
+    for _ in range(5):
+        before = set(root.iterdir()) if root.is_dir() else set()
+        errors: list[str] = []
+        try:
+            if which == "best":
+                chosen = checkpoint.best(root)
+            else:
+                chosen, errors = checkpoint.latest(root)
+            if chosen is None:
+                scored = " with a score" if which == "best" else ""
+                raise ValueError(f"it has no whole checkpoint{scored}")
+            states = chosen.restore(like)
+        except (ValueError, OSError):
+            if all(path.exists() for path in before):
+                raise
+        else:
+            for error in errors:
+                print(f"warning: {error}", file=sys.stderr)
+            return states
+    raise ValueError(f"training deletes {root} sooner than it can be read: try again")
 
 
 def states_of(
@@ -278,6 +378,51 @@ def load_policies(
     about = numpy_policy.about(str(folder))
     env = environments.make_env(about["env"], reward_delay=about["reward_delay"])
     return Policies(env, int(env.episode_length), [about["seed"]], [arrays])
+
+
+def load_policy(
+    path: str | pathlib.Path,
+    seed: int | None = None,
+    *,
+    which: str = "last",
+    point: int | None = None,
+    env: Any = None,
+    algorithm: Algorithm | None = None,
+) -> Callable[..., jax.Array]:
+    """Return a saved policy as a pure function for `jax.jit` and `jax.vmap`.
+
+    The function is ``policy(observation, key=None)``, (..., obs) -> (..., action), in
+    float32. It clips actions to their range. Without a key the action is the policy's
+    mean, or that of a mixture's most probable Gaussian; with a key it is drawn from the
+    policy. The key is consumed. Discrete actions are int32 (...), without a key the
+    most probable ones.
+
+    Args:
+      path: the folder of a run or a sweep; a file ``policy.npz``; or "zoo:NAME", one of
+        the policies that come with the package. In a folder policy.npz is read if it
+        has what is asked for, and a checkpoint otherwise.
+      seed: number of the seed; default the one with the highest final return.
+      which: see `load`.
+      point: see `load`.
+      env: see `load`; only for checkpoints of an environment that was made in Python.
+      algorithm: see `load`; only for checkpoints of what was made in Python.
+
+    Raises:
+      ValueError: if it is not a saved policy, or has no such seed; and as `load` does.
+    """
+    if not isinstance(path, str | pathlib.PurePath):
+        raise refusal("path", path, "a string or a pathlib.Path")
+    folder = pathlib.Path(path)
+    has_file = not folders.has_config(folder) or (folder / "policy.npz").exists()
+    if has_file and which == "last" and point is None:
+        return policy.make(numpy_policy.read(path, seed))
+    if seed is None:
+        point = choose_point(folder, point)
+        seed = best_seed(find(folder, point)[2])
+    env, _, _, states = load(
+        folder, which, point, seed=seed, env=env, algorithm=algorithm
+    )
+    return policy.from_state(member(states, 0), env)
 
 
 def load_reward(

@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import hashlib
 import pathlib
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Required, TypedDict
 
@@ -25,8 +26,16 @@ import jax
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, refusal, shown
-from gasil_jax.host import descriptions, folders, json_files, points, programs
+from gasil_jax.host import (
+    descriptions,
+    environments,
+    folders,
+    json_files,
+    points,
+    programs,
+)
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
 from gasil_jax.host.points import Point
 from gasil_jax.host.programs import Program
 from gasil_jax.host.runs import Run
@@ -42,13 +51,16 @@ class Recording:
     """What is recorded of training, and when. It does not change a run's numbers.
 
     Attributes:
-      checkpoint_every: environment steps per seed between two checkpoints, rounded up
-        to whole iterations; None writes one every ten minutes.
-      keep_checkpoints: number of newest checkpoints to keep, besides the best one; 0
-        writes none.
-      evaluate_every: environment steps per seed between two evaluations; None for none.
+      checkpoint_every: environment steps per seed between two checkpoints; by
+        default a checkpoint is written every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
+        with the best evaluation or, without evaluate_every, with the best returns.
+      evaluate_every: environment steps per seed between two evaluations of the
+        policy's mean action in fresh environments, rounded up to whole iterations;
+        by default none. The untrained policy is evaluated too. The scores are undelayed
+        returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation.
-      log: names of trackers.
+      log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
     checkpoint_every: int | None = None
@@ -59,12 +71,30 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True)
+class Start:
+    """The trained policy that runs start from.
+
+    Attributes:
+      run: the folder of its run.
+      seed: its seed.
+      sha256: hash of its checkpoint.
+    """
+
+    run: str
+    seed: int
+    sha256: str
+
+
+@dataclasses.dataclass(frozen=True)
 class Sweep:
     """The points and seeds of a folder.
 
     Attributes:
       env: name of the environment.
       algorithm: the algorithm that the points change.
+      others: those of further agents, which are trained beside it. Then each point has
+        its "agent".
+      start: the trained policy that all runs start from; None starts from scratch.
       seeds: absolute seed numbers.
       points: changed settings, by name; all have the same names.
       settings: settings of the environment.
@@ -82,14 +112,28 @@ class Sweep:
     recording: Recording = dataclasses.field(default_factory=Recording)
     preset: str | None = None
     only_python: str | None = None
+    others: Sequence[Algorithm] = ()
+    start: Start | None = None
+
+    @property
+    def algorithms(self) -> tuple[Algorithm, ...]:
+        """The algorithms of all agents."""
+        return (self.algorithm, *self.others)
+
+    @property
+    def agent(self) -> str:
+        """The names of all agents, separated by commas."""
+        return ",".join(x.agent.name for x in self.algorithms)
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
         """The run of each (index of the point, seed)."""
-        every = [self.algorithm.replace(**point) for point in self.points]
+        every = [points.algorithm_of(x, self.algorithms) for x in self.points]
+        changed = [algorithm.replace(**values) for algorithm, values in every]
+        start = None if self.start is None else self.start.sha256
         return {
-            (index, seed): Run(self.env, changed, seed, self.settings)
-            for index, changed in enumerate(every)
+            (index, seed): Run(self.env, algorithm, seed, self.settings, start=start)
+            for index, algorithm in enumerate(changed)
             for seed in self.seeds
         }
 
@@ -140,20 +184,22 @@ class Sweep:
 
     def write(self, folder: pathlib.Path) -> None:
         """Write config.json."""
-        algorithm = descriptions.describe(self.algorithm)
+        algorithm, *others = (
+            {name: "a function" if callable(x) else x for name, x in values.items()}
+            for values in map(descriptions.describe, self.algorithms)
+        )
         content = {
             "env": self.env,
             "settings": self.settings,
-            "algorithm": {
-                name: "a function" if callable(x) else x
-                for name, x in algorithm.items()
-            },
+            "algorithm": algorithm,
+            "others": others,
             "points": [dict(point) for point in self.points],
             "seeds": list(self.seeds),
             "recording": self.recording,
             "preset": self.preset,
+            "start": self.start,
             "only_python": self.only_python,
-            "expert_sha256": _expert_hash(self.algorithm),
+            "expert_sha256": _expert_hash(self),
         }
         json_files.write(folder / folders.CONFIG, content)
 
@@ -172,8 +218,8 @@ class Sweep:
                 "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
                 "devices and log may differ"
             )
-        every = points.completed([*stored["points"], *self.points], self.algorithm)
-        return dataclasses.replace(self, points=every)
+        every = points.completed([*stored["points"], *self.points], *self.algorithms)
+        return dataclasses.replace(self, points=every, start=stored.get("start"))
 
 
 class Config(TypedDict, total=False):
@@ -182,17 +228,19 @@ class Config(TypedDict, total=False):
     env: Required[str]
     settings: Required[Settings]
     algorithm: Required[dict[str, Any]]
-    points: Required[tuple[dict[str, float], ...]]
+    others: tuple[dict[str, Any], ...]
+    points: Required[tuple[dict[str, float | str], ...]]
     seeds: Required[tuple[int, ...]]
     recording: Required[Recording]
     preset: Required[str | None]
     only_python: Required[str | None]
+    start: Start | None
     expert_sha256: str | None
 
 
 def described(folder: pathlib.Path) -> Config:
     """Return the content of config.json, also of what only Python can make."""
-    path = folder / folders.CONFIG
+    path = folder if folder.is_file() else folder / folders.CONFIG
     try:
         content: Config = json_files.read(path, Config)
     except (FileNotFoundError, NotADirectoryError):
@@ -212,7 +260,13 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
 
     An algorithm that only Python can make is an argument.
     """
-    stored = described(folder)
+    return made(folder, described(folder), algorithm)
+
+
+def made(
+    folder: pathlib.Path, stored: Config, algorithm: Algorithm | None = None
+) -> Sweep:
+    """Return the sweep that a folder's config.json describes; see `read`."""
     if algorithm is None and (why := stored["only_python"]) is not None:
         raise InputError(
             f"run is {folder}, which was trained from Python with what no command line "
@@ -220,14 +274,31 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
             "python -m gasil_jax.plot"
         )
     with json_files.blamed(folder / folders.CONFIG):
+        _note_imports(folder, stored)
         if algorithm is None:
             algorithm = descriptions.read(stored["algorithm"])
-        algorithms.check(algorithm)
-        points.check(stored["points"], algorithm, "points: ")
-        every = points.completed(stored["points"], algorithm)
+        others = tuple(map(descriptions.read, stored.get("others", ())))
+        for each in (algorithm, *others):
+            algorithms.check(each)
+        points.check(stored["points"], algorithm, *others, source="points: ")
+        every = points.completed(stored["points"], algorithm, *others)
     names = ("env", "settings", "seeds", "recording", "preset", "only_python")
     fields: dict[str, Any] = {name: stored[name] for name in names}  # type: ignore[literal-required]
-    return Sweep(algorithm=algorithm, points=every, **fields)
+    start = stored.get("start")
+    return Sweep(
+        algorithm=algorithm, others=others, points=every, start=start, **fields
+    )
+
+
+def _note_imports(folder: pathlib.Path, stored: Config) -> None:
+    """Print which modules a config.json names, which its reader imports."""
+    named: list[Any] = [stored["env"]]
+    for each in (stored["algorithm"], *stored.get("others", ())):
+        named += [each.get("agent"), *each.get("rewards", ())]
+    modules = {str(name).partition(":")[0] for name in named if ":" in str(name)}
+    new = sorted(modules - {*environments.FAMILIES, *sys.modules})
+    if new:
+        note(f"{folder} names code that is imported now: {', '.join(new)}")
 
 
 def check_seeds(seeds: Sequence[int]) -> None:
@@ -241,42 +312,44 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 def _differences(before: Config, now: Sweep) -> list[str]:
     """Return "NAME was A, is B" for each field in which two sweeps must not differ."""
-    algorithm = descriptions.describe(now.algorithm)
-    agents = before["algorithm"].get("agent"), algorithm["agent"]
-    if agents[0] != agents[1]:
-        return [f"agent was {agents[0]}, is {agents[1]}"]
-    old_recording, new_recording = vars(before["recording"]), vars(now.recording)
+    old, new = (before["algorithm"], *before.get("others", ())), now.algorithms
+    agents = ",".join(str(x.get("agent")) for x in old)
+    if agents != now.agent:
+        return [f"agent was {agents}, is {now.agent}"]
     evaluations = ("evaluate_every", "evaluate_episodes")
+    recordings = (before["recording"], now.recording)
     changes = []
-    for old, new in (
+    for was, then in (
         ({"env": before["env"]}, {"env": now.env}),
         (vars(before["settings"]), vars(now.settings)),
-        (before["algorithm"], algorithm),
-        ({x: old_recording[x] for x in evaluations}, new_recording),
+        *zip(old, map(descriptions.describe, new), strict=True),
+        [{x: getattr(each, x) for x in evaluations} for each in recordings],
     ):
-        for name, value in old.items():
-            other = "a function" if callable(new.get(name)) else new.get(name)
+        for name, value in was.items():
+            other = "a function" if callable(then.get(name)) else then.get(name)
             if name in ("total_steps", "expert"):
                 continue
             if json_files.as_type(Any, value, name) != other:
                 changes.append(f"{name} was {shown(value)}, is {shown(other)}")
-    if algorithm["total_steps"] < before["algorithm"]["total_steps"]:
-        changes.append(f"total_steps was {before['algorithm']['total_steps']}")
+    if now.algorithm.config.total_steps < old[0]["total_steps"]:
+        changes.append(f"total_steps was {old[0]['total_steps']}")
     if not set(before["seeds"]) <= set(now.seeds):
         changes.append(f"seeds were {shown(list(before['seeds']))}")
-    if before.get("expert_sha256") != _expert_hash(now.algorithm):
+    start = before.get("start")
+    if now.start and (start is None or start.sha256 != now.start.sha256):
+        changes.append(f"init_from was {start and start.run}, is {now.start.run}")
+    if before.get("expert_sha256") != _expert_hash(now):
         changes.append("the trajectories of the expert were others")
     return changes
 
 
-def _expert_hash(algorithm: Algorithm) -> str | None:
-    """Return the hash of the expert's trajectories, None without an expert."""
-    if getattr(algorithm.agent, "expert", None) is None:
-        return None
+def _expert_hash(sweep: Sweep) -> str | None:
+    """Return the hash of the experts' trajectories, None without an expert."""
+    agents = [x.agent for x in sweep.algorithms if getattr(x.agent, "expert", None)]
     digest = hashlib.sha256()
-    for values in jax.tree.leaves(algorithm.agent.data()):
+    for values in jax.tree.leaves([agent.data() for agent in agents]):
         digest.update(values.tobytes())
-    return digest.hexdigest()
+    return digest.hexdigest() if agents else None
 
 
 def parse_shard(text: str) -> tuple[int, int]:

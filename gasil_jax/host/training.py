@@ -6,7 +6,8 @@ from typing import Any
 
 import jax
 
-from gasil_jax import train
+from gasil_envs import user_code
+from gasil_jax import checks, train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.host import devices, driver, environments, resources, trackers
 from gasil_jax.host.driver import Callback, Outcome
@@ -32,7 +33,7 @@ def prepare(
     *,
     num_devices: int | None = None,
 ) -> Any:
-    """Start the devices, check that everything fits, and return the environment.
+    """Start the devices, check that everything works and fits; return the environment.
 
     Nothing is compiled before this is done.
     """
@@ -41,6 +42,9 @@ def prepare(
     env = make_env(sweep)
     with announced(sweep.env, "starting the devices"):
         every = jax.devices()
+    algorithms = {x.algorithm.agent.name: x.algorithm for x in programs}
+    for each in algorithms.values():
+        _check(env, each)
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, every, folder)
     if num_devices is not None and 0 < num_members < num_devices:
@@ -50,6 +54,24 @@ def prepare(
         )
     _note_if_no_episode_ends(env, [each.algorithm for each in programs])
     return env
+
+
+def _check(env: Any, algorithm: Algorithm) -> None:
+    """Check that an algorithm can run in an environment; trace what is the user's."""
+
+    def begin() -> Any:
+        state = train.init(env, algorithm, jax.random.key(0))
+        return train.train_step(env, algorithm, state)
+
+    checks.check(env, algorithm)
+    own = [f"rewards {model.name!r}" for model in algorithm.own_models]
+    if ":" in algorithm.agent.name:
+        own.insert(0, f"agent {algorithm.agent.name!r}")
+    if own:
+        what, package = " and ".join(own), pathlib.Path(train.__file__).parent
+        with user_code.refused(f"{what} can't be traced", package):
+            with announced(what, "tracing its functions"):
+                jax.eval_shape(begin)
 
 
 def _note_if_no_episode_ends(env: Any, every: Sequence[Algorithm]) -> None:

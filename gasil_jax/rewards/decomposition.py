@@ -24,7 +24,6 @@ share, so that agents that replay whole episodes see the complete rewards.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import chex
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -47,24 +46,13 @@ _MOST = 2**19
 
 
 class Decomposition(struct.PyTreeNode):
-    """The state of reward decomposition between iterations.
+    """The state of reward decomposition between iterations."""
 
-    Attributes:
-      network: g, parameters and optimizer state of a `networks.StepReward`.
-      rates: moments of payout / length of all windows so far; a normalizer with
-        obs = 1.
-      reward: float32 (N, H), the decomposed rewards of the history's steps.
-      open_reward: float32 (N,), sum of the decomposed rewards of the running window.
-      open_steps: float32 (N,), number of steps of the running window.
-      recorded_steps: int32 (), number of steps of each environment in the history.
-    """
-
-    network: Learner
-    rates: Normalizer
-    reward: jax.Array
-    open_reward: jax.Array
-    open_steps: jax.Array
-    recorded_steps: jax.Array
+    network: Learner  # g, a `networks.StepReward`
+    rates: Normalizer  # moments of payout / length of all windows so far, (1,)
+    reward: jax.Array  # float32 (N, H), the decomposed rewards of the history's steps
+    open_reward: jax.Array  # float32 (N,), their sum over the running window
+    open_steps: jax.Array  # float32 (N,), number of steps of the running window
 
 
 class Windows(NamedTuple):
@@ -80,35 +68,26 @@ def ends_window(reward: jax.Array, ended: jax.Array) -> jax.Array:
     return (reward != 0) | ended
 
 
-def windows(history: History, recorded_steps: jax.Array) -> Windows:
+def windows(history: History) -> Windows:
     """Return the complete windows of a history, (N, H), in time order.
 
     A window whose first step is no longer in the history, and one that ends with a NaN
     reward, is left out.
-
-    Args:
-      history: the history, with NaN rewards at faulty steps and at the last step of an
-        episode that was cut short, whose return is not known.
-      recorded_steps: int32 (), number of steps of each environment in the history.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
-    steps = reward.shape[1]
-    index = jnp.arange(steps, dtype=jnp.int32)[None]
-    recorded = index >= steps - recorded_steps
-    last = ends_window(reward, ended) | ~recorded
+    index = jnp.arange(reward.shape[1], dtype=jnp.int32)[None]
+    last = ends_window(reward, ended)
     latest = jax.lax.cummax(jnp.where(last, index, -1), axis=1)
     before = jnp.pad(latest[:, :-1], ((0, 0), (1, 0)), constant_values=-1)
     return Windows(
-        ends=last & recorded & (before >= 0) & jnp.isfinite(reward),
+        ends=last & (before >= 0) & jnp.isfinite(reward),
         payout=reward,
         length=index - before,
     )
 
 
-def window_sums(
-    reward: jax.Array, ends: jax.Array, running: tuple[jax.Array, jax.Array]
-) -> tuple[jax.Array, jax.Array, tuple[jax.Array, jax.Array]]:
-    """Return each running window's sum and length up to every step, (T, N) each.
+def window_sums(reward: jax.Array, ends: jax.Array, running: Any) -> Any:
+    """Return each window's sum and length up to every step, (T, N) each.
 
     Args:
       reward: float32 (T, N).
@@ -116,7 +95,6 @@ def window_sums(
       running: sum and number of steps, float32 (N,) each, of the windows that run when
         the batch begins; those that run when it ends are returned too.
     """
-    chex.assert_equal_shape([reward, ends])
 
     def step(running: Any, now: Any) -> Any:
         reward, ends = now
@@ -129,10 +107,7 @@ def window_sums(
 
 
 def at_window_end(values: jax.Array, ends: jax.Array) -> jax.Array:
-    """Return for each step the value at the end of its window, (T, N).
-
-    Steps of a window that does not end in the batch get 0.
-    """
+    """Return each step's value at the end of its window, (T, N); 0 if it has none."""
 
     def backward(later: jax.Array, now: Any) -> Any:
         value, ends = now
@@ -146,17 +121,11 @@ def at_window_end(values: jax.Array, ends: jax.Array) -> jax.Array:
 def goodness_of_fit(
     predicted: jax.Array, actual: jax.Array, valid: jax.Array
 ) -> Metrics:
-    """Return how well the network predicts what windows pay per step.
+    """Return how well the valid windows' payout / length, (T, N), is predicted.
 
-    Args:
-      predicted: float32 (T, N), mean of the network's rewards over a window.
-      actual: float32 (T, N), the window's payout / length.
-      valid: bool (T, N), which windows count.
-
-    Returns:
-      "decomposition_fit", (), the share of the variance of `actual` that is explained
-      (R2), and "decomposition_error", (), the root of the mean squared error. NaN where
-      too few windows count, or all have the same `actual`.
+    The metrics are "decomposition_fit", the share of its variance that is explained
+    (R2), NaN where it does not vary, and "decomposition_error", the root of the mean
+    squared error.
     """
     count = jnp.sum(valid)
 
@@ -174,65 +143,9 @@ def goodness_of_fit(
     }
 
 
-def _train(
-    network: Learner,
-    history: History,
-    complete: Windows,
-    *,
-    rates: Normalizer,
-    key: jax.Array,
-    predict: Any,
-    settings: "Decompose",
-) -> Learner:
-    """Take gradient steps on windows drawn from the history.
-
-    If all windows have a single step, no network is needed and no step is taken. The
-    number of steps is a loop's bound, not a mask, so a vmapped batch of such runs saves
-    the time too.
-    """
-    num_windows = settings.decomposition_minibatch_size
-    num_rows = settings.decomposition_window_steps
-    steps = complete.ends.shape[1]
-    assert history.next_observation is not None  # Ensured by the model.
-    rings = history.observation, history.action, history.next_observation
-    mean, scale = normalization.moments(rates)
-    counts = jnp.cumsum(complete.ends.ravel())
-
-    parts = num_parts(num_windows, num_rows * sum(ring.shape[-1] for ring in rings))
-
-    def objective(params: Any, drawn: Any) -> jax.Array:
-        env, position, weight, target = drawn
-        # Windows and steps are one axis: with two, a CPU takes a third longer.
-        index = (jnp.repeat(env, num_rows), position.ravel())
-        output = predict(params, *(ring[index] for ring in rings))
-        predicted = jnp.sum(weight * output.reshape(weight.shape), axis=1)
-        return jnp.mean((predicted - target) ** 2)
-
-    def step(i: jax.Array, network: Learner) -> Learner:
-        window_key, step_key = jax.random.split(keys[i])
-        rank = jax.random.uniform(window_key, (num_windows,)) * counts[-1]
-        index = jnp.searchsorted(counts, jnp.floor(rank).astype(jnp.int32), "right")
-        env, end = jnp.divmod(jnp.minimum(index, counts.size - 1), steps)
-        length = complete.length[env, end]
-        offset, weight = sample_window_steps(step_key, length, num_rows)
-        position = (history.cursor + end[:, None] - offset) % steps
-        target = (complete.payout[env, end] / length - mean[0]) / scale[0]
-        drawn = (env, position, weight, target)
-        gradient = mean_gradient(
-            jax.grad(objective), network.params, drawn, parts=parts
-        )
-        step_size = settings.decomposition_learning_rate
-        return learner.descend(network, gradient, learner.adam(), step_size=step_size)
-
-    keys = jax.random.split(key, settings.decomposition_updates)
-    is_delayed = jnp.any(complete.ends & (complete.length > 1))
-    return jax.lax.fori_loop(0, jnp.where(is_delayed, len(keys), 0), step, network)
-
-
 def num_parts(num_windows: int, numbers_per_window: int) -> int:
     """Return the fewest equal parts of a minibatch that each fit a CPU's cache."""
     divisors = (n for n in range(1, num_windows) if num_windows % n == 0)
-
     fitting = (n for n in divisors if num_windows // n * numbers_per_window <= _MOST)
     return next(fitting, num_windows)
 
@@ -258,15 +171,8 @@ def sample_window_steps(
     """Draw the steps that represent each window, with their weights in its mean.
 
     A window of at most S steps is represented by all of them, a longer one by S of
-    them, drawn with replacement.
-
-    Args:
-      key: random key; consumed.
-      length: int32 (W,), number of steps of each window.
-      num_steps: S.
-
-    Returns:
-      int32 (W, S), the steps' distance from the window's last one, and float32 (W, S).
+    them, drawn with replacement. Lengths are int32 (W,). The steps are given by their
+    distance from the window's last one, int32 (W, S); weights are float32 (W, S).
     """
     length = length[:, None]
     every = jnp.arange(num_steps, dtype=jnp.int32)[None]
@@ -328,7 +234,6 @@ class Decompose(RewardModel):
             reward=jnp.zeros((sizes.num_envs, sizes.history_steps), jnp.float32),
             open_reward=jnp.zeros(sizes.num_envs, jnp.float32),
             open_steps=jnp.zeros(sizes.num_envs, jnp.float32),
-            recorded_steps=jnp.int32(0),
         )
 
     def update(
@@ -341,25 +246,20 @@ class Decompose(RewardModel):
         `goodness_of_fit` of the batch's windows of more than one step, predicted before
         training on them.
         """
-        network, batch, history = self._network, context.rollout, context.history
+        batch, history = context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.
-        low, high = context.action_range
-
-        def normalize(x: jax.Array) -> jax.Array:
-            return normalization.normalize(context.normalizer, x)
 
         def predict(
             params: Any, observation: jax.Array, action: jax.Array, after: jax.Array
         ) -> jax.Array:
-            action = jnp.clip(action, low, high)
-            return network.apply(
-                params, normalize(observation), action, normalize(after)
-            )
-
-        step = (batch.observation, batch.action, batch.next_observation)
+            observation = normalization.normalize(context.normalizer, observation)
+            after = normalization.normalize(context.normalizer, after)
+            action = jnp.clip(action, *context.action_range)
+            return self._network.apply(params, observation, action, after)
 
         def step_rewards(params: Any, rates: Normalizer) -> jax.Array:
             mean, scale = normalization.moments(rates)
+            step = (batch.observation, batch.action, batch.next_observation)
             return mean[0] + scale[0] * predict(params, *step)
 
         # Measure how well the batch's ended windows are predicted, then train.
@@ -375,16 +275,8 @@ class Decompose(RewardModel):
         )
         num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
         cursor = (history.cursor - num_steps) % ring
-        recorded_steps = jnp.minimum(state.recorded_steps + num_steps, ring)
-        complete = windows(history, recorded_steps)
-        trained = _train(
-            state.network,
-            history,
-            complete,
-            rates=rates,
-            key=key,
-            predict=predict,
-            settings=self,
+        trained = self._train(
+            state.network, history, rates=rates, key=key, predict=predict
         )
         healthy, trained = learner.keep_if_finite(trained, state.network)
         # What the network does not explain of a payout is shared by the window's steps.
@@ -405,7 +297,6 @@ class Decompose(RewardModel):
             reward=write(recorded, reward, cursor),
             open_reward=running[0],
             open_steps=running[1],
-            recorded_steps=recorded_steps,
         )
         # The NaNs that mark episodes without a valid return must stay.
         no_return = jnp.isnan(history.reward)
@@ -415,3 +306,58 @@ class Decompose(RewardModel):
             history=history.replace(reward=decomposed),
         )
         return state, context, healthy, metrics
+
+    def _train(
+        self,
+        network: Learner,
+        history: History,
+        *,
+        rates: Normalizer,
+        key: jax.Array,
+        predict: Any,
+    ) -> Learner:
+        """Take gradient steps on windows drawn from the history.
+
+        If all windows have a single step, no network is needed and no step is taken.
+        The number of steps is a loop's bound, not a mask, so a vmapped batch of such
+        runs saves the time too.
+        """
+        num_windows = self.decomposition_minibatch_size
+        num_rows = self.decomposition_window_steps
+        complete = windows(history)
+        steps = complete.ends.shape[1]
+        rings = history.observation, history.action, history.next_observation
+        mean, scale = normalization.moments(rates)
+        counts = jnp.cumsum(complete.ends.ravel())
+        numbers = sum(ring.shape[-1] for ring in rings if ring is not None)
+        parts = num_parts(num_windows, num_rows * numbers)
+
+        def objective(params: Any, drawn: Any) -> jax.Array:
+            env, position, weight, target = drawn
+            # Windows and steps are one axis: with two, a CPU takes a third longer.
+            index = (jnp.repeat(env, num_rows), position.ravel())
+            output = predict(params, *jax.tree.map(lambda ring: ring[index], rings))
+            predicted = jnp.sum(weight * output.reshape(weight.shape), axis=1)
+            return jnp.mean((predicted - target) ** 2)
+
+        def step(i: jax.Array, network: Learner) -> Learner:
+            window_key, step_key = jax.random.split(keys[i])
+            rank = jax.random.uniform(window_key, (num_windows,)) * counts[-1]
+            index = jnp.searchsorted(counts, jnp.floor(rank).astype(jnp.int32), "right")
+            env, end = jnp.divmod(jnp.minimum(index, counts.size - 1), steps)
+            length = complete.length[env, end]
+            offset, weight = sample_window_steps(step_key, length, num_rows)
+            position = (history.cursor + end[:, None] - offset) % steps
+            target = (complete.payout[env, end] / length - mean[0]) / scale[0]
+            drawn = (env, position, weight, target)
+            gradient = mean_gradient(
+                jax.grad(objective), network.params, drawn, parts=parts
+            )
+            step_size = self.decomposition_learning_rate
+            return learner.descend(
+                network, gradient, learner.adam(), step_size=step_size
+            )
+
+        keys = jax.random.split(key, self.decomposition_updates)
+        is_delayed = jnp.any(complete.ends & (complete.length > 1))
+        return jax.lax.fori_loop(0, jnp.where(is_delayed, len(keys), 0), step, network)

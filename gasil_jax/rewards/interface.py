@@ -17,10 +17,18 @@ class RewardModel(struct.PyTreeNode):
     good-trajectory buffer always ranks episodes by the environment's own rewards.
 
     Attributes:
-      switch: name of the setting that is true if an algorithm has this model.
+      name: the model's name, MODULE:CLASS.
+      switch: of a model of the package, the setting that is true if an algorithm has
+        it. A class of your own has none.
     """
 
+    name: ClassVar[str]
     switch: ClassVar[str]
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Name the class."""
+        super().__init_subclass__(**options)
+        cls.name = f"{cls.__module__}:{cls.__qualname__}"
 
     @property
     def keeps_next_observation(self) -> bool:

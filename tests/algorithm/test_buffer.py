@@ -1,6 +1,7 @@
 """The buffer against a plain Python list that does the same."""
 
 import functools
+import types
 
 import jax
 import jax.numpy as jnp
@@ -35,13 +36,17 @@ class ListBuffer:
 
 @functools.partial(jax.jit, static_argnames="max_episodes")
 def push(buffer, history, observation, ended, return_, length, max_episodes=None):
-    action = -observation
-    history = good_trajectories.record(
-        history, observation, action, reward=jnp.zeros_like(return_), ended=ended
+    batch = types.SimpleNamespace(
+        observation=observation,
+        action=-observation,
+        reward=jnp.zeros_like(return_),
+        ended=ended,
+        faulty=False,
+        cut_short=False,
     )
-    episodes = good_trajectories.ended_episodes(history, ended, return_, length=length)
+    history = good_trajectories.record(history, batch)
     buffer = good_trajectories.insert(
-        buffer, history, episodes, max_episodes=max_episodes
+        buffer, history, ended, return_, length=length, max_episodes=max_episodes
     )
     return buffer, history
 
@@ -124,22 +129,6 @@ def batch_of(*rows):
     return [[row, (False, 0.0)] for row in rows]
 
 
-def test_an_episode_that_spans_batches_enters_whole():
-    going, end = (False, 0.0), (True, 3.0)
-    buffer, _ = replay([batch_of(going, going, going), batch_of(end, going, going)])
-    np.testing.assert_array_equal(buffer.observation[:4, 0], [1, 3, 5, 7])
-
-
-def test_the_last_admitted_episode_is_cut_and_ties_go_to_the_older():
-    going, end = (False, 0.0), (True, 1.0)
-    buffer, reference = replay([batch_of(going, going, end)] * 3)
-    assert int(buffer.size) == CAPACITY
-    np.testing.assert_array_equal(buffer.time, [0, 1, 2, 0, 1, 2, 0])
-    np.testing.assert_array_equal(
-        buffer.observation[:, 0], [s[3] for s in reference.steps]
-    )
-
-
 def test_an_empty_buffer_samples_zeros_and_never_nan():
     buffer, _ = empty()
     observation, action = good_trajectories.sample(jax.random.key(0), buffer, 5)
@@ -155,53 +144,16 @@ def test_samples_come_uniformly_from_the_filled_part():
     assert np.all(np.abs(counts - 1000) < 150)
 
 
-def test_samples_by_return_prefer_the_best_episodes():
-    going = (False, 0.0)
-    rows = [[(True, 3.0), (True, 1.0)], [going, (True, 2.0)], [(True, 3.0), going]]
-    buffer, _ = replay([rows])
-    size = int(buffer.size)
-    return_ = np.asarray(buffer.return_)[:size]
-    expected = np.exp((return_ - return_.max()) / return_.std())
-    weights = good_trajectories.return_weights(buffer)
-    np.testing.assert_allclose(weights[:size], expected, rtol=1e-5)
-    assert np.all(weights[size:] == 0)
-    drawn, _ = good_trajectories.sample(jax.random.key(0), buffer, 6000, by_return=True)
-    for observation, weight in zip(buffer.observation[:size], expected, strict=True):
-        share = np.mean(np.asarray(drawn) == np.asarray(observation))
-        assert abs(share - weight / expected.sum()) < 0.03
-
-
-def test_vmapped_insertion_equals_one_by_one():
-    rng = np.random.default_rng(0)
-    members = 3
-    observation = rng.normal(size=(members, NUM_STEPS, NUM_ENVS, 1)).astype(np.float32)
-    ended = rng.random((members, NUM_STEPS, NUM_ENVS)) < 0.6
-    return_ = rng.normal(size=ended.shape).astype(np.float32)
-    length = np.ones(ended.shape, np.int32)
-    buffer, history = empty()
-    repeat = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * members), tree)
-    batched, _ = jax.vmap(push)(
-        repeat(buffer), repeat(history), observation, ended, return_, length
-    )
-    for i in range(members):
-        alone, _ = push(
-            buffer, history, observation[i], ended[i], return_[i], length[i]
-        )
-        jax.tree.map(
-            lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), batched, alone
-        )
-
-
 def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
     zeros = jnp.zeros((2, 1))
-    record = lambda history, observation: good_trajectories.record(
-        history,
-        observation,
-        zeros[..., None],
-        reward=zeros,
-        ended=zeros > 0,
-        next_observation=observation + 1,
+    steps = types.SimpleNamespace(
+        action=zeros[..., None], reward=zeros, ended=zeros > 0, faulty=0, cut_short=0
     )
+
+    def record(history, observation):
+        steps.observation, steps.next_observation = observation, observation + 1
+        return good_trajectories.record(history, steps)
+
     history = good_trajectories.init_history(
         1, 2, 2, observation_size=1, action_size=1, keep_next=True
     )

@@ -1,5 +1,7 @@
 """PPO+SIL's replay and loss against plain Python."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,7 +21,15 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
 
     @jax.jit
     def add(replay, history, observation, reward, ended):
-        history = record(history, observation, -observation, reward=reward, ended=ended)
+        batch = types.SimpleNamespace(
+            observation=observation,
+            action=-observation,
+            reward=reward,
+            ended=ended,
+            faulty=False,
+            cut_short=False,
+        )
+        history = record(history, batch)
         replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
         return replay, history
 

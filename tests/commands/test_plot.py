@@ -17,6 +17,19 @@ def texts(legend):
     return [text.get_text().strip() for text in legend.get_texts()]
 
 
+@pytest.fixture
+def figures(monkeypatch):
+    """The figures that are saved in a test; their files are empty."""
+    kept = []
+
+    def keep(figure, path, **_):
+        kept.append(figure)
+        path.touch()
+
+    monkeypatch.setattr(Figure, "savefig", keep)
+    return kept
+
+
 def test_runs_and_points_of_sweeps_are_drawn(trained, swept, tmp_path, capsys):
     out = tmp_path / "new" / "figure.png"
     assert plot.main([str(trained.folder), "--out", str(out)]) == 0
@@ -33,15 +46,8 @@ def test_runs_and_points_of_sweeps_are_drawn(trained, swept, tmp_path, capsys):
 
 
 def test_two_runs_of_one_agent_are_told_apart_by_their_folders(
-    trained, swept, tmp_path, capsys, monkeypatch
+    trained, swept, tmp_path, capsys, figures
 ):
-    figures = []
-
-    def kept(figure, path, **_):
-        figures.append(figure)
-        path.touch()
-
-    monkeypatch.setattr(Figure, "savefig", kept)
     folders = [str(trained.folder), str(swept.folder)]
     arguments = [*folders, "--point", "0", "--out"]
     assert plot.main([*arguments, str(tmp_path / "1.png")]) == 0
@@ -87,9 +93,54 @@ def test_a_table_that_is_being_written_is_read_up_to_its_last_whole_row(
     np.testing.assert_allclose(plot.read(out).final, final)
 
 
+def test_other_metrics_and_x_axes_are_drawn(trained, figures, tmp_path):
+    drawn = ["--metric", "entropy", "--x", "iteration", "--smooth", "2"]
+    out = ["--out", str(tmp_path / "x.png")]
+    assert plot.main([str(trained.folder), *drawn, *out]) == 0
+    axes = figures[-1].axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("iteration", "entropy")
+    np.testing.assert_array_equal(axes.get_lines()[0].get_xdata(), [1, 2, 3, 4])
+    assert plot.read(trained.folder, x="episodes").env_steps[-1] > 0
+
+
+def test_files_of_other_libraries_are_curves(trained, figures, tmp_path, capsys):
+    """Stable-Baselines3's monitor, with a comment, and CleanRL's with empty cells."""
+    monitors = tmp_path / "monitors"
+    monitors.mkdir()
+    for seed in range(2):
+        rows = "".join(f"{seed + i},10,{i}.5\n" for i in range(20))
+        (monitors / f"{seed}.csv").write_text(f"#{{}}\nr,l,t\n{rows}")
+    read = plot.read_csv(monitors, None, ("sum:l", "r"))
+    assert read.returns.shape == (2, 20) and read.env_steps[-1] == 200
+    np.testing.assert_allclose(read.final, [18.5, 19.5])
+    clean = tmp_path / "clean.csv"
+    clean.write_text("global_step,charts/episodic_return\n100,\n200,3.0\n300,4.0\n")
+    columns = ["--columns", "global_step", "charts/episodic_return"]
+    out = ["--out", str(tmp_path / "x.png")]
+    assert plot.main([str(trained.folder), str(clean), *columns, *out]) == 0
+    # It stands beside the run.
+    assert len(figures[-1].axes) == 3
+    assert "clean" in texts(figures[-1].axes[0].get_legend())
+    (tmp_path / "damaged.csv").write_text("global_step,charts/episodic_return\n1,x\n")
+    for path, more, message in (
+        (clean, [], "columns has 0 names: "),
+        (clean, ["--columns", "global_step", "return"], "columns 'return' is unknown"),
+        (tmp_path / "damaged.csv", columns, "damaged: could not convert"),
+        (tmp_path / "none.csv", columns, "must be a run or a CSV file"),
+    ):
+        assert plot.main([str(path), *more, "--out", str(tmp_path / "y.png")]) == 2
+        assert message in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (
+            "RUN --metric entropie",
+            "metric 'entropie' is unknown: did you mean 'entropy'",
+        ),
+        ("RUN --smooth 0", "smooth is 0: it must be 1 or more"),
+        ("RUN --x steps", "x 'steps' is unknown"),
         ("", "runs is empty: name one folder or more"),
         ("RUN --out x.txt", "must end in .png, .pdf, .svg"),
         ("RUN --out RUN/learning_curve.png", "which exists: name a new file"),

@@ -18,6 +18,7 @@ from gasil_envs.physics import (
     batching,
     constraints,
     dynamics,
+    host_threads,
     native,
     newton,
     newton_kernel,
@@ -70,14 +71,14 @@ def test_only_our_physics_gets_the_option_that_keeps_loops(monkeypatch, name, ex
 
 
 def test_host_calls_that_would_deadlock_are_refused(monkeypatch):
-    monkeypatch.setattr(native, "_NEEDS_THREADS", True)
+    monkeypatch.setattr(host_threads, "_NEEDS_THREADS", True)
     monkeypatch.setattr(jax, "local_device_count", lambda: 2)
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setenv("PJRT_NPROC", "2")
     with pytest.raises(RuntimeError, match="set PJRT_NPROC=4 before JAX starts"):
-        native._check_threads()
+        host_threads.check()
     monkeypatch.setenv("PJRT_NPROC", "3")
-    native._check_threads()
+    host_threads.check()
 
 
 def problems(batch, size, groups, seed=0, *, pulling=False):

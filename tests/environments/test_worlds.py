@@ -234,3 +234,19 @@ def test_control_tasks_are_built_and_robots_that_are_downloaded_refused():
     assert (env.observation_size, env.action_size, env.episode_length) == (5, 1, 1000)
     with pytest.raises(ValueError, match="downloads a robot's model"):
         gasil_envs.make("playground:Go1Getup")
+
+
+@pytest.mark.parametrize(
+    "name", ["gymnax:Breakout-MinAtar", "navix:Navix-DoorKey-5x5-v0"]
+)
+def test_worlds_are_drawn(name):
+    """MinAtar's planes have a color each; navix draws its grid itself."""
+    if name.startswith("navix"):
+        pytest.importorskip("navix")
+    env = gasil_envs.make(name)
+    state = jax.jit(env.reset)(jax.random.key(0))
+    drawn = pictures.painter(env, (80, 60)).draw([jax.device_get(state.pipeline_state)])
+    assert (
+        drawn.shape == (60, 80, 3) and len(np.unique(drawn.reshape(-1, 3), axis=0)) > 2
+    )
+    assert not pictures.can_draw(gasil_envs.make("gymnax:CartPole-v1"))

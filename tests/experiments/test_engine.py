@@ -15,7 +15,7 @@ import pytest
 
 import gasil_jax
 from experiments import __main__, engine
-from experiments.curves import Curve, Figure
+from experiments.curves import Curve, Figure, difference
 from experiments.engine import Setup
 from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store, read
@@ -273,6 +273,31 @@ def test_the_small_version_has_few_seeds_and_steps(tmp_path):
         assert (curve.seeds, curve.total_steps) == (3, 100_000)
         assert len(curve.runs(Store(tmp_path))) == 3  # whatever is searched
     assert list(__main__._small(FIGURES["matrix"], ()).panels) == ["hopper-delayed"]
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
+    """As if all of its runs were trained already."""
+    results = tmp_path / "quick" / "results"
+    store, made = Store(results / "runs"), {"physics": "jax", "versions": None}
+    record = Record(*[np.arange(1.0, 11.0)] * 3, made | {"commit": "", "device": ""})
+    runs = __main__._small(FIGURES[name], ()).requested(store)
+    store.add(dict.fromkeys(runs, record))
+    assert __main__.main([name, "--quick", "--runs", str(tmp_path)]) == 0
+    assert "![" in (results / f"{name}.md").read_text()
+
+
+def test_a_small_version_is_trained(toy, tmp_path, monkeypatch, capsys):
+    panels = {"a": toy.panels["a"], "b": toy.panels["a"]}
+    both = (*difference("a", "x", "y"), *difference("b", "y", "x"))
+    compared = {("a", "x", "y"): both[:2], ("b", "x", "y", "a"): both}
+    figure = dataclasses.replace(toy, panels=panels, comparisons=compared)
+    monkeypatch.setitem(FIGURES, "matrix", figure)
+    monkeypatch.setattr(__main__, "_QUICK_STEPS", 512)
+    arguments = ["--runs", str(tmp_path), "--evaluate-episodes", "0", "--devices", "1"]
+    assert __main__.main(["matrix", "--quick", *arguments]) == 0
+    page = (tmp_path / "quick" / "results" / "matrix.md").read_text()
+    assert "![" in page and len(list((tmp_path / "quick/results").glob("*.png")))
 
 
 def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):

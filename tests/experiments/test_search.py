@@ -5,9 +5,7 @@ import collections
 import numpy as np
 import pytest
 
-from experiments import search, tables
-from experiments.figure_results import Results
-from experiments.figures import FIGURES
+from experiments import search
 from experiments.search import (
     AGENTS,
     CELLS,
@@ -115,21 +113,6 @@ def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
     assert mixed.chosen(store) == {**chosen["ppo+bc"], **chosen["ppo"]}
     assert mixed.chosen(store) != chosen["ppo+bc"]
     assert "behavior_cloning_coefficient" not in chosen["ppo"]
-
-
-def test_which_values_suit_a_task_is_told(tmp_path):
-    store, points = Store(tmp_path), search.draw("ppo")
-    assert search.mean_ranks("gamma", "ant", 20, store=store) == {}
-    fill(store, Search("ant", "ppo", 20), points, [1e4 * x["gamma"] for x in points])
-    # PPO on decomposed rewards has the same points, the other way round.
-    decomposed = Search("ant", "ppo", 20, decompose_rewards=True)
-    fill(store, decomposed, points, [-x["gamma"] for x in points])
-    low, high = search.mean_ranks("gamma", "ant", 20, store=store).values()
-    assert low == pytest.approx(high) == pytest.approx(0.5)
-    assert search.mean_ranks("alpha", "ant", 20, store=store) == {}
-    printed = tables.ranks(Results(FIGURES["matrix"], store), "gamma")
-    row = next(x for x in printed.splitlines() if "| ant" in x)
-    assert row == "| ant-delayed | 0.50 | 0.50 |"
 
 
 def test_the_papers_protocol_has_the_appendix_s_values():

@@ -38,7 +38,8 @@ def test_each_environment_has_titled_panels(figures, tmp_path):
         figure.get_supxlabel()
     )
     hopper, swimmer = figure.axes[:3], figure.axes[3:]
-    assert [axes[0].get_title() for axes in (hopper, swimmer)] == ["hopper", "swimmer"]
+    titles = [axes[0].get_title() for axes in (hopper, swimmer)]
+    assert titles == ["hopper", "swimmer, ppo"]
     assert hopper[0].get_lines()[0].get_xdata().max() == 1.0
     for axes in (hopper[0], hopper[2]):
         labels = [text.get_text() for text in axes.get_legend().get_texts()]
@@ -79,7 +80,9 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     values = dict(zip(("alpha", "imitation_rule"), zip(*points)))
     values["gamma"] = tuple(np.linspace(0.9, 0.99, 9))
     returns = np.arange(9.0)
-    plotting.marginals(tmp_path / "x.png", values, returns, best=8, left_out=2)
+    plotting.marginals(
+        tmp_path / "x.png", values, returns, title="t", best=8, left_out=2
+    )
     (figure,) = figures
     alpha, rule, gamma = figure.axes
     assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
@@ -98,46 +101,50 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     assert "neighbouring values" in caption
 
 
-def test_values_that_begin_at_zero_have_a_scale(figures, tmp_path):
-    values = {"alpha": (0.0, 0.02, 1.0)}
-    plotting.marginals(
-        tmp_path / "x.png", values, np.arange(3.0), best=None, left_out=0
-    )
-    (axes,) = figures[0].axes
-    assert axes.get_xscale() == "symlog"
-    assert figures[0].get_supxlabel() == (
-        "point: mean over its seeds; mean: over the points of each\nvalue"
-    )
-
-
 def labels_of(points):
     return results._labels(mock.Mock(sweep=mock.Mock(points=points)))
 
 
-def test_a_sweeps_labels_are_what_varies(figures, tmp_path):
-    points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0)]
-    names, returns = labels_of(points), np.array([[1.0, 2.0], [3.0, 4.0]])
-    plotting.final_returns(tmp_path / "x.png", names, returns, best=1)
-    labels = figures[0].axes[0].get_yticklabels()
-    assert [label.get_text() for label in labels] == ["0: alpha=0.1", "1: alpha=1"]
-    assert [label.get_weight() for label in labels] == ["normal", "bold"]
+def of_points(returns):
+    """Made-up curves that end with returns (points, seeds)."""
+    curves = np.repeat(returns[:, :, None], 4, axis=2)
+    steps = np.tile([1e3, 2e3, 3e3, 4e3], (len(returns), 1))
+    return {"title": "hopper, ppo", "env_steps": steps, "curves": curves}
 
 
-def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
-    point = {"learning_rate": 3e-5, "discriminator_updates": 10, "alpha": 0.1}
-    point |= {"discriminator_learning_rate": 2e-5, "buffer_steps": 10_000}
-    points = [point, {name: 2 * value for name, value in point.items()}]
+def test_a_sweep_is_sorted_and_the_best_points_have_curves(figures, tmp_path):
+    points = [{"alpha": x, "gamma": 0.9} for x in (0.1, 1.0, 2.0)]
+    returns = np.array([[1.0, 2.0], [3.0, 4.0], [np.nan, 9.0]])
     plotting.final_returns(
-        tmp_path / "x.png", labels_of(points), np.ones((2, 5)), best=1
+        tmp_path / "x.png", labels_of(points), returns, **of_points(returns)
     )
     (figure,) = figures
-    figure.draw_without_rendering()
-    (axes,) = figure.axes
-    assert axes.get_position().width > 0.5
-    low, high = [label.get_window_extent() for label in axes.get_yticklabels()]
-    assert not low.overlaps(high) and min(low.x0, high.x0) >= 0.0
-    text = axes.get_yticklabels()[0].get_text()
-    assert text.replace("\n", " ") == f"0: {labels_of(points)[0]}"
+    rows, curves = figure.axes
+    labels = rows.get_yticklabels()
+    names = ["1: alpha=1", "0: alpha=0.1", "2: alpha=2"]
+    assert [label.get_text() for label in labels] == names
+    assert [label.get_weight() for label in labels] == ["bold", "normal", "normal"]
+    assert [x.get_ydata()[-1] for x in curves.get_lines()] == [3.5, 1.5]
+    assert [x.get_label() for x in curves.get_lines()] == ["1", "0"]
+    assert curves.get_xlabel() == "steps" and figure.get_suptitle() == "hopper, ppo"
+
+
+def test_a_short_run_is_drawn_in_thousands_and_ticks_have_no_offset(figures, tmp_path):
+    steps = np.arange(1, 11) * 4000.0
+    returns = 500.0 + np.linspace(0, 0.01, 10) * np.ones((2, 1))
+    plotting.learning_curve(tmp_path / "x.png", steps, returns, title="hopper, ppo")
+    (axes,) = figures[0].axes
+    assert axes.get_xlabel() == "thousand steps of a seed"
+    assert axes.get_lines()[0].get_xdata()[-1] == 40.0
+    figures[0].draw_without_rendering()
+    assert axes.yaxis.get_offset_text().get_text() == ""
+    assert axes.get_title() == "hopper, ppo"
+
+
+def test_a_moving_mean_is_of_the_points_before():
+    smoothed = plotting.smoothed(np.array([[1.0, 3.0, 5.0, 7.0]]), 2)
+    np.testing.assert_allclose(smoothed, [[1.0, 2.0, 4.0, 6.0]])
+    np.testing.assert_allclose(plotting.smoothed(smoothed, 1), smoothed)
 
 
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
@@ -145,17 +152,6 @@ def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
     monkeypatch.setattr(matplotlib.figure.Figure, "savefig", pixels)
     names = [f"alpha={i}" for i in range(1300)]
-    plotting.final_returns(tmp_path / "x.png", names, np.zeros((1300, 1)), best=None)
+    returns = np.zeros((1300, 1))
+    plotting.final_returns(tmp_path / "x.png", names, returns, **of_points(returns))
     assert kept[0] < 2**16
-
-
-def test_names_at_the_ends_of_lines_are_apart_and_in_order():
-    axes = matplotlib.figure.Figure().subplots()
-    axes.set_ylim(0.0, 10.0)
-    ends = {"a": 9.0, "b": 5.0, "c": 5.0, "d": 4.9, "e": 0.0, "f": 0.0}
-    plotting.label_ends(axes, ends, dict.fromkeys(ends, "black"))
-    places = [text.xy[1] for text in axes.texts]
-    assert [text.get_text() for text in axes.texts] == [*ends]
-    assert (-np.diff(places) > 0.0599).all()
-    # Where there is room a name is at the end of its line.
-    assert places[0] == 0.9 and places[1] == 0.5 and min(places) == 0.0

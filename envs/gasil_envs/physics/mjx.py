@@ -1,15 +1,17 @@
 """MJX as MuJoCo ships it, as an engine of `interface.Physics`."""
 
+import contextlib
 import copy
+import io
 import logging
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from mujoco import mjx
 
 from gasil_envs.physics import candidates, collision, constraints, tree
 from gasil_envs.physics.interface import Fields, PhysicsState
@@ -94,6 +96,14 @@ def differences(model: mujoco.MjModel) -> list[str]:
     return named + tree.rounding(model)
 
 
+def _mjx() -> Any:
+    """Return the package; its import takes seconds, and few runs need it."""
+    # It prints at its first import that its optional Warp backend is absent.
+    with contextlib.redirect_stdout(io.StringIO()):
+        from mujoco import mjx
+    return mjx
+
+
 class Unsupported(ValueError):
     """MJX does not take a model, because of `part`."""
 
@@ -144,6 +154,7 @@ class MjxPhysics:
         # Sensors move nothing, and MJX refuses many though they are disabled.
         without.opt.disableflags |= _DISABLE.mjDSBL_SENSOR
         without.sensor_type[:] = mujoco.mjtSensor.mjSENS_CLOCK
+        mjx = _mjx()
         try:
             self._model = mjx.put_model(without)
             self._blank_data = mjx.make_data(without)
@@ -163,12 +174,12 @@ class MjxPhysics:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
-    def _data(self, state: PhysicsState) -> mjx.Data:
+    def _data(self, state: PhysicsState) -> Any:
         return self._blank_data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
         )
 
-    def _pick(self, data: mjx.Data) -> Fields:
+    def _pick(self, data: Any) -> Fields:
         return {
             name: getattr(data._impl if name in _OF_IMPLEMENTATION else data, name)
             for name in self._fields
@@ -179,6 +190,7 @@ class MjxPhysics:
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""
+        mjx = _mjx()
         data = mjx.kinematics(self._model, self._data(state))
         data = mjx.com_pos(self._model, data)
         return self._pick(mjx.com_vel(self._model, data))
@@ -195,7 +207,7 @@ class MjxPhysics:
     def _step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        data = self._data(state).replace(ctrl=control)
+        mjx, data = _mjx(), self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
             lambda data, _: (mjx.step(self._model, data), None),
             data,

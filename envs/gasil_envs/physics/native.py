@@ -9,7 +9,6 @@ error or a warning in a simulation, its result is NaN, which ends its episode.
 import collections
 import concurrent.futures
 import itertools
-import os
 from collections.abc import Sequence
 from functools import partial
 from typing import Any, Protocol
@@ -20,40 +19,11 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from gasil_envs.physics import dynamics
+from gasil_envs.physics import dynamics, host_threads
 from gasil_envs.physics.batching import batch_last
 from gasil_envs.physics.interface import Fields, PhysicsState
 
 _STATE = ("qpos", "qvel", "qacc_warmstart")
-
-# JAX copies a host call's arguments on the threads that its CPU devices compute with.
-# Before jax 0.12 copies of large arguments wait for ever if all threads are in calls.
-_POOL_SIZE = "PJRT_NPROC"
-_NEEDS_THREADS = tuple(map(int, jax.__version__.split(".")[:2])) < (0, 12)
-
-
-def available_cores() -> int:
-    """Return the number of cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def reserve_threads(num_devices: int) -> None:
-    """Let `num_devices` CPU devices make host calls at once; call before JAX starts."""
-    if _NEEDS_THREADS and num_devices > 1:
-        os.environ.setdefault(_POOL_SIZE, str(2 * num_devices))
-
-
-def _check_threads() -> None:
-    devices = jax.local_device_count()
-    threads = int(os.environ.get(_POOL_SIZE, available_cores()))
-    on_cpu = jax.default_backend() == "cpu"
-    if _NEEDS_THREADS and on_cpu and devices > 1 and threads <= devices:
-        raise RuntimeError(
-            f"physics 'mujoco' on {devices} CPU devices would deadlock in jax "
-            f"{jax.__version__}: set {_POOL_SIZE}={2 * devices} before JAX starts"
-        )
 
 
 class _Simulations(Protocol):
@@ -202,8 +172,9 @@ class MujocoPhysics:
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
         """Advance `frame_skip` time steps under one control (nu,)."""
-        _check_threads()
-        threads = self._threads or max(1, available_cores() // jax.local_device_count())
+        host_threads.check()
+        cores = host_threads.available_cores()
+        threads = self._threads or max(1, cores // jax.local_device_count())
 
         def on_host(*arrays: Any) -> dict[str, np.ndarray]:
             return self._advance([np.asarray(x) for x in arrays], frame_skip, threads)
