@@ -111,7 +111,10 @@ def test_a_task_s_own_functions_make_its_episodes():
     ("parts", "what"),
     [
         ({"world": '<geom type="box" size="1 1 1"/>'}, "contacts of capsule and box"),
-        ({"top": '<option integrator="implicitfast"/>'}, "neither Euler nor RK4"),
+        (
+            {"top": '<option integrator="implicitfast" density="1"/>'},
+            "a medium or a free body without others, with implicitfast",
+        ),
         ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),
     ],
 )

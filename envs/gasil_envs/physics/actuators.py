@@ -113,6 +113,15 @@ def forces(
     actuators: Actuators, control: jax.Array, qpos: jax.Array, qvel: jax.Array
 ) -> jax.Array:
     """Return generalized forces (V, B) of controls (nu, B)."""
+    force = _own_forces(actuators, control, qpos, qvel=qvel)
+    of_qvel = actuators.transmission.of_qvel
+    return jnp.clip(constant_times(of_qvel.T, force), *actuators.joint_range)
+
+
+def _own_forces(
+    actuators: Actuators, control: jax.Array, qpos: jax.Array, *, qvel: jax.Array
+) -> jax.Array:
+    """Return the force of each actuator, (nu, B)."""
     of_qpos, of_qvel = actuators.transmission
     length, velocity = constant_times(of_qpos, qpos), constant_times(of_qvel, qvel)
 
@@ -121,5 +130,22 @@ def forces(
         return constant + of_length * length + of_velocity * velocity
 
     force = affine(actuators.gain) * control + affine(actuators.bias)
-    force = jnp.clip(force, *actuators.force_range)
-    return jnp.clip(constant_times(of_qvel.T, force), *actuators.joint_range)
+    return jnp.clip(force, *actuators.force_range)
+
+
+def damping(
+    actuators: Actuators, control: jax.Array, qpos: jax.Array, *, qvel: jax.Array
+) -> jax.Array:
+    """Return minus the derivative of the forces by qvel, (V, V, B).
+
+    As in C MuJoCo it counts an actuator's own range of force, but not a joint's.
+    """
+    force = _own_forces(actuators, control, qpos, qvel=qvel)
+    low, high = actuators.force_range
+    gain, bias = (x[:, 2:].astype(np.float32) for x in (actuators.gain, actuators.bias))
+    rate = jnp.where((low < force) & (force < high), gain * control + bias, 0.0)
+    of_qvel = actuators.transmission.of_qvel
+    squares = of_qvel[:, :, None] * of_qvel[:, None]
+    size = len(qvel)
+    result = constant_times(squares.reshape(-1, size**2).T, -rate)
+    return result.reshape(size, size, -1)

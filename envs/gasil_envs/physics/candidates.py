@@ -57,7 +57,12 @@ def candidates(model: mujoco.MjModel) -> Candidates:
 def _pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
     """Yield the geoms of each pair, and its number in <pair> or -1."""
     seen = set()
+    # Neither of two bodies moves, if they are parts of the world or held by mocap.
+    is_held = model.body_treeid < 0
     for i in range(model.npair):
+        bodies = model.geom_bodyid[[model.pair_geom1[i], model.pair_geom2[i]]]
+        if is_held[bodies].all():
+            continue
         pair = _in_order(model, int(model.pair_geom1[i]), int(model.pair_geom2[i]))
         seen.add(pair)
         yield (*pair, i)
@@ -73,7 +78,7 @@ def _pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
     ]
     for a, b in itertools.combinations(range(model.nbody), 2):
         weld_a, weld_b = model.body_weldid[[a, b]]
-        if weld_a == weld_b or (a << 16) + b in excluded:
+        if weld_a == weld_b or (a << 16) + b in excluded or is_held[[a, b]].all():
             continue
         is_parent = weld_a == parent[b] or weld_b == parent[a]
         if is_parent and weld_a and weld_b and not parents_collide:

@@ -55,6 +55,11 @@ _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
 
 _FLAGS = mujoco.mjtDisableBit
+_EULER, _RK4, _IMPLICITFAST = (
+    mujoco.mjtIntegrator.mjINT_EULER,
+    mujoco.mjtIntegrator.mjINT_RK4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+)
 
 
 def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
@@ -85,9 +90,12 @@ def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
 def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
     """Return why `make` does not support this model and fields; None if it does."""
     model = _enabled(model)
-    integrators = (mujoco.mjtIntegrator.mjINT_EULER, mujoco.mjtIntegrator.mjINT_RK4)
-    if model.opt.integrator not in integrators:
-        return "its integrator is neither Euler nor RK4"
+    if model.opt.integrator not in (_EULER, _RK4, _IMPLICITFAST):
+        return "its integrator is neither Euler, RK4 nor implicitfast"
+    medium = model.opt.density > 0 or model.opt.viscosity > 0
+    if model.opt.integrator == _IMPLICITFAST:
+        if medium or tree.has_lone_bodies(model):
+            return "it has a medium or a free body without others, with implicitfast"
     of_one_tree = [x for x in fields if x in _OF_ONE_TREE]
     fixed = (model.body_weldid == 0) & (model.body_mass > 0)
     if (
@@ -264,8 +272,8 @@ def step(
         motor = (own.transmission.of_qvel.T * own.gain[:, 0]).astype(np.float32)
         moved = total(jnp.asarray(motor)[..., None] * control, 1)
         actuation = moved if dynamics.model.nu else jnp.zeros_like(state.qvel)
-    is_euler = dynamics.model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER
-    integrate = _euler if is_euler else _runge_kutta
+    is_rk4 = dynamics.model.opt.integrator == _RK4
+    integrate = _runge_kutta if is_rk4 else _euler
     one = functools.partial(integrate, dynamics, actuation)
     carry = (state, kinematics(dynamics.model, dynamics.fields, state))
     return jax.lax.scan(lambda x, _: (one(*x), None), carry, length=frame_skip)[0]
@@ -316,13 +324,25 @@ def _rotate(quaternion: jax.Array, velocity: jax.Array, dt: float) -> jax.Array:
 def _euler(
     dynamics: Dynamics, actuation: jax.Array, state: PhysicsState, fields: Fields
 ) -> tuple[PhysicsState, Fields]:
-    """Semi-implicit Euler, with the joints' damping taken implicitly."""
-    model = dynamics.model
+    """Semi-implicit Euler, with damping taken implicitly.
+
+    That is the joints' damping, and with implicitfast also that of tendons and servos.
+    """
+    model, own = dynamics.model, dynamics.actuators
     dt = model.opt.timestep
     now = forward(dynamics, state, actuation)
     qacc = now.qacc
-    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP:
-        damping = np.diag(dt * model.dof_damping).astype(np.float32)[..., None]
+    implicitfast = model.opt.integrator == _IMPLICITFAST
+    if implicitfast or not model.opt.disableflags & _FLAGS.mjDSBL_EULERDAMP:
+        constant = np.diag(model.dof_damping)
+        if implicitfast:
+            of_qvel = dynamics.tendons.of_qvel
+            constant = constant + of_qvel.T @ (model.tendon_damping[:, None] * of_qvel)
+        damping: Any = (dt * constant).astype(np.float32)[..., None]
+        if implicitfast and not own.are_motors:
+            damping = damping + dt * actuators.damping(
+                own, actuation, state.qpos, qvel=state.qvel
+            )
         qacc = solver.eliminate(now.inertia + damping, now.force)
     qvel = state.qvel + dt * qacc
     qpos = _integrate_positions(model, state.qpos, qvel)

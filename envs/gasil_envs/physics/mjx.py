@@ -65,9 +65,6 @@ def differences(model: mujoco.MjModel) -> list[str]:
     kinds = model.geom_type[geoms].reshape(-1, 2)
     on_plane = kinds[:, 0] == mujoco.mjtGeom.mjGEOM_PLANE
     capsule = kinds == mujoco.mjtGeom.mjGEOM_CAPSULE
-    is_free = model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
-    bodies = model.jnt_bodyid[is_free]
-    alone = ~np.isin(bodies, model.body_parentid)
     numerics = [
         mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, name) >= 0
         for name in _MJX_NUMERICS
@@ -91,7 +88,7 @@ def differences(model: mujoco.MjModel) -> list[str]:
         "solimp of width 0": any((x[:, 2] <= mujoco.mjMINVAL).any() for x in solimps),
         "equalities of bodies": (model.eq_type <= int(mujoco.mjtEq.mjEQ_WELD)).any(),
         "turning of free bodies with implicitfast": (
-            model.opt.integrator == implicitfast and alone.any()
+            model.opt.integrator == implicitfast and tree.has_lone_bodies(model)
         ),
         f"contacts that {' or '.join(_MJX_NUMERICS)} leaves out": any(numerics),
     }

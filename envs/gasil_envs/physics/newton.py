@@ -219,6 +219,13 @@ def _derivative(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     return jnp.clip(w * d, -most, most)
 
 
+def _force(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
+    """The force, which is 0 and not -0 of a row that only pushes and does not."""
+    if most is None:
+        return w * jnp.maximum(-d, 0.0)
+    return -_derivative(d, w, most)
+
+
 def _curvature(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     """The second derivative of the cost."""
     return jnp.where(d < 0.0 if most is None else jnp.abs(w * d) < most, w, 0.0)
@@ -321,4 +328,4 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
     qacc, jaref = system.repeat(
         iterate, start, least=2, most=iterations, is_short=False
     )
-    return qacc, each(jnp.negative, of_rows(_derivative, jaref))
+    return qacc, of_rows(_force, jaref)

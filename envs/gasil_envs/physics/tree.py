@@ -60,16 +60,23 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
     if model.jnt_stiffness[model.jnt_type <= BALL].any():
         return "it has free joints or balls with springs"
-    if model.nmocap or model.body_gravcomp.any():
-        return "it has mocap bodies or compensated gravity"
+    if model.jnt_actgravcomp.any():
+        return "it has gravity compensated by actuators"
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
         return "it has wind or the ellipsoid model of fluids"
     flags = mujoco.mjtDisableBit
     passive = flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER
-    medium = model.opt.density > 0 or model.opt.viscosity > 0
-    if model.opt.disableflags & passive == passive and medium:
-        return "its medium is disabled with its springs and dampers"
+    others = model.opt.density > 0 or model.opt.viscosity > 0
+    others = others or model.body_gravcomp.any()
+    if model.opt.disableflags & passive == passive and others:
+        return "its medium or compensation is disabled with its springs and dampers"
     return None
+
+
+def has_lone_bodies(model: mujoco.MjModel) -> bool:
+    """Whether a free body has no other ones attached."""
+    bodies = model.jnt_bodyid[model.jnt_type == FREE]
+    return not np.isin(bodies, model.body_parentid).all()
 
 
 def rounding(model: mujoco.MjModel) -> list[str]:
@@ -78,7 +85,7 @@ def rounding(model: mujoco.MjModel) -> list[str]:
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, inertia)
     own = np.sqrt(np.diag(inertia))
-    away = np.linalg.norm(data.xpos[model.body_weldid > 0], axis=1).max(initial=0.0)
+    away = np.linalg.norm(data.xpos[model.body_treeid >= 0], axis=1).max(initial=0.0)
     found = []
     if away > _FAR:
         found.append(
@@ -236,7 +243,7 @@ def kinematics(
     xipos = stacked([x + rotate(turned, local) for x, turned, local in places])
     mass = model.body_mass.astype(np.float32)[:, None]
     # What does not move is not counted: it may be heavy, and far away.
-    moving = mass * ((model.body_weldid > 0) | with_bases)[:, None]
+    moving = mass * ((model.body_treeid >= 0) | with_bases)[:, None]
 
     def centre(mass: np.ndarray) -> jax.Array:
         return add(m * x for m, x in zip(mass[:, 0], xipos, strict=True)) / mass.sum()
@@ -398,7 +405,11 @@ def smooth(
     before, cvel = materialize((before, cvel))
     change = materialize(_cross_motion(before, cdof) * qvel[:, None])
     gravity = np.concatenate([np.zeros(3), model.opt.gravity]).astype(np.float32)
-    acceleration = _sum_down(model, change)[1] - gravity[:, None]
+    falling = gravity[:, None]
+    if model.body_gravcomp.any():
+        weight = 1 - model.body_gravcomp.astype(np.float32)
+        falling = weight[:, None, None] * falling
+    acceleration = _sum_down(model, change)[1] - falling
     momentum = materialize(_momentum(cinert, cvel))
     of_body = _momentum(cinert, materialize(acceleration))
     of_body = of_body + _cross_force(cvel, momentum)
