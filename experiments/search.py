@@ -324,6 +324,19 @@ class PaperSearch(SingleStage):
         return tuple({**point, **own} for point in points)
 
 
+class SecondStage(PaperSearch):
+    """`PaperSearch`, whose best points by two seeds get ten before one is chosen.
+
+    The ten seeds are other ones than the search's.
+    """
+
+    _final_seeds = range(10)
+
+    def finalists(self, store: Store) -> tuple[Point, ...]:
+        """Return the best points by the search's two seeds."""
+        return Search.finalists(self, store)
+
+
 #: The sparse tasks, and the ways to explore and imitate that are compared on them.
 SPARSE = tuple(
     f"sparse:{name}"

@@ -37,13 +37,7 @@ gc.set_threshold(100_000, 20, 20)
 # with this mark check XLA's numbers or its memory, and are compiled as for users.
 _AS_FOR_USERS = "compiled_as_for_users"
 # Modules with tests that take long by themselves.
-_LONG = {
-    "test_examples",
-    "test_figures",
-    "test_point_mass_figures",
-    "test_readme",
-    "test_sweep",
-}
+_LONG = {"test_examples", "test_figures", "test_ray", "test_readme", "test_sweep"}
 
 
 def pytest_configure(config):
@@ -132,10 +126,7 @@ def pytest_collection_modifyitems(items):
     changes. Long tests come before the others, so that none is left at the end.
     """
     items.sort(
-        key=lambda item: (
-            not _is_optimized(item),
-            item.module.__name__ not in _LONG,
-        )
+        key=lambda item: (not _is_optimized(item), item.module.__name__ not in _LONG)
     )
     for item in items:
         fixtures = item._fixtureinfo.name2fixturedefs.values()
@@ -196,25 +187,3 @@ def untrained_hopper(tmp_path_factory):
 def untrained_point_mass(tmp_path_factory):
     """The folder of a run on the point mass."""
     return _untrained(tmp_path_factory.mktemp("point_mass") / "run", "point_mass")
-
-
-@pytest.fixture(scope="session")
-def trained_point_mass():
-    """The environment, algorithm and states (3,) after a little training."""
-    import jax
-    import numpy as np
-
-    import gasil_jax
-
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    algorithm = gasil_jax.algorithm(
-        "ppo+gasil",
-        total_steps=1024,
-        num_envs=4,
-        batch_steps=512,
-        hidden_sizes=(16, 8),
-        num_epochs=1,
-    )
-    train = gasil_jax.make_train(env, algorithm)
-    keys = jax.vmap(jax.random.key)(np.arange(3))
-    return env, algorithm, jax.jit(jax.vmap(train))(keys)[0]

@@ -1,4 +1,9 @@
-"""A training that takes seconds, as settings and as flags of the command line."""
+"""A training that takes seconds, as settings and as flags, and policies of none."""
+
+import jax
+import numpy as np
+
+import gasil_jax
 
 #: Settings that every agent has.
 SETTINGS = {
@@ -29,3 +34,21 @@ SMALL = (
 )
 #: Two programs of two points each. The first step of points 2 and 3 is beyond float32.
 GRID = ("--grid", "learning_rate=3e-4,1e30", "discriminator_updates=3,1")
+
+
+def drawn_policies(env, algorithm, count, *, whole=False):
+    """States of `count` runs, of which policies and normalizers are drawn, not trained.
+
+    If they are not asked for as a whole, all else are shapes, and nothing is compiled.
+    """
+    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
+    seeds = np.arange(count, dtype=np.uint32)
+    states = jax.jit(init)(seeds) if whole else jax.eval_shape(init, seeds)
+    rng = np.random.default_rng(0)
+    draw = lambda x: (0.5 * rng.normal(size=x.shape)).astype(x.dtype)
+    learner = states.actor_critic.policy
+    learner = learner.replace(params=jax.tree.map(draw, learner.params))
+    return states.replace(
+        actor_critic=states.actor_critic.replace(policy=learner),
+        normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
+    )

@@ -68,11 +68,6 @@ def test_help_imports_nothing_that_only_training_needs():
     assert not set(slow.split()) & set(result.stdout.split())
 
 
-def test_an_algorithm_can_be_made_before_anything_else():
-    make = "import gasil_jax; gasil_jax.algorithm('ppo+gasil').replace(num_envs=8)"
-    subprocess.run([sys.executable, "-c", make], check=True)
-
-
 def test_the_wheel_alone_trains(tmp_path):
     major = int(importlib.metadata.version("setuptools").partition(".")[0])
     if major < 77:

@@ -129,22 +129,6 @@ def batch_of(*rows):
     return [[row, (False, 0.0)] for row in rows]
 
 
-def test_an_episode_that_spans_batches_enters_whole():
-    going, end = (False, 0.0), (True, 3.0)
-    buffer, _ = replay([batch_of(going, going, going), batch_of(end, going, going)])
-    np.testing.assert_array_equal(buffer.observation[:4, 0], [1, 3, 5, 7])
-
-
-def test_the_last_admitted_episode_is_cut_and_ties_go_to_the_older():
-    going, end = (False, 0.0), (True, 1.0)
-    buffer, reference = replay([batch_of(going, going, end)] * 3)
-    assert int(buffer.size) == CAPACITY
-    np.testing.assert_array_equal(buffer.time, [0, 1, 2, 0, 1, 2, 0])
-    np.testing.assert_array_equal(
-        buffer.observation[:, 0], [s[3] for s in reference.steps]
-    )
-
-
 def test_an_empty_buffer_samples_zeros_and_never_nan():
     buffer, _ = empty()
     observation, action = good_trajectories.sample(jax.random.key(0), buffer, 5)
@@ -158,27 +142,6 @@ def test_samples_come_uniformly_from_the_filled_part():
     values, counts = np.unique(np.asarray(observation), return_counts=True)
     np.testing.assert_array_equal(values, [1, 3, 5])
     assert np.all(np.abs(counts - 1000) < 150)
-
-
-def test_vmapped_insertion_equals_one_by_one():
-    rng = np.random.default_rng(0)
-    members = 3
-    observation = rng.normal(size=(members, NUM_STEPS, NUM_ENVS, 1)).astype(np.float32)
-    ended = rng.random((members, NUM_STEPS, NUM_ENVS)) < 0.6
-    return_ = rng.normal(size=ended.shape).astype(np.float32)
-    length = np.ones(ended.shape, np.int32)
-    buffer, history = empty()
-    repeat = lambda tree: jax.tree.map(lambda x: jnp.stack([x] * members), tree)
-    batched, _ = jax.vmap(push)(
-        repeat(buffer), repeat(history), observation, ended, return_, length
-    )
-    for i in range(members):
-        alone, _ = push(
-            buffer, history, observation[i], ended[i], return_[i], length[i]
-        )
-        jax.tree.map(
-            lambda a, b, i=i: np.testing.assert_array_equal(a[i], b), batched, alone
-        )
 
 
 def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():

@@ -43,8 +43,7 @@ def test_nothing_is_imitated_while_the_buffer_is_empty(agent):
     else:
         np.testing.assert_array_equal(rewards, reward)
         assert_equal(after, state.agent)
-    unknown = {
-        "ppo+bc": "behavior_cloning_loss",
-        "ppo+sil": "sil_fraction",
-    }.get(agent, "discriminator_loss")
+    unknown = {"ppo+bc": "behavior_cloning_loss", "ppo+sil": "sil_fraction"}.get(
+        agent, "discriminator_loss"
+    )
     assert np.isnan({**learned, **own}[unknown])

@@ -67,15 +67,16 @@ def test_networks_of_ones_own_are_trained_and_act():
     states, metrics = jax.jit(jax.vmap(train))(keys)
     assert np.isfinite(metrics["value_loss"]).all()
     state = gasil_jax.member(states, 0)
-    for network in (
-        lambda x: x.actor_critic.policy,
-        lambda x: x.actor_critic.values[0],
-        lambda x: x.agent.discriminator,
-    ):
-        params = network(state).params
-        old = network(before).params
-        changed = jax.tree.map(lambda x, y: bool((x != y).any()), params, old)
-        assert all(jax.tree.leaves(changed))
+
+    def networks(state):
+        learned = state.actor_critic
+        learners = learned.policy, learned.values[0], state.agent.discriminator
+        return [learner.params for learner in learners]
+
+    changed = jax.tree.map(
+        lambda x, y: bool((x != y).any()), networks(state), networks(before)
+    )
+    assert all(jax.tree.leaves(changed))
     assert_it_acts(env, state)
 
 
@@ -98,22 +99,10 @@ class WithState(nn.Module):
     ("function", "network", "message"),
     [
         ("policy_network", Head(3), r"returns float32\[2, 3\] for 2 steps.*\[2, 2\]$"),
-        (
-            "value_network",
-            Head(1),
-            r"returns float32\[2, 1\] .* be float32\[2\]$",
-        ),
-        (
-            "value_network",
-            WithState(),
-            "has batch_stats, params: it must have par",
-        ),
+        ("value_network", Head(1), r"returns float32\[2, 1\] .* be float32\[2\]$"),
+        ("value_network", WithState(), "has batch_stats, params: it must have par"),
         ("value_network", 3, "fails: AttributeError: 'int' object has no"),
-        (
-            "discriminator_network",
-            Head(2),
-            r"float32\[2, 2\] for 2 steps: it must",
-        ),
+        ("discriminator_network", Head(2), r"float32\[2, 2\] for 2 steps: it must"),
         ("discriminator_network", WithState(), "fails: TypeError"),
     ],
 )

@@ -17,13 +17,6 @@ def test_the_order_is_that_of_jax(size):
         assert ours.dtype == jnp.int32
 
 
-def test_many_at_once_have_the_order_of_each_alone():
-    keys = jax.random.split(jax.random.key(0), 4)
-    together = jax.vmap(lambda key: permutation(key, 500))(keys)
-    for key, order in zip(keys, together, strict=True):
-        np.testing.assert_array_equal(order, jax.random.permutation(key, 500))
-
-
 @pytest.mark.parametrize("highest", [1, 3, 2**10, 2**22, 2**32])
 def test_argsort_is_stable(highest):
     keys = np.random.default_rng(0).integers(0, highest, 1000, dtype=np.uint32)

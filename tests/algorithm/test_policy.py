@@ -7,19 +7,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from small_training import drawn_policies
 
 import gasil_jax
-from gasil_jax import normalization, npz, numpy_policy, policy
+from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.host import policy_file
 from gasil_jax.networks import GaussianPolicy
 
-# With the other tests that use it, so that it is trained once.
-pytestmark = pytest.mark.xdist_group("trained_point_mass")
 
-
-@pytest.fixture
-def saved(trained_point_mass, tmp_path_factory):
-    env, algorithm, states = trained_point_mass
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    env = gasil_jax.make_env("point_mass", reward_delay=7)
+    algorithm = gasil_jax.algorithm("ppo", hidden_sizes=(16, 8))
+    states = drawn_policies(env, algorithm, 3)
     folder = tmp_path_factory.mktemp("run")
     policy_file.save(
         folder / "policy.npz", states, env, [5, 6, 7], np.array([1, 3, np.nan])
@@ -33,19 +33,22 @@ def test_it_is_the_networks_gaussian(saved, seed):
     network = GaussianPolicy(algorithm.config.hidden_sizes, env.action_size)
 
     @jax.jit
-    def expected(state, key):
+    def expected(params, normalizer, key):
         observation = jax.random.normal(key, (9, env.observation_size))
         # The last one is far beyond the clip.
         observation = (3.0 * observation).at[-1].multiply(1e3)
-        normalized = normalization.normalize(state.normalizer, observation)
-        mean, log_std = network.apply(state.actor_critic.policy.params, normalized)
+        normalized = normalization.normalize(normalizer, observation)
+        mean, log_std = network.apply(params, normalized)
         noise = jnp.exp(log_std)[None] * jax.random.normal(key, mean.shape)
         means, draws = (jnp.clip(x, -1.0, 1.0) for x in (mean, mean + noise))
         return observation, normalized, means, draws
 
-    state = gasil_jax.member(states, 1 if seed is None else seed - 5)
+    index = 1 if seed is None else seed - 5
+    params, normalizer = jax.tree.map(
+        lambda x: x[index], (states.actor_critic.policy.params, states.normalizer)
+    )
     key = jax.random.key(3)
-    observation, normalized, means, draws = expected(state, key)
+    observation, normalized, means, draws = expected(params, normalizer, key)
     assert np.abs(normalized).max() == numpy_policy.CLIP
     act = gasil_jax.load_policy(folder, seed)
     np.testing.assert_allclose(act(observation), means, atol=1e-5)
@@ -81,25 +84,11 @@ def test_it_needs_no_jax(saved):
     assert result.stdout.strip() == "(2,)", result.stderr
 
 
-def test_bad_files_and_seeds_are_refused(saved, tmp_path):
-    _, _, _, folder = saved
+def test_a_seed_or_an_observation_of_another_size_is_refused(saved, tmp_path):
     with pytest.raises(ValueError, match=r"seed is 9: .* has a policy of 5, 6, 7"):
-        gasil_jax.load_policy(folder, 9)
+        gasil_jax.load_policy(saved[-1], 9)
     with pytest.raises(ValueError, match="does not exist: it must be a finished run"):
         gasil_jax.load_policy(tmp_path)
-    whole = (folder / "policy.npz").read_bytes()
-    for content in (b"", whole[: len(whole) // 2], b"\x80\x04N."):
-        (tmp_path / "policy.npz").write_bytes(content)
-        with pytest.raises(ValueError, match="is not a saved policy"):
-            gasil_jax.load_policy(tmp_path)
-    arrays = npz.read(folder / "policy.npz")
-    del arrays["mean"]
-    np.savez(tmp_path / "policy.npz", **arrays)
-    with pytest.raises(ValueError, match=r"not a saved policy \(mean is missing"):
-        gasil_jax.load_policy(tmp_path)
-
-
-def test_an_observation_of_another_size_is_refused(saved):
     # One number would otherwise be taken as all of them.
     for act in (gasil_jax.load_policy(saved[-1]), numpy_policy.load(saved[-1])):
         for observation in (np.float32(0), np.zeros(1), np.zeros((11, 2))):
@@ -107,11 +96,9 @@ def test_an_observation_of_another_size_is_refused(saved):
                 act(observation)
 
 
-def test_a_batch_of_states_is_no_policy(trained_point_mass):
-    env, _, states = trained_point_mass
-    assert gasil_jax.member(states, -1).iteration.shape == ()
-    with pytest.raises(IndexError, match="index is 3: there are 3 states"):
-        gasil_jax.member(states, 3)
+def test_a_batch_of_states_is_no_policy(saved):
+    env, _, states, _ = saved
+    states = states.replace(iteration=np.zeros(3, np.int32))
     for none in (0, b"x", None, {"a": np.zeros(2), "b": 1.0}):
         with pytest.raises(ValueError, match=r"states is .*: it must be arrays with"):
             gasil_jax.member(none, 0)
@@ -119,13 +106,8 @@ def test_a_batch_of_states_is_no_policy(trained_point_mass):
         policy.from_state(states, env)
 
 
-def test_only_the_zoos_policies_have_a_description(tmp_path):
-    with pytest.raises(ValueError, match="must be zoo:NAME, with NAME one of ant"):
-        numpy_policy.about(tmp_path)
-
-
-def test_a_policys_file_has_the_name_that_is_asked_for(trained_point_mass, tmp_path):
-    env, _, states = trained_point_mass
+def test_a_policys_file_has_the_name_that_is_asked_for(saved, tmp_path):
+    env, _, states, _ = saved
     path = tmp_path / "best.weights"
     policy_file.save(path, states, env, [5, 6, 7], np.zeros(3))
     assert list(tmp_path.iterdir()) == [path]
@@ -147,17 +129,7 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     algorithm = gasil_jax.algorithm(
         "ppo", activation=activation, layer_norm=layer_norm, hidden_sizes=(8, 5)
     )
-    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    # Shapes, of which all that is a policy's is drawn here.
-    states = jax.eval_shape(init, np.arange(2, dtype=np.uint32))
-    rng = np.random.default_rng(0)
-    draw = lambda x: rng.normal(size=x.shape).astype(x.dtype)
-    params = jax.tree.map(draw, states.actor_critic.policy.params)
-    learner = states.actor_critic.policy.replace(params=params)
-    states = states.replace(
-        actor_critic=states.actor_critic.replace(policy=learner),
-        normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
-    )
+    states, rng = drawn_policies(env, algorithm, 2), np.random.default_rng(0)
     policy_file.save(tmp_path / "policy.npz", states, env, [0, 1], np.zeros(2))
 
     weights = numpy_policy.read(tmp_path, 1)
@@ -174,7 +146,8 @@ def test_the_layers_are_their_formulas(activation, layer_norm, tmp_path):
     np.testing.assert_allclose(policy.make(weights)(observation), x, rtol=1e-3)
     # The network that trains is the same.
     network = GaussianPolicy((8, 5), 2, activation, layer_norm)
-    own, normalizer = jax.tree.map(lambda x: x[1], (params, states.normalizer))
+    params, normalizer = states.actor_critic.policy.params, states.normalizer
+    own, normalizer = jax.tree.map(lambda x: x[1], (params, normalizer))
     normalized = normalization.normalize(normalizer, observation)
     mean, _ = jax.jit(network.apply)(own, normalized)
     np.testing.assert_allclose(mean, x, rtol=1e-3)

@@ -4,7 +4,6 @@ import types
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from gasil_jax import learner, ppo
 from gasil_jax.config import Config
@@ -39,21 +38,6 @@ def test_gae_equals_a_plain_loop():
         gae_lambda=lam,
     )
     np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("terminated", [False, True])
-def test_truncation_bootstraps_and_termination_does_not(terminated):
-    one = jnp.ones((1, 1))
-    advantage = ppo.generalized_advantage_estimation(
-        one,
-        0 * one,
-        10 * one,
-        terminated=one == terminated,
-        ended=one == 1,
-        gamma=0.9,
-        gae_lambda=0.5,
-    )
-    np.testing.assert_allclose(advantage, 1.0 if terminated else 10.0)
 
 
 def test_loss_equals_numpy():

@@ -10,7 +10,7 @@ import pytest
 import gasil_envs
 import gasil_jax
 from gasil_envs import locomotion
-from gasil_jax import algorithms, presets, run
+from gasil_jax import algorithms, presets
 from gasil_jax.cli import options
 
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
@@ -75,12 +75,6 @@ def test_the_command_line_starts_from_the_preset():
     assert delayed == parse("walker2d", "--reward_delay=20")
 
 
-def test_flags_override_the_preset():
-    agent = parse("point_mass", "--agent", "gasil", "--alpha", "0.3").agent
-    assert agent.alpha == 0.3
-    assert agent.discriminator_updates == 20
-
-
 @pytest.mark.parametrize("env", ["walker2d", "point_mass"])
 def test_the_papers_batch_is_of_one_environment(env):
     config = parse(env, "--preset", "paper").config
@@ -94,28 +88,3 @@ def test_the_papers_rule_for_humanoid():
     agent = parse("humanoid", "--agent", "ppo+gasil", "--preset", "paper").agent
     assert agent.alpha == 0.02
     assert agent.alpha_schedule == ((2e6, 0.0), (3e6, 1.0))
-
-
-def test_a_preset_that_has_nothing_for_the_run_is_refused(capsys):
-    """But for the default, with which a run starts from the defaults."""
-    arguments = ["--env", "point_mass", "--agent", "gasil", "--preset", "scaled"]
-    assert run.main(arguments) == 2
-    assert (
-        "preset 'scaled' has nothing for agent 'gasil' on point_mass with dense "
-        "rewards: it has ppo on hopper, walker2d, halfcheetah, swimmer, ant, humanoid"
-    ) in capsys.readouterr().err
-
-
-def test_an_unknown_preset_is_refused(capsys):
-    assert run.main(["--env", "hopper", "--preset", "papre"]) == 2
-    assert "did you mean 'paper'" in capsys.readouterr().err
-    with pytest.raises(ValueError, match="did you mean 'tuned'"):
-        gasil_jax.preset("hopper", "ppo", "tunde")
-    with pytest.raises(ValueError, match=r"did you mean 'ppo\+gasil'"):
-        gasil_jax.preset("hopper", "ppo+gasill")
-    with pytest.raises(ValueError, match="env 'walker' is unknown: did you mean 'walk"):
-        gasil_jax.preset("walker", "ppo")
-    with pytest.raises(ValueError, match="preset '20' is unknown"):
-        gasil_jax.preset("hopper", "ppo", 20)
-    with pytest.raises(ValueError, match=r"reward_delay is 2\.5: it must be a whole"):
-        gasil_jax.preset("hopper", "ppo", reward_delay=2.5)

@@ -4,7 +4,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-import gasil_jax
 from gasil_jax.rewards import normalization
 
 update = jax.jit(normalization.update)
@@ -72,13 +71,3 @@ def test_no_reward_stays_none():
         normalization.init(2), nothing, nothing > 0, gamma=0.99
     )
     assert not np.any(normalization.normalize(normalizer, nothing, 10.0))
-
-
-def test_without_normalization_there_is_no_scale():
-    env = gasil_jax.make_env("point_mass")
-    for normalize in (True, False):
-        algorithm = gasil_jax.algorithm(total_steps=2048, normalize_rewards=normalize)
-        train = gasil_jax.make_train(env, algorithm)
-        _, metrics = jax.eval_shape(train, jax.random.key(0))
-        assert ("reward_scale" in metrics) == normalize
-        assert ("clipped_rewards" in metrics) == normalize

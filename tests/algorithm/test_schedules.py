@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from small_training import DISCRIMINATOR, SETTINGS
 
 import gasil_jax
 from gasil_jax.algorithms import schedule_factor
@@ -13,8 +14,7 @@ HUMANOID = ((2e6, 0.0), (3e6, 1.0))
 
 
 @pytest.mark.parametrize(
-    ("steps", "expected"),
-    [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)],
+    ("steps", "expected"), [(0, 0), (2e6, 0), (2.25e6, 0.25), (3e6, 1), (1e7, 1)]
 )
 def test_the_papers_rule_for_humanoid(steps, expected):
     result = jax.jit(lambda steps: schedule_factor(HUMANOID, steps))(steps)
@@ -38,14 +38,10 @@ def test_no_schedule_changes_nothing_but_the_annealed_learning_rate():
 
 
 def test_a_run_follows_its_schedules():
-    algorithm = gasil_jax.algorithm(
-        total_steps=1024,
-        batch_steps=256,
-        num_envs=4,
-        num_epochs=1,
-        hidden_sizes=(8,),
-        alpha_schedule=((256, 0.0), (512, 1.0)),
-        learning_rate_schedule=((0, 1.0), (256, 0.0)),
+    algorithm = gasil_jax.algorithm("ppo+gasil", **SETTINGS, **DISCRIMINATOR).replace(
+        total_steps=512,
+        alpha_schedule=((128, 0.0), (256, 1.0)),
+        learning_rate_schedule=((0, 1.0), (128, 0.0)),
     )
     env = gasil_jax.make_env("point_mass")
     _, metrics = jax.jit(gasil_jax.make_train(env, algorithm))(jax.random.key(0))
@@ -72,15 +68,6 @@ def test_an_optax_schedule_is_the_factor():
         np.testing.assert_allclose(now["alpha"], expected, rtol=1e-6)
         expected = before["clip_epsilon"] * max(0.0, 1 - iteration / 4)
         np.testing.assert_allclose(now["clip_epsilon"], expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    "points", [((1.0, 0.5), (0.0, 1.0)), ((0.0, -1.0),), ((0.0, float("nan")),)]
-)
-def test_a_bad_schedule_is_refused(points):
-    env = gasil_jax.make_env("point_mass")
-    with pytest.raises(ValueError, match="alpha_schedule is"):
-        gasil_jax.make_train(env, gasil_jax.algorithm(alpha_schedule=points))
 
 
 def test_a_longer_loop_does_not_anneal_below_0():

@@ -1,6 +1,5 @@
 """The training loop on the point mass."""
 
-import dataclasses
 import functools
 
 import brax.envs
@@ -88,53 +87,20 @@ def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"num_envs": 0}, "num_envs is 0"),
-        ({"num_envs": True}, "num_envs is True"),
-        ({"hidden_sizes": [64, 64]}, "hidden_sizes is .* must be a tuple"),
-        ({"alpha_schedule": (2e6, 0.0)}, "alpha_schedule is .*points"),
-        ({"normalize_rewards": 1}, "normalize_rewards is 1: it must be True or"),
-        ({"minibatch_size": 60}, "nearest that does is"),
-        ({"num_envs": 3}, "num_envs is 3"),
         ({"expert": "a.npz"}, r"expert is a setting of gail, not of ppo\+gasil"),
         ({"reward_clip": 1.0}, "reward_clip has no effect: normalize_rewards is off"),
         ({"alhpa": 0.1}, "setting 'alhpa' is unknown: did you mean 'alpha'"),
-        ({"alpha": -1.0}, "alpha is -1.0"),
-        ({"gamma": 1.5}, "gamma is 1.5"),
-        ({"alpha": np.float32(-1)}, "alpha is -1.0"),
-        ({"alpha": "x"}, "alpha is 'x'"),
     ],
 )
-def test_a_bad_setting_is_refused(change, message):
-    env = gasil_jax.make_env("point_mass")
+def test_a_setting_that_it_does_not_have_is_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        gasil_jax.make_train(env, PPO_GASIL.replace(**change))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"agent": "ppo+gasil"}, "agent is 'ppo.gasil': it must be an instance of a"),
-        ({"agent": gasil_jax.PPO}, "agent is <class .*: it must be an instance of a"),
-        ({"rewards": gasil_jax.Normalize()}, "rewards is .*: it must be a tuple of"),
-        ({"config": PPO_GASIL}, "config is .*: it must be a gasil_jax.Config"),
-    ],
-)
-def test_a_part_of_another_kind_is_refused(change, message):
-    env = gasil_jax.make_env("point_mass")
-    with pytest.raises(ValueError, match=message):
-        gasil_jax.make_train(env, dataclasses.replace(PPO_GASIL, **change))
-
-
-def test_an_agent_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match=r"agent 'ppo\+gasill' .* 'ppo\+gasil'"):
-        gasil_jax.algorithm("ppo+gasill")
+        PPO_GASIL.replace(**change)
 
 
 @pytest.mark.parametrize(
     ("hyperparameters", "message"),
     [
         (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),
-        (np.ones(3), r"hyperparameters is array\(.*: it must be numbers by name"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"learning_rate": -jnp.ones(())}, "rate is -1.0"),
         ({"alpha": np.ones(3)}, r"alpha has shape \(3,\): .*vmap"),
@@ -149,13 +115,12 @@ def test_hyperparameters_that_are_not_allowed_are_refused(hyperparameters, messa
 
 
 def test_the_shape_of_a_traced_hyperparameter_is_checked():
+    """jit traces all its arguments; under vmap each run has one number."""
     train = gasil_jax.make_train(gasil_jax.make_env("point_mass"), PPO_GASIL)
-    # jit traces all its arguments; under vmap each run has one number.
-    many = {"alpha": jnp.ones(3)}
+    many, key = {"alpha": jnp.ones(3)}, jax.random.key(0)
     with pytest.raises(ValueError, match="alpha has shape"):
-        jax.eval_shape(train, jax.random.key(0), many)
-    trained = jax.vmap(train, in_axes=(None, 0))
-    _, metrics = jax.eval_shape(trained, jax.random.key(0), many)
+        jax.eval_shape(train, key, many)
+    _, metrics = jax.eval_shape(jax.vmap(train, in_axes=(None, 0)), key, many)
     assert metrics["env_steps"].shape[0] == 3
 
 
@@ -164,11 +129,6 @@ def test_an_environment_of_gymnasium_is_refused():
         ValueError, match=r"has no observation_size: .* Brax's interface"
     ):
         gasil_jax.make_train(gymnasium.make("CartPole-v1"), PPO_GASIL)
-
-
-def test_a_name_is_not_an_environment():
-    with pytest.raises(ValueError, match=r"env is 'hopper', .*make_env"):
-        gasil_jax.make_train("hopper", PPO_GASIL)
 
 
 def test_a_state_may_begin_outside_of_jit_and_be_donated():

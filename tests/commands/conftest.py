@@ -39,4 +39,5 @@ def trained(tmp_path_factory):
 def swept(tmp_path_factory):
     """A sweep of four points with two of the run's seeds; point 0 is the run's."""
     folder = tmp_path_factory.mktemp("swept")
-    return _done(folder, sweep, *SMALL, "--seeds", "2", *GRID)
+    more = ("--seeds", "2", "--evaluate-every", "512")
+    return _done(folder, sweep, *SMALL, *more, *GRID)

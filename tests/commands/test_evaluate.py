@@ -1,7 +1,6 @@
 """Saving, loading and scoring a run's policies."""
 
 import csv
-import functools
 import shutil
 
 import jax
@@ -9,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from brax.envs import Wrapper
+from refusals import refused
+from small_training import drawn_policies
 
 import gasil_jax
 from gasil_jax import evaluate, evaluation, numpy_policy, policy
 from gasil_jax.host import checkpoint, saved
 
 # With the other tests that use it, so that it is trained once.
-on_trained_point_mass = pytest.mark.xdist_group("trained_point_mass")
 on_trained = pytest.mark.xdist_group("commands")
 
 
@@ -43,36 +43,8 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(
     assert evaluate.main([folder, *flags, "--seed", "6"]) == 0
     assert capsys.readouterr().out.splitlines()[1] == lines[1]
     # Nothing is written over.
-    assert evaluate.main([folder, "--out", str(out)]) == 2
-    assert "which exists: name a new file" in capsys.readouterr().err
-
-
-@on_trained
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        ("", "RUN is missing: see --help"),
-        ("RUN --checkpoint first", "checkpoint is 'first': it must be one of last, be"),
-        ("RUN --episodes 0", "episodes is 0: it must be from 1 to"),
-        ("RUN --episodes 1000000000000", "GB of memory"),
-        ("RUN --seed 8", "seed is 8: the run has 5, 6, 7"),
-        ("RUN --point 1", "point is 1: "),
-        ("RUN --key -1", "key is -1: it must be from 0 to 4294967295"),
-        ("RUN --gymnasium", "must be of a locomotion task of Gymnasium"),
-        ("RUN --out x.txt", "it must end in .csv"),
-        ("RUN --out /proc/scores.csv", "/proc/scores.csv, which can't be written"),
-        ("RUN/programs", "has no config.json: it must be the folder of a run or a swe"),
-        ("RUN/nowhere", "does not exist: it must be the folder of a run or a sweep"),
-        ("zoo:nothing", "nothing"),
-    ],
-)
-def test_what_can_not_be_scored_is_refused_in_a_line(
-    arguments, message, trained, capsys
-):
-    words = arguments.replace("RUN", str(trained.folder)).split()
-    assert evaluate.main(words) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error
+    told = refused(capsys, evaluate, folder, "--out", out)
+    assert "which exists: name a new file" in told
 
 
 @on_trained
@@ -84,9 +56,8 @@ def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
     best = checkpoint.best(root).folder
     (best / "state" / "_METADATA").write_text("{}")
     capsys.readouterr()
-    assert evaluate.main([str(out), "--checkpoint", "best", "--episodes", "1"]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert f"{best} is damaged: state/_METADATA is not what was written" in line
+    told = refused(capsys, evaluate, out, "--checkpoint", "best")
+    assert f"{best} is damaged: state/_METADATA is not what was written" in told
 
 
 @on_trained
@@ -107,58 +78,44 @@ def test_gymnasiums_episodes_have_the_runs_limit():
         assert scores["episode_length"] == [length]
 
 
-@on_trained_point_mass
-def test_a_state_of_another_shape_is_refused(trained_point_mass, tmp_path):
-    _, _, states = trained_point_mass
-    checkpoint.save(tmp_path / "state", states)
-    other = jax.eval_shape(lambda: jax.tree.map(lambda x: x[:1], states))
-    for like in (other, other.replace(agent=())):
-        with pytest.raises(ValueError, match="holds another state"):
-            checkpoint.restore(tmp_path / "state", like)
+@pytest.fixture(scope="module")
+def untrained():
+    """The environment, the algorithm, and the state of a policy that is drawn."""
+    env = gasil_jax.make_env("point_mass", reward_delay=7)
+    algorithm = gasil_jax.algorithm("ppo", hidden_sizes=(16, 8))
+    states = drawn_policies(env, algorithm, 1, whole=True)
+    return env, algorithm, gasil_jax.member(states, 0)
 
 
-@on_trained_point_mass
-def test_scores_are_those_of_a_plain_loop(trained_point_mass):
-    env, algorithm, states = trained_point_mass
-    state = gasil_jax.member(states, 1)
-    key = jax.random.key(3)
-    scores = jax.jit(
-        lambda s: evaluation.evaluate(env, algorithm, s, key=key, num_episodes=3)
-    )(state)
+def scores(env, algorithm, state, **given):
+    return jax.jit(
+        lambda state, key: evaluation.evaluate(
+            env, algorithm, state, key=key, num_episodes=3, **given
+        )
+    )(state, jax.random.key(3))
+
+
+def test_scores_are_those_of_a_plain_loop(untrained):
+    env, _, state = untrained
+    scored = scores(*untrained)
     act = numpy_policy.make(policy.weights(state, env))
     reset, step = jax.jit(env.reset), jax.jit(env.step)
-    for i, reset_key in enumerate(jax.random.split(jax.random.split(key)[0], 3)):
+    key, _ = jax.random.split(jax.random.key(3))
+    for i, reset_key in enumerate(jax.random.split(key, 3)):
         running, total, length = reset(reset_key), 0.0, 0
         while not running.done:
             running = step(running, jnp.asarray(act(np.asarray(running.obs))))
             total += float(running.info["true_reward"])
             length += 1
-        np.testing.assert_allclose(scores["episode_return"][i], total, rtol=1e-3)
-        assert int(scores["episode_length"][i]) == length == 50
+        np.testing.assert_allclose(scored["episode_return"][i], total, rtol=1e-3)
+        assert int(scored["episode_length"][i]) == length == 50
+    drawn = scores(*untrained, deterministic=False)
+    assert not np.allclose(drawn["episode_return"], scored["episode_return"])
 
 
-@on_trained_point_mass
-def test_stochastic_scores_vary_more(trained_point_mass):
-    env, algorithm, states = trained_point_mass
-
-    @functools.partial(jax.jit, static_argnums=1)
-    def score(states, deterministic):
-        return evaluation.evaluate(
-            env,
-            algorithm,
-            gasil_jax.member(states, 0),
-            key=jax.random.key(0),
-            num_episodes=50,
-            deterministic=deterministic,
-        )["episode_return"]
-
-    assert np.std(score(states, False)) > np.std(score(states, True))
-
-
-@on_trained_point_mass
-def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
+def test_an_episode_that_is_only_cut_off_ends_too(untrained):
     """As in training; `done` need not be set beside `truncation`."""
-    env, algorithm, states = trained_point_mass
+    env, algorithm, state = untrained
 
     class CutOff(Wrapper):
         def reset(self, rng):
@@ -173,10 +130,5 @@ def test_an_episode_that_is_only_cut_off_ends_too(trained_point_mass):
             info = {**stepped.info, "time": time, "truncation": cut_off}
             return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
 
-    key, state = jax.random.key(0), gasil_jax.member(states, 0)
-    scores = jax.jit(
-        lambda s: evaluation.evaluate(
-            CutOff(env), algorithm, s, key=key, num_episodes=3
-        )
-    )(state)
-    assert scores["episode_length"].tolist() == [7, 7, 7]
+    lengths = scores(CutOff(env), algorithm, state)["episode_length"]
+    assert lengths.tolist() == [7, 7, 7]

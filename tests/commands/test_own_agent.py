@@ -8,6 +8,7 @@ import re
 import jax
 import numpy as np
 import pytest
+from refusals import refused, rows
 from small_training import DISCRIMINATOR_FLAGS, FLAGS
 
 import gasil_jax
@@ -62,113 +63,65 @@ def helper(state):
 
 INSTANCE = Own()
 """
-REWARD = "def update_and_reward(self, state, context, key): return "
-POLICY = "def update_policy(self, state, actor_critic, context, key): return "
-MIX = "def mix(self, state, advantages, context): return "
-ONE = "float = number(0.5, 0.0, 1.0)"
+#: What stands for parts of the definitions below.
+SHORT = {
+    "REWARD": "def update_and_reward(self, state, context, key): return",
+    "POLICY": "def update_policy(self, state, actor_critic, context, key): return",
+    "MIX": "def mix(self, state, advantages, context): return",
+    "ONE": "float = number(0.5, 0.0, 1.0)",
+    "PAID": "context.rollout.reward",
+    "UPDATE": "def update(self, state, context, key): return",
+    "Agent": "gasil_jax.Agent",
+}
+
+
+def in_full(lines):
+    return re.sub("|".join(SHORT), lambda found: SHORT[found.group()], lines)
+
+
 #: What agents are derived from, what they define, and why they are refused.
-WRONG = [
-    ("Own", 'name = "mine"', "calls itself 'mine': name the module"),
-    ("gasil_jax.Agent", f"gamma: {ONE}", "'gamma', a name that is taken"),
-    ("gasil_jax.Agent", f"reward_clip: {ONE}", "'reward_clip', a name that is taken"),
-    ("gasil_jax.Agent", f"diverged: {ONE}", "'diverged', a name that is taken"),
-    ("gasil_jax.Agent", f"seeds: {ONE}", "'seeds', a name that is taken by an option"),
-    (
-        "gasil_jax.Agent",
-        "bare: float = 0.5",
-        "'bare' has no range: .*config.number",
-    ),
-    (
-        "gasil_jax.Agent",
-        "my_weight: float = number(2.0, 0.0, 1.0)",
-        "my_weight is 2.0: it must be 0 or more and at most",
-    ),
-    (
-        "Own",
-        "def __post_init__(self): raise RuntimeError('not today')",
-        r"can't be made: RuntimeError: not today \(.*my_agents",
-    ),
-    (
-        "Own",
-        REWARD + "state, context.rollout.reward, {'my': context.rollout.reward}",
-        "'my' .* has shape .*: it must be one number",
-    ),
-    (
-        "Own",
-        REWARD + "(state, {})",
-        "reward .* returns 2 values: .* 3, state, rewards, metrics",
-    ),
-    (
-        "Own",
-        POLICY + "state, actor_critic, {}, {}",
-        "update_policy .* returns 4 values: .* 3, state, actor_",
-    ),
-    (
-        "Own",
-        MIX + "advantages[..., 0]",
-        "mix of agent .* returns 1 value: .* 2, advantage, metrics",
-    ),
-    (
-        "Own",
-        REWARD + "state, context.rollout.reward.sum(axis=0), {}",
-        r"rewards is float32\[4\]: it must be float32\[32, 4\]",
-    ),
-    (
-        "Own",
-        MIX + "(advantages, {})",
-        r"mix .* advantage is float32\[32, 4, 1\]: .*32, 4\]",
-    ),
-    (
-        "Own",
-        "num_streams = 2",
-        "has 2 reward streams: it must have a function mix that",
-    ),
-    (
-        "Own",
-        MIX + "(advantages[..., 0], {'explained_variance': 0.5})",
-        "'explained_variance' .* the name of another metric",
-    ),
-    (
-        "Own",
-        REWARD + "state, context.nothing, {}",
-        r"can't be traced: AttributeError: .*my_agents.py, li",
-    ),
-    (
-        "Counts",
-        REWARD + "{'count': jnp.zeros(3, int)}, context.rollout.reward, {}",
-        r"update_and_reward .*\['count'\] is int32\[3\]: .* int32\[\]",
-    ),
-    (
-        "Counts",
-        REWARD + "{'count': state['count'] + 0.5}, context.rollout.reward, {}",
-        r"state\['count'\] is float32\[\]: .* int32\[\]",
-    ),
-    (
-        "Counts",
-        "def remember(self, state, context): pass",
-        r"remember of .* state\['count'\] is missing: .* int32",
-    ),
-    ("Own", POLICY + "state, (), {}", "update_policy of .* actor_critic.* missing:"),
-    (
-        "Own",
-        POLICY + "state, actor_critic, None",
-        "update_policy .* returns metrics None: .* be a dict",
-    ),
-    ("Own", REWARD + "sys.exit()", r"can't be traced: SystemExit \(.*my_agents"),
-    (
-        "Own",
-        "def check(self, sizes): sys.exit(7)",
-        "check of agent .* fails: SystemExit: 7",
-    ),
-    (
-        "Own",
-        "def check(self, sizes): return sizes.alhpa",
-        "check of agent .* fails: AttributeError: .*alhpa",
-    ),
-]
+WRONG = rows(
+    r"""
+Own | name = "mine" | calls itself 'mine': name the module
+Agent | gamma: ONE | 'gamma', a name that is taken
+Agent | reward_clip: ONE | 'reward_clip', a name that is taken
+Agent | diverged: ONE | 'diverged', a name that is taken
+Agent | seeds: ONE | 'seeds', a name that is taken by an option
+Agent | bare: float = 0.5 | 'bare' has no range: .*config.number
+Agent | my_weight: float = number(2.0, 0.0, 1.0) | my_weight is 2.0: it must be 0 or m
+Own | def __post_init__(self): raise RuntimeError('not') | RuntimeError: not \(.*my_
+Own | REWARD state, PAID, {'my': PAID} | 'my' .* has shape .*: it must be one number
+Own | REWARD (state, {}) | reward .* returns 2 values: .* 3, state, rewards, metrics
+Own | POLICY state, actor_critic, {}, {} | update_policy .* returns 4 values: .* 3, sta
+Own | MIX advantages[..., 0] | mix of agent .* returns 1 value: .* 2, advantage, metrics
+Own | REWARD state, PAID.sum(axis=0), {} | rewards is float32\[4\]: .*32\[32, 4\]
+Own | MIX (advantages, {}) | mix .* advantage is float32\[32, 4, 1\]: .*32, 4\]
+Own | num_streams = 2 | has 2 reward streams: it must have a function mix that
+Own | MIX (advantages[..., 0], {'value_loss': 0.5}) | 'value_loss' .* of another metric
+Own | REWARD state, context.nothing, {} | traced: AttributeError: .*my_agents.py, li
+Counts | REWARD {'count': jnp.zeros(3, int)}, PAID, {} | 'count'\] is int32\[3\]: .*int
+Counts | REWARD {'count': state['count'] + 0.5}, PAID, {} | is float32\[\]: .* int32\[\]
+Counts | def remember(self, state, context): pass | state\['count'\] is missing: .*int
+Own | POLICY state, (), {} | update_policy of .* actor_critic.* missing:
+Own | POLICY state, actor_critic, None | update_policy .* returns metrics None: .* a d
+Own | REWARD sys.exit() | can't be traced: SystemExit \(.*my_agents
+Own | def check(self, sizes): sys.exit(7) | check of agent .* fails: SystemExit: 7
+Own | def check(self, sizes): return sizes.alhpa | .* fails: AttributeError: .*alhpa
+"""
+)
 for number, (base, definition, _) in enumerate(WRONG):
-    MODULE += f"\n\nclass Wrong{number}({base}):\n    {definition}\n"
-SMALL = (*FLAGS, "--agent", "my_agents:Own", "--devices", "1")
+    MODULE += in_full(f"\n\nclass Wrong{number}({base}):\n    {definition}\n")
+#: Other names of agents, and why they are refused.
+NAMES = """
+nowhere:Own | 'nowhere:Own' can't be imported: No module named 'nowhere'
+my_agents:No | can't be imported: module 'my_agents' has no attribute 'No'
+my_agents:helper | is of type function: it must be a class that is derived
+my_agents:Plain | is of type type: it must be a class that is derived from
+my_agents:INSTANCE | is of type Own: it must be a class that is derived
+leaves:Own | 'leaves:Own' can't be imported: SystemExit: 3
+my_agents | 'my_agents' is unknown: it must be .*, gail, MODULE:CLASS$
+"""
+SMALL = (*FLAGS, "--agent", "my_agents:Own")
 
 
 @pytest.fixture(autouse=True)
@@ -191,22 +144,18 @@ def metrics(folder):
 
 
 def test_every_command_takes_it(tmp_path, capsys):
+    """Also one that is derived from another agent, with the numbers of both."""
     out = tmp_path / "run"
-    assert run.main([*SMALL, "--my-weight", "0.25", "--out", str(out)]) == 0
-    assert column(metrics(out), "my_weight") == {0.25}
+    derived = (*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "my_agents:Derived")
+    own = ("--my-bonus", "0.25", "--alpha", "0.3", "--buffer-steps", "70")
+    assert run.main([*derived, *own, "--no-stagger-episodes", "--out", str(out)]) == 0
     described = json.loads((out / "config.json").read_text())["algorithm"]
-    assert described["agent"] == "my_agents:Own" and described["my_weight"] == 0.25
-    again = ["--out", str(out), "--resume"]
-    # The total of steps may grow.
-    before = metrics(out).read_text()
-    assert run.main([*again, "--total-steps", "384"]) == 0
-    after = metrics(out).read_text()
-    assert after.startswith(before) and after.count("\n") == 1 + 3
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["env_steps_per_seed"] == 384
-    assert column(metrics(out), "my_weight") == {0.25}
-    assert run.main([*again, "--my-weight", "0.3"]) == 2
-    assert "my_weight was 0.25, is 0.3" in capsys.readouterr().err
+    expected = {"agent": "my_agents:Derived", "my_bonus": 0.25, "alpha": 0.3}
+    assert described == described | expected | {"buffer_steps": 70}
+    assert column(metrics(out), "good_steps") == {0, 70}
+    again = ["--out", out, "--resume"]
+    told = refused(capsys, run, *again, "--my-bonus", "0.3")
+    assert "my_bonus was 0.25, is 0.3" in told
     assert evaluate.main([str(out), "--episodes", "1"]) == 0
     picture = str(tmp_path / "x.png")
     assert render.main([str(out), "--out", picture, "--steps", "5"]) == 0
@@ -214,24 +163,14 @@ def test_every_command_takes_it(tmp_path, capsys):
     grid = [*SMALL, "--grid", "my_weight=0.1,0.3"]
     for part in ("1/2", "2/2"):
         assert sweep.main([*grid, "--shard", part, "--out", "parts"]) == 0
-    assert column(tmp_path / "parts" / "results.csv", "my_weight") == {0.1, 0.3}
+    results = tmp_path / "parts" / "results.csv"
+    table = next((tmp_path / "parts").glob("programs/*/metrics.csv"))
+    assert column(results, "my_weight") == {0.1, 0.3} > column(table, "my_weight")
     (tmp_path / "points.json").write_text('[{"my_weight": 0.2}, {"gamma": 0.9}]')
     words = [*SMALL, "--points-file", "points.json"]
     _, requested = options.read(options.SweepOptions, words, "x")
     (program,) = requested.unfinished(tmp_path)
     assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]
-
-
-def test_it_may_be_derived_from_another_agent(tmp_path):
-    small = (*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "my_agents:Derived")
-    own = ("--my-bonus", "0.25", "--alpha", "0.3", "--buffer-steps", "70")
-    assert run.main([*small, *own, "--no-stagger-episodes", "--out", "run"]) == 0
-    described = json.loads((tmp_path / "run" / "config.json").read_text())["algorithm"]
-    assert described["agent"] == "my_agents:Derived"
-    for name, value in (("my_bonus", 0.25), ("alpha", 0.3), ("buffer_steps", 70)):
-        assert described[name] == value
-    assert column(metrics(tmp_path / "run"), "good_steps") == {0, 70}
-    assert evaluate.main(["run", "--episodes", "1"]) == 0
 
 
 def test_the_help_explains_its_settings(capsys):
@@ -246,43 +185,33 @@ def test_the_help_explains_its_settings(capsys):
     ("agent", "why"),
     [
         *((f"my_agents:Wrong{i}", why) for i, (*_, why) in enumerate(WRONG)),
-        ("nowhere:Own", "'nowhere:Own' can't be imported: No module named 'nowhere'"),
-        ("my_agents:No", "can't be imported: module 'my_agents' has no attribute 'No'"),
-        ("my_agents:helper", "is of type function: it must be a class that is derived"),
-        ("my_agents:Plain", "is of type type: it must be a class that is derived from"),
-        ("my_agents:INSTANCE", "is of type Own: it must be a class that is derived"),
-        ("leaves:Own", "'leaves:Own' can't be imported: SystemExit: 3"),
-        ("my_agents", "'my_agents' is unknown: it must be .*, gail, MODULE:CLASS$"),
+        *rows(NAMES),
     ],
 )
 def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
-    # JAX has been started by other tests, so that --devices would be told of.
-    assert run.main([*SMALL[:-2], "--agent", agent, "--out", "run"]) == 2
-    # On a slow machine a line says first that the program is traced.
-    *others, error = capsys.readouterr().err.splitlines()
-    assert error.startswith("error: ") and re.search(why, error), error
-    assert all(line.endswith(("environment", "functions")) for line in others), others
+    told = refused(capsys, run, *SMALL, "--agent", agent, "--out", "run")
+    assert re.search(why, told), told
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize(
-    ("program", "arguments", "why"),
-    [
-        (run, "--my-weight 2", "my_weight is 2.0: it must be 0 or more and at most 1"),
-        (run, "--my-weight much", "my_weight is 'much': it must be a number"),
-        (run, "--my-wieght 0.2", "--my-weight"),
-        (run, "--agent ppo --my-weight 0.2", "option --my-weight is unknown"),
-        (run, "--alpha 0.2", "alpha is a setting of gasil, ppo+gasil, gail"),
-        (sweep, "--grid my_weight=0.1,2", "my_weight is 2.0: it must be 0 or more"),
-        (sweep, "--grid my_wieght=0.1", "did you mean 'my_weight'?"),
-        (sweep, "--agent ppo --grid my_weight=0.1", "'my_weight' can't vary"),
-        (sweep, "--grid alpha=0.1", "alpha is a setting of gasil, ppo+gasil, gail"),
-    ],
-)
-def test_its_numbers_are_checked(tmp_path, capsys, program, arguments, why):
-    assert program.main([*SMALL, *arguments.split(), "--out", "run"]) == 2
-    captured = capsys.readouterr()
-    assert why in captured.err and captured.err.count("\n") == 1, captured.err
+#: Words of `run`, or of `sweep` with a grid.
+NUMBERS = """
+--my-weight 2 | my_weight is 2.0: it must be 0 or more and at most 1
+--my-weight much | my_weight is 'much': it must be a number
+--my-wieght 0.2 | --my-weight
+--agent ppo --my-weight 0.2 | option --my-weight is unknown
+--alpha 0.2 | alpha is a setting of gasil, ppo+gasil, gail
+--grid my_weight=0.1,2 | my_weight is 2.0: it must be 0 or more
+--grid my_wieght=0.1 | did you mean 'my_weight'?
+--agent ppo --grid my_weight=0.1 | 'my_weight' can't vary
+--grid alpha=0.1 | alpha is a setting of gasil, ppo+gasil, gail
+"""
+
+
+@pytest.mark.parametrize(("words", "why"), rows(NUMBERS))
+def test_its_numbers_are_checked(tmp_path, capsys, words, why):
+    program = sweep if "--grid" in words else run
+    assert why in refused(capsys, program, *SMALL, *words.split(), "--out", "run")
     assert not (tmp_path / "run").exists()
 
 
@@ -340,21 +269,22 @@ class Signs(gasil_jax.RewardModel):
         context = context.replace(rollout=context.rollout.replace(reward=reward))
         return state, context, True, {"my_factor": self.factor}
 """
-UPDATE = "def update(self, state, context, key): return "
 #: What models of rewards define, and why they are refused.
-WRONG_MODELS = [
-    (UPDATE + "state, context, {}", "update .* 3 values: .*state, context, learned"),
-    (UPDATE + "state, context.rollout, True, {}", "returned context.rollout.* missing"),
-    (UPDATE + "(), context, context.rollout.reward > 0, {}", "learned is bool.32, 4.:"),
-    (UPDATE + "state, context, 'yes', {}", "update .* returns what is no array: "),
-    (UPDATE + "state, context, True, {'entropy': 0}", "'entropy' of a model of rew"),
-    ("def update(self, state, context): pass", r"traced: .*update\(\) takes 3 posi"),
-    ("def init(self, key): pass", r"can't be traced: .*init\(\) takes 2 positional"),
-    ("gamma: float = number(1.0, 0.0)", "'gamma', a name that is taken: "),
-    ("seeds: float = number(1.0, 0.0)", "'seeds', a name that is taken by an option"),
-]
+WRONG_MODELS = rows(
+    r"""
+UPDATE state, context, {} | update .* 3 values: .*state, context, learned
+UPDATE state, context.rollout, True, {} | returned context.rollout.* missing
+UPDATE (), context, PAID > 0, {} | learned is bool.32, 4.:
+UPDATE state, context, 'yes', {} | update .* returns what is no array:
+UPDATE state, context, True, {'entropy': 0} | 'entropy' of a model of rew
+def update(self, state, context): pass | traced: .*update\(\) takes 3 posi
+def init(self, key): pass | can't be traced: .*init\(\) takes 2 positional
+gamma: ONE | 'gamma', a name that is taken:
+seeds: ONE | 'seeds', a name that is taken by an option
+"""
+)
 for number, (definition, _) in enumerate(WRONG_MODELS):
-    MODEL += f"\n\nclass Wrong{number}(Signs):\n    {definition}\n"
+    MODEL += in_full(f"\n\nclass Wrong{number}(Signs):\n    {definition}\n")
 
 
 @pytest.fixture
@@ -377,8 +307,8 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     assert run.main([*again, "--total-steps", "384"]) == 0
     assert evaluate.main(["out", "--episodes", "1"]) == 0
     assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
-    assert run.main([*again, "--rewards", "my_models:Wrong0"]) == 2
-    assert "rewards was ['my_models:Signs'], is ['my_mod" in capsys.readouterr().err
+    told = refused(capsys, run, *again, "--rewards", "my_models:Wrong0")
+    assert "rewards was ['my_models:Signs'], is ['my_mod" in told
 
 
 @pytest.mark.parametrize(
@@ -391,6 +321,6 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     ],
 )
 def test_what_is_no_model_is_refused_in_a_line(my_models, capsys, model, why):
-    assert run.main([*FLAGS, "--agent", "ppo", "--rewards", model, "--out", "x"]) == 2
-    error = capsys.readouterr().err.splitlines()[-1]
-    assert error.startswith("error: ") and re.search(why, error), error
+    words = ("--agent", "ppo", "--rewards", model, "--out", "x")
+    told = refused(capsys, run, *FLAGS, *words)
+    assert re.search(why, told), told

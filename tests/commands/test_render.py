@@ -75,23 +75,6 @@ def test_locomotion_is_drawn(untrained_hopper, tmp_path):
     assert sky_and_floor.std() > 10
 
 
-def test_bad_input_is_one_line_and_status_2(trained, tmp_path, capsys):
-    (tmp_path / "there.gif").touch()
-    for arguments, message in (
-        (["--out", "film.avi"], "must end in .mp4, .gif, .png"),
-        (["--out", str(tmp_path / "there.gif")], "which exists"),
-        (["--seed", "9"], "seed is 9: the run has 5, 6, 7"),
-        (["--steps", "0"], "steps is 0"),
-        (["--width", "99999999"], "width is 99999999: it must be from 1 to 4096"),
-        (["--key", "-1"], "key is -1: it must be from 0 to 4294967295"),
-        (["--out", "/proc/nowhere/film.gif"], "out is /proc/nowhere/film.gif"),
-        (["--out", "/proc/film.png"], "out is /proc/film.png, which can't be written"),
-    ):
-        assert render.main([str(trained.folder), *arguments]) == 2
-        error = capsys.readouterr().err
-        assert message in error and len(error.splitlines()) == 1
-
-
 def test_a_film_is_whole_or_not_there(trained, tmp_path, monkeypatch, capsys):
     def half(frames, fps, path):
         path.write_bytes(b"x")

@@ -101,18 +101,6 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     assert "neighbouring values" in caption
 
 
-def test_values_that_begin_at_zero_have_a_scale(figures, tmp_path):
-    values = {"alpha": (0.0, 0.02, 1.0)}
-    plotting.marginals(
-        tmp_path / "x.png", values, np.arange(3.0), title="t", best=None, left_out=0
-    )
-    (axes,) = figures[0].axes
-    assert axes.get_xscale() == "symlog"
-    assert figures[0].get_supxlabel() == (
-        "point: mean over its seeds; mean: over the points of each\nvalue"
-    )
-
-
 def labels_of(points):
     return results._labels(mock.Mock(sweep=mock.Mock(points=points)))
 
@@ -157,24 +145,6 @@ def test_a_moving_mean_is_of_the_points_before():
     smoothed = plotting.smoothed(np.array([[1.0, 3.0, 5.0, 7.0]]), 2)
     np.testing.assert_allclose(smoothed, [[1.0, 2.0, 4.0, 6.0]])
     np.testing.assert_allclose(plotting.smoothed(smoothed, 1), smoothed)
-
-
-def test_long_labels_leave_room_for_the_returns(figures, tmp_path):
-    point = {"learning_rate": 3e-5, "discriminator_updates": 10, "alpha": 0.1}
-    point |= {"discriminator_learning_rate": 2e-5, "buffer_steps": 10_000}
-    points = [point, {name: 2 * value for name, value in point.items()}]
-    returns = np.array([[2.0] * 5, [1.0] * 5])
-    plotting.final_returns(
-        tmp_path / "x.png", labels_of(points), returns, **of_points(returns)
-    )
-    (figure,) = figures
-    figure.draw_without_rendering()
-    axes, _ = figure.axes
-    assert axes.get_position().width > 0.3
-    low, high = [label.get_window_extent() for label in axes.get_yticklabels()]
-    assert not low.overlaps(high) and min(low.x0, high.x0) >= 0.0
-    text = axes.get_yticklabels()[0].get_text()
-    assert text.replace("\n", " ") == f"0: {labels_of(points)[0]}"
 
 
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):

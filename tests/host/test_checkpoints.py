@@ -72,10 +72,13 @@ def test_a_checkpoint_is_read_from_a_folder_of_any_name(name, tmp_path):
         assert_same(found.restore(state), state)
 
 
-def test_a_type_of_the_same_size_is_not_taken_for_another(tmp_path):
+@pytest.mark.parametrize(
+    "like", [{"x": jnp.ones(3, jnp.float16)}, {"x": jnp.ones(2, jnp.bfloat16)}, {}]
+)
+def test_another_state_is_not_taken_for_what_is_stored(like, tmp_path):
     checkpoint.save(tmp_path / "state", {"x": jnp.ones(3, jnp.bfloat16)})
-    with pytest.raises(ValueError, match=r"holds another state: \['x'\] differs"):
-        checkpoint.restore(tmp_path / "state", {"x": jnp.ones(3, jnp.float16)})
+    with pytest.raises(ValueError, match=r"holds another state: \['x'\] "):
+        checkpoint.restore(tmp_path / "state", like)
 
 
 def test_what_reads_otherwise_does_not_count_as_written(tmp_path, monkeypatch):
@@ -227,29 +230,6 @@ except checkpoint.WriteError as error:
     ended = subprocess.run(arguments, capture_output=True, text=True)
     assert ended.stderr == f"{tmp_path} can't be written: File too large\n"
     assert names(tmp_path) == []
-
-
-def test_what_failed_first_is_told_where_cleaning_up_fails_too(tmp_path):
-    with pytest.raises(OSError, match="File too large"):
-        with checkpoint._orbax(tmp_path / "state"):
-            try:
-                raise ValueError(f"writing fails: os_error_code='{errno.EFBIG}'")
-            finally:  # Cleaning up.
-                raise OSError(errno.ENOTEMPTY, "Directory not empty")
-    with pytest.raises(OSError, match="Directory not empty"):
-        with checkpoint._orbax(tmp_path / "state"):
-            raise OSError(errno.ENOTEMPTY, "Directory not empty")
-
-
-def test_an_error_in_a_thread_that_is_not_orbaxs_is_still_told(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(sys, "unraisablehook", told.append)
-    (tmp_path / "state").mkdir()
-    with pytest.raises(ValueError, match="already exists"):
-        checkpoint.save(tmp_path / "state", {"x": np.ones(3)})
-    for text in ("Event loop is closed", "mine"):
-        sys.unraisablehook(mock.Mock(exc_value=RuntimeError(text)))
-    assert [str(unraisable.exc_value) for unraisable in told] == ["mine"]
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):

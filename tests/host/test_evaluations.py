@@ -15,10 +15,9 @@ from small_training import FLAGS, SETTINGS
 from test_resume import program_of
 
 import gasil_jax
-from gasil_jax import run, statistics, sweep
-from gasil_jax.cli import plot
+from gasil_jax import run
 from gasil_jax.evaluation import evaluate as evaluate_directly
-from gasil_jax.host import checkpoint, plotting, saved, tables, trackers
+from gasil_jax.host import checkpoint, saved, tables, trackers
 from gasil_jax.host.evaluations import Evaluation, evaluation_key
 from gasil_jax.host.members import make_members
 
@@ -153,12 +152,16 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     assert_same_tables(out, whole)
 
 
-def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("at", "scored"), [(0, ["0"]), (10, ["0", "640"])])
+def test_an_interrupted_run_continues_with_its_scores(
+    at, scored, evaluated, tmp_path, monkeypatch
+):
+    """Even one that is stopped before it trains scores each policy once."""
     whole, out = evaluated[0], tmp_path / "out"
     score = Evaluation.score
 
     def interrupted(self, states, done):
-        if done == 10:
+        if done == at:
             os.kill(os.getpid(), signal.SIGTERM)
         return score(self, states, done)
 
@@ -166,27 +169,7 @@ def test_an_interrupted_run_continues_with_its_scores(evaluated, tmp_path, monke
         patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
-    assert len(rows(out)) == 3 * len(SEEDS)
-    assert run.main(["--resume", "--out", str(out)]) == 0
-    assert_same_tables(out, whole)
-
-
-def test_a_run_that_is_stopped_before_it_trains_scores_the_first_policy_once(
-    evaluated, tmp_path, monkeypatch
-):
-    whole, out = evaluated[0], tmp_path / "out"
-    score = Evaluation.score
-
-    def interrupted(self, states, done):
-        scores = score(self, states, done)
-        os.kill(os.getpid(), signal.SIGTERM)
-        return scores
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Evaluation, "score", interrupted)
-        status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
-    assert status == 128 + signal.SIGTERM
-    assert {row["env_steps"] for row in rows(out)} == {"0"}
+    assert [row["env_steps"] for row in rows(out)[::3]][: len(scored)] == scored
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert_same_tables(out, whole)
 
@@ -224,29 +207,6 @@ def test_the_tracker_is_given_the_scores(evaluated):
         np.testing.assert_allclose(scores, expected[step], rtol=1e-5)
 
 
-def test_the_figures_show_the_scores_dashed(evaluated, tmp_path, figures):
-    out, _ = evaluated
-    curves = plot.read(out)
-    assert curves.evaluations["mean"].shape == (3, 6)
-    plot.draw([curves], tmp_path / "x.png")
-    plotting.learning_curve(
-        tmp_path / "y.png",
-        curves.env_steps,
-        curves.returns,
-        title="title",
-        evaluations=curves.evaluations,
-    )
-    scores = curves.evaluations["mean"]
-    middle = statistics.interquartile_mean(scores, axis=0)
-    assert len(figures) == 2
-    for figure in figures:
-        lines = figure.axes[0].get_lines()
-        (dashed,) = (line for line in lines if line.get_linestyle() == "--")
-        iterations = np.array([0, 5, 10, 15, 20, ITERATIONS])
-        np.testing.assert_allclose(dashed.get_xdata(), 128e-6 * iterations)
-        np.testing.assert_allclose(dashed.get_ydata(), middle)
-
-
 def scored(tmp_path, seeds, devices, times=1):
     """Return the mean, lowest and highest return of each seed's amplified policy."""
     env = gasil_jax.make_env("point_mass", reward_delay=7)
@@ -278,44 +238,3 @@ def test_a_seeds_scores_are_its_own_and_compile_once(tmp_path, caplog):
     alone = scored(tmp_path, [6], devices=1)
     np.testing.assert_allclose(alone[6], together[6], **TOLERANCE)
     assert np.abs(np.subtract(together[5], together[6])).max() > 0.1
-
-
-def test_keys_differ_by_seed_and_iteration():
-    keys = {
-        tuple(jax.random.key_data(evaluation_key(np.uint32(seed), iteration)).tolist())
-        for seed in (0, 1, 2**32 - 1)
-        for iteration in (1, 2)
-    }
-    assert len(keys) == 6
-
-
-def test_a_sweep_has_the_scores_in_its_tables(tmp_path, capsys):
-    out = tmp_path / "sweep"
-    # The points differ in their number of evaluations, and are two programs.
-    arguments = (*SMALL, "--seeds", "2", "--total-steps", "1024", *EVALUATED)
-    grid = ("--grid", "batch_steps=128,256")
-    assert sweep.main([*arguments, *grid, "--out", str(out)]) == 0
-    curves = np.load(out / "curves.npz")
-    steps = curves["evaluation_env_steps"]
-    np.testing.assert_array_equal(steps[0, 0], [0, 640, 1024])
-    np.testing.assert_array_equal(steps[1, 0], [0, 768, 1024])
-    for name in ("mean", "min", "max", "length"):
-        assert curves[f"evaluation_{name}"].shape == (2, 2, 3)
-    summary = json.loads((out / "summary.json").read_text())
-    assert summary["evaluation_seconds"] > 0
-    final = curves["evaluation_mean"][:, :, -1]
-    with (out / "results.csv").open() as file:
-        table = list(csv.DictReader(file))
-    assert {float(row["final_length"]) for row in table} == {50.0}
-    np.testing.assert_allclose(
-        [float(row["final_evaluation"]) for row in table], final.ravel(), rtol=1e-6
-    )
-    for point, mean in zip(summary["points"], final.mean(axis=1), strict=True):
-        assert point["final_evaluation"] == pytest.approx(mean)
-        assert point["final_length"] == 50.0
-    # A sweep's truncated table is reported.
-    path = next((out / "programs").glob("*/evaluations.csv"))
-    path.write_text("".join(path.read_text().splitlines(keepends=True)[:3]))
-    assert sweep.main(["--resume", "--out", str(out)]) == 2
-    error = capsys.readouterr().err
-    assert "evaluations.csv is damaged: it lacks rows" in error

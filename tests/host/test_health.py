@@ -157,9 +157,8 @@ def test_a_first_observation_is_looked_at_too():
     assert bad.any() and not bad.all() and (scores["episode_return"][bad] == 0.0).all()
 
 
-@pytest.mark.parametrize("limit", [20, 15])
-def test_a_reward_that_is_held_back_is_looked_at_too(limit):
-    env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), limit), 10)
+def test_a_reward_that_is_held_back_is_looked_at_too():
+    env = wrappers.RewardDelay(wrappers.EpisodeLimit(Fragile(), 15), 10)
     small = gasil_jax.algorithm("ppo", **SETTINGS)
     small = small.replace(total_steps=4 * 128)
     _, metrics = jax.jit(gasil_jax.make_train(env, small))(jax.random.key(0))

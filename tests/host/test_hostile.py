@@ -1,5 +1,6 @@
 """Values, command lines and files of any kind are taken, or refused in a line."""
 
+import builtins
 import io
 import json
 import math
@@ -16,6 +17,7 @@ import pytest
 from altered_archives import altered
 from brax.envs import State
 from brax.envs.wrappers import training
+from refusals import refused, rows
 from small_training import FLAGS
 
 import gasil_jax
@@ -31,7 +33,6 @@ from gasil_jax import (
     sweep,
 )
 from gasil_jax.agents import expert
-from gasil_jax.host import output_file
 from gasil_jax.policy import from_state
 
 ENV = gasil_jax.make_env("point_mass")
@@ -75,9 +76,11 @@ SETTINGS = {
     "learning_rate": [*NUMBERS, 0, 1e300],
     "num_envs": [*NUMBERS, 0, 0.5, 2**62, 2**2000],
     "buffer_steps": [*NUMBERS, 0, 0.5, 2**62],
-    "hidden_sizes": [3, (2**62,), [3], (None,), (True,), (0,)],
-    "alpha_schedule": [3, None, ((1,),), ((0, True),), lambda s: None, lambda: 1.0],
+    "hidden_sizes": [3, (2**62,), [3], (None,), (True,), (0,), [64, 64]],
+    "alpha_schedule": [3, None, ((1,),), ((0, True),), lambda s: None, (2e6, 0.0)],
+    "learning_rate_schedule": [((1, 0.5), (0, 1)), ((0, -1),), lambda: 1.0],
     "normalize_rewards": [None, 1, "on", np.True_],
+    "minibatch_size": [60],
 }
 ENVIRONMENT = {
     "reward_delay": [*NUMBERS, 0, 0.5],
@@ -87,12 +90,12 @@ ENVIRONMENT = {
     "max_episode_steps": [0, True, "3"],
 }
 FIT = {
-    "seeds": [*NUMBERS[:4], [], 0, 0.5, [1, 1], [2**32], 2**21],
+    "seeds": [*NUMBERS[:4], [], 0, 0.5, [1, 1], [-1], [2**32], 2**21],
     "evaluate_every": [*NUMBERS[1:], 0, 0.5],
     "evaluate_episodes": [*NUMBERS, 0, 0.5],
-    "checkpoint_every": [*NUMBERS[1:], 0],
-    "resume": [None, 1, "on"],
-    "folder": [3, []],
+    "checkpoint_every": [*NUMBERS[1:], 0, 128],
+    "resume": [None, 1, "on", True],
+    "folder": [3, [], "/proc/none"],
     "callback": [3, "x"],
     "points": [3, [], [3], "alpha"],
 }
@@ -102,9 +105,9 @@ EPISODES = {
     "key": [0, 0.5, None],
 }
 PARTS = {
-    "agent": [3, None],
-    "rewards": [3, None, [], (gasil_jax.Normalize,)],
-    "config": [3, gasil_jax.Config],
+    "agent": [3, None, gasil_jax.PPO],
+    "rewards": [3, None, [], (gasil_jax.Normalize,), gasil_jax.Normalize()],
+    "config": [3, gasil_jax.Config, SMALL],
 }
 
 
@@ -134,10 +137,11 @@ CASES = [
     *of(PARTS, check),
     *of({"which": ["first", 3]}, lambda **x: gasil_jax.load_reward("no", **x)),
     ("alpha", lambda x: gasil_jax.init(ENV, SMALL, KEY, {"alpha": x}), ["3", True]),
-    ("hyperparameters", lambda x: gasil_jax.init(ENV, SMALL, KEY, x), [0, "alpha"]),
+    ("hyperparameters", lambda x: gasil_jax.init(ENV, SMALL, KEY, x), [0, SMALL]),
     ("agent", gasil_jax.algorithm, [3, None, "gasill"]),
-    ("env", lambda x: gasil_jax.preset(x, "ppo"), [3, None]),
+    ("env", lambda x: gasil_jax.preset(x, "ppo"), [3, None, "walker"]),
     ("preset", lambda x: gasil_jax.preset("hopper", "ppo", x), [3, None, "tuend"]),
+    ("reward_delay", lambda x: gasil_jax.preset("ant", "ppo", reward_delay=x), [2.5]),
     ("env", gasil_jax.make_env, [3, None, "hoper", "brax:", ":", "a:b"]),
     ("state", lambda x: gasil_jax.train_step(ENV, SMALL, x), [3, None]),
     ("state", lambda x: from_state(x, ENV), [3, None]),
@@ -161,9 +165,9 @@ def is_allowed(name, value):
 )
 def test_what_is_wrong_is_refused_in_a_line_by_name(name, use, more):
     for value in [*(x for x in NEVER if not is_allowed(name, x)), *more]:
-        with pytest.raises((ValueError, IndexError)) as refused:
+        with pytest.raises((ValueError, IndexError)) as refusal:
             use(value)
-        told = str(refused.value)
+        told = str(refusal.value)
         assert "\n" not in told and len(told) < 2000
         shown = " ".join(str(value).split()) if isinstance(value, str) else name
         assert name in told or shown.removeprefix("zoo:")[:50] in told
@@ -179,31 +183,35 @@ def test_numbers_of_any_library_are_taken():
 
 
 @pytest.mark.parametrize(
-    ("env", "message"),
+    ("use", "message"),
     [
-        (Short(), "env 'Short': the obs of its reset has shape (2,): it must have"),
-        (wrappers.RewardDelay(Short(), 5), "env 'Short': the obs of its reset has"),
-        (wrappers.AutoReset(ENV), "env is wrapped in AutoReset"),
-        (training.AutoResetWrapper(ENV), "env is wrapped in AutoReset"),
+        *[
+            (lambda env=env: gasil_jax.make_train(env, gasil_jax.algorithm()), message)
+            for env, message in (
+                (Short(), "env 'Short': the obs of its reset has shape (2,): it must"),
+                (wrappers.RewardDelay(Short(), 5), "env 'Short': the obs of its reset"),
+                (wrappers.AutoReset(ENV), "env is wrapped in AutoReset"),
+                (training.AutoResetWrapper(ENV), "env is wrapped in AutoReset"),
+            )
+        ],
+        *[
+            (lambda act=act: episodes_of(act), message)
+            for act, message in (
+                (3, "act is 3: it must be a function of observations and a key"),
+                (lambda seen, key: None, "act returns None: it must be of shape (3, 2"),
+                (lambda seen, key: jnp.zeros(2), "returns an array of shape (2,): it"),
+            )
+        ],
     ],
 )
-def test_an_environment_that_does_not_fit_is_refused(env, message):
+def test_what_does_not_fit_is_refused(use, message):
     with pytest.raises(ValueError, match=re.escape(message)) as refusal:
-        gasil_jax.make_train(env, gasil_jax.algorithm())
+        use()
     assert "\n" not in str(refusal.value)
 
 
-@pytest.mark.parametrize(
-    ("act", "why"),
-    [
-        (3, "act is 3: it must be a function of observations and a key"),
-        (lambda observation, key: None, "act returns None: it must be of shape (3, 2)"),
-        (lambda observation, key: jnp.zeros(2), "returns an array of shape (2,): it"),
-    ],
-)
-def test_a_policy_that_returns_no_actions_is_refused(act, why):
-    with pytest.raises(ValueError, match=re.escape(why)):
-        evaluation.run_episodes(ENV, act, KEY, num_episodes=3, num_steps=1)
+def episodes_of(act):
+    evaluation.run_episodes(ENV, act, KEY, num_episodes=3, num_steps=1)
 
 
 #: Each program with a line that can't run: its folder can't be made or found.
@@ -225,74 +233,15 @@ WORDS = [
 ]
 
 
-def refused(capsys, program, words):
-    """Run a command line that ends in one line, and return that."""
-    assert program.main(words) == 2, words
-    printed = capsys.readouterr()
-    told = [x for x in printed.err.splitlines() if x.startswith("error: ")]
-    others = set(printed.err.splitlines()) - set(told)
-    assert all(x.startswith(("note: ", "warning: ")) for x in others), printed.err
-    assert len(told) == 1 and len(told[0]) < 2000 and printed.out == "", words
-    return told[0]
-
-
 def test_an_altered_command_line_ends_in_one_line(capsys, monkeypatch):
     monkeypatch.chdir("/proc")  # Where nothing can be written.
     for program, line in LINES:
         words = line.split()
         for number, word in enumerate(WORDS):
             at = 1 + number % len(words)
-            refused(capsys, program, [*words[:at], word, *words[at:]])
+            refused(capsys, program, *words[:at], word, *words[at:])
         for at in range(len(words)):
-            refused(capsys, program, words[:at] + words[at + 1 :])
-
-
-@pytest.mark.slow
-def test_a_randomly_altered_command_line_ends_in_one_line(capsys, monkeypatch):
-    monkeypatch.chdir("/proc")
-    draw = np.random.default_rng(0)
-    for number in range(60 * len(LINES)):
-        program, line = LINES[number % len(LINES)]
-        words = line.split()
-        for _ in range(2):
-            at, kind = int(draw.integers(len(words))), draw.integers(4)
-            if kind == 0:
-                words.insert(at, WORDS[draw.integers(len(WORDS))])
-            elif kind == 1:
-                words.insert(at, words[draw.integers(len(words))])
-            else:
-                place = int(draw.integers(len(words[at]) + 1))
-                other = "" if kind == 2 else chr(draw.integers(48, 127))
-                words[at] = words[at][:place] + other + words[at][place + 1 :]
-        if {"-h", "--help", "--help-all", "--version"}.isdisjoint(words):
-            refused(capsys, program, words)
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        ("--evaluate-every 0", "evaluate_every is 0: it must be from 1"),
-        ("--evaluate-every x", "evaluate_every is 'x': it must be a whole number"),
-        ("--evaluate-every 9 --evaluate-episodes 0", "evaluate_episodes is 0: it must"),
-        ("--evaluate-episodes 3", "evaluate_episodes is 3: it needs evaluate_every"),
-        ("--evaluate-every 9 --evaluate-episodes 1e12", "GB of memory"),
-        ("--seeds 9" + 400 * "9", "seeds is 99999"),
-        (f"--out {300 * 'x'}", "too long"),
-        (f"--alpha {5000 * 'x'}", f"alpha is '{30 * 'x'}"),
-        (f"--{5000 * 'x'}", "is unknown"),
-        ("--num-env 3", "did you mean --num-envs"),
-    ],
-)
-def test_bad_options_are_one_line(words, message, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    for program, more in ((run, ()), (sweep, ("--grid", "gamma=0.9,0.99"))):
-        given = [*FLAGS, "--out", "out", *words.split(), *more]
-        assert message in refused(capsys, program, given)
-    assert list(tmp_path.iterdir()) == []
-    with pytest.raises(ValueError, match="too long"):
-        # A file is first written under a name that is longer by some 40 bytes.
-        output_file.make_parent(tmp_path / f"{'x' * 240}.gif")
-    assert refused(capsys, evaluate, [300 * "x"])
+            refused(capsys, program, *words[:at], *words[at + 1 :])
 
 
 @pytest.fixture(scope="module")
@@ -304,76 +253,72 @@ def folder(tmp_path_factory):
     return out
 
 
-def edit(*path, value=None):
-    """Return a function that replaces a value in what a JSON file holds."""
-
-    def edited(content):
-        inner = content
-        for key in path[:-1]:
-            inner = inner[key]
-        inner[path[-1]] = value
-        return content
-
-    return edited
-
-
-DAMAGES = [
-    *[
-        (name, lambda _, x=x: x)
-        for name in ("config.json", "program.json", "training.json", "summary.json")
-        for x in (None, 3, [], "x")
-    ],
-    *[("config.json", edit(x)) for x in ("seeds", "points", "algorithm", "settings")],
-    *[
-        ("config.json", edit(*path, value=x))
-        for *path, x in (
-            *(("seeds", [-1]), ("seeds", [2**40]), ("seeds", "two"), ("seeds", [1, 1])),
-            *(("points", []), ("points", [3]), ("points", [{"alhpa": 1.0}])),
-            *(("points", [{"batch_steps": 0}]), ("settings", "gravity", 3)),
-            *(("settings", "obs_noise", "loud"), ("recording", "log", "wandb")),
-            *(("recording", "keep_checkpoints", "all"), ("algorithm", "agent", 3)),
-            *(("algorithm", "agent", "gasill"), ("algorithm", "alpa", 1)),
-            *(("algorithm", "imitation_weight", 0.5), ("algorithm", "gamma", "high")),
-            *(("algorithm", "gamma", -1), ("algorithm", "hidden_sizes", {"a": 1})),
-            *(("algorithm", "normalize_rewards", 1), ("env", "hoper")),
-        )
-    ],
-    *[
-        ("program.json", edit(*path, value=x))
-        for *path, x in (
-            *(("runs", [[0, 0]]), ("runs", [[9, 0], [1, 0]]), ("runs", [3])),
-            *(("labels", {}), ("labels", "seed", [5, 6]), ("labels", "seed", [0])),
-            *(("labels", "point", ["a", "b"]), ("experiments", [3, 4])),
-        )
-    ],
-    *[("training.json", edit(x, value="x")) for x in ("iterations", "versions")],
-    ("summary.json", edit("best_by_mean", value="first")),
-    ("summary.json", edit("best_by_mean", value=7)),
-]
-
-
-@pytest.mark.parametrize(("name", "damage"), DAMAGES)
-def test_a_damaged_file_is_told_in_a_line(name, damage, folder, tmp_path, capsys):
-    """Those that a command does not need change nothing."""
-    out = shutil.copytree(folder, tmp_path / "out")
-    path = next(out.rglob(name))
-    path.write_text(json.dumps(damage(json.loads(path.read_text()))))
-    needs = {"summary.json": [evaluate]}.get(name, [evaluate, plot, sweep])
-    for program in needs:
-        words = [str(out), "--out", str(tmp_path / "x.png")]
-        words = words[:1] if program is evaluate else words
-        resumed = ["--resume", "--out", str(out)]
-        refused(capsys, program, resumed if program is sweep else words)
+#: A file, where in it, and the value that stands there instead of its own.
+DAMAGES = """
+config.json | seeds | [-1]
+config.json | seeds | [1099511627776]
+config.json | seeds | [1, 1]
+config.json | points | []
+config.json | points | [{"alhpa": 1.0}]
+config.json | points | [{"batch_steps": 0}]
+config.json | settings gravity | 3
+config.json | settings obs_noise | "loud"
+config.json | recording log | "wandb"
+config.json | algorithm agent | "gasill"
+config.json | algorithm alpa | 1
+config.json | algorithm imitation_weight | 0.5
+config.json | algorithm gamma | "high"
+config.json | algorithm gamma | -1
+config.json | algorithm hidden_sizes | {"a": 1}
+config.json | env | "hoper"
+program.json | runs | [[0, 0]]
+program.json | runs | [[9, 0], [1, 0]]
+program.json | labels | {}
+program.json | labels seed | [5, 6]
+program.json | labels point | ["a", "b"]
+program.json | experiments | [3, 4]
+training.json | iterations | true
+training.json | train_seconds | null
+training.json | evaluation_seconds | []
+training.json | versions jax | 3
+summary.json | best_by_mean | "first"
+training.json | device | gone
+"""
+KINDS = ("null", "3", "[]", '"x"')
+DESCRIBED = ("config.json", "program.json", "training.json", "summary.json")
+KEYS = ("seeds", "points", "algorithm", "settings")
 
 
 @pytest.mark.parametrize(
-    "content", [b"", b"[" * 100_000, b"\x80\x04N.", b"{}", b"\xff"]
+    ("name", "path", "value"),
+    [
+        *[(name, "", kind) for name in DESCRIBED for kind in KINDS],
+        *[("config.json", key, "null") for key in KEYS],
+        *rows(DAMAGES),
+        *[("config.json", None, x) for x in ("", "[" * 100_000, "\x80\x04N.", "\xff")],
+    ],
 )
-def test_what_is_no_description_is_refused(content, tmp_path, capsys):
-    (tmp_path / "config.json").write_bytes(content)
-    resumed = ["--resume", "--out", str(tmp_path)]
-    for program, words in ((evaluate, [str(tmp_path)]), (run, resumed)):
-        assert "config.json is damaged: " in refused(capsys, program, words)
+def test_a_damaged_file_is_told_in_a_line(name, path, value, folder, tmp_path, capsys):
+    """Those that a command does not need change nothing."""
+    out = shutil.copytree(folder, tmp_path / "out")
+    file = next(out.rglob(name))
+    if path is None:
+        file.write_bytes(value.encode("latin1"))
+    else:
+        content = {"all": json.loads(file.read_text())}
+        inner, (*keys, last) = content, ("all", *path.split())
+        for key in keys:
+            inner = inner[key]
+        if value == "gone":
+            del inner[last]
+        else:
+            inner[last] = json.loads(value)
+        file.write_text(json.dumps(content["all"]))
+    told = [refused(capsys, evaluate, out)]
+    if name != "summary.json":
+        told.append(refused(capsys, plot, out, "--out", tmp_path / "x.png"))
+        told.append(refused(capsys, sweep, "--resume", "--out", out))
+    assert path is not None or all(f"{name} is damaged: " in line for line in told)
 
 
 def saved(kind, *arguments, **arrays):
@@ -429,8 +374,6 @@ def load(path):
 
 @pytest.mark.parametrize("content", CONTENTS)
 def test_a_foreign_archive_is_refused_and_never_unpickled(content, tmp_path):
-    import builtins
-
     path = tmp_path / "x.npz"
     path.write_bytes(content)
     for use in (act_of, load):
@@ -438,6 +381,13 @@ def test_a_foreign_archive_is_refused_and_never_unpickled(content, tmp_path):
             use(path)
         assert "\n" not in str(refusal.value) and str(path) in str(refusal.value)
     assert not hasattr(builtins, "exploded")
+
+
+@pytest.mark.parametrize("name", ["seeds", "final_return", "mean", "scale", "kernel_0"])
+def test_a_file_of_policies_without_one_of_its_arrays_is_refused(name, tmp_path):
+    np.savez(tmp_path / "policy.npz", **{x: y for x, y in POLICY.items() if x != name})
+    with pytest.raises(ValueError, match=rf"is not a saved policy \({name} is missing"):
+        gasil_jax.load_policy(tmp_path)
 
 
 @pytest.mark.slow

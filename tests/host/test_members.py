@@ -34,10 +34,10 @@ def compiled(agent):
     return members, jax.tree.map(jnp.asarray, members.trim(states)), advance
 
 
-@pytest.mark.xdist_group("members ppo")
+@pytest.mark.xdist_group("members ppo+gasil")
 def test_the_members_of_padded_states_are_taken_on_the_host():
     """Sliced by JAX, each device would get the states of all members."""
-    members, states, _ = compiled("ppo")
+    members, states, _ = compiled("ppo+gasil")
     states = members.trim(members.to_devices(states))
     arrays = [
         jax.random.key_data(x)
