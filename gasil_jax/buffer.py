@@ -1,12 +1,11 @@
 """The good-trajectory buffer: the steps of the top-K episodes, in fixed arrays.
 
 Paper, section 4.1. An episode is offered to the buffer as a whole once it has ended. It
-is ranked by the return of the environment's own reward: R = sum_t gamma^t r_t, or the
-undiscounted sum if `buffer_discounts` is false. The capacity is in steps: all
-steps that were ever offered are ordered by (return descending, episode, time), and the
-first `capacity` of them are kept. So the last episode in the buffer may be cut, and on
-a tie the older episode stays. All functions are pure and work under jit, vmap and
-shard_map; an empty buffer is a normal state.
+is ranked by the return of the environment's own reward, R = sum_t gamma^t r_t. The
+capacity is in steps: all steps that were ever offered are ordered by (return
+descending, episode, time), and the first `capacity` of them are kept. So the last
+episode in the buffer may be cut, and on a tie the older episode stays. All functions
+are pure and work under jit, vmap and shard_map; an empty buffer is a normal state.
 """
 
 import chex
@@ -55,8 +54,8 @@ class History(struct.PyTreeNode):
       observation: float32 (N, H, obs).
       action: float32 (N, H, action).
       reward: float32 (N, H), the reward, never normalized; in an agent's context it may
-        be decomposed. NaN in faulty steps, and in the last step of an episode that was
-        cut short.
+        be decomposed. NaN in faulty steps, in the last step of an episode that was cut
+        short, and where no step is recorded yet.
       ended: bool (N, H), whether the step was the last of its episode.
       cursor: int32 (), index at which the next step is written.
       next_observation: float32 (N, H, obs), after the action; None if it is not kept.
@@ -113,8 +112,8 @@ def init_history(
     return History(
         observation=observations(),
         action=jnp.zeros((num_envs, length, action_size), jnp.float32),
-        reward=jnp.zeros((num_envs, length), jnp.float32),
-        # No episode begins before the first recorded step.
+        # No episode begins before the first recorded step, and none is valid there.
+        reward=jnp.full((num_envs, length), jnp.nan, jnp.float32),
         ended=jnp.ones((num_envs, length), bool),
         cursor=jnp.int32(0),
         next_observation=observations() if keep_next else None,

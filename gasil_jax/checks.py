@@ -21,8 +21,7 @@ from gasil_jax.errors import refusal, shown
 def check(env: Any, algorithm: Algorithm) -> None:
     """Raise `ValueError` if the algorithm can't train in the environment.
 
-    Nothing is compiled, and the environment is not traced. Of the agent, only networks
-    of the user's own are traced.
+    Nothing is compiled, and only networks of the user's own are traced.
     """
     _check_interface(env)
     algorithms.check(algorithm)
@@ -31,14 +30,12 @@ def check(env: Any, algorithm: Algorithm) -> None:
     with user_code.refused(f"check of agent {agent.name!r} fails", passing=ValueError):
         agent.check(sizes)
     _check_networks(agent, sizes)
-    reason = None
-    if sizes.discrete:
-        reason = "the environment's actions are discrete"
-    elif type(agent).policy_network is not Agent.policy_network:
-        reason = f"agent {agent.name!r} has a policy_network of its own, with one mean"
-    if config.policy_components > 1 and reason:
+    own = type(agent).policy_network is not Agent.policy_network
+    if config.policy_components > 1 and (sizes.discrete or own):
+        why = f"agent {agent.name!r} has a policy_network of its own, with one mean"
+        why = "the environment's actions are discrete" if sizes.discrete else why
         raise ValueError(
-            f"policy_components is {config.policy_components}: it must be 1, {reason}"
+            f"policy_components is {config.policy_components}: it must be 1, {why}"
         )
 
 

@@ -28,6 +28,8 @@ SCHEDULE_SUFFIX = "_schedule"
 
 #: Counts are int32, and all other numbers float32.
 _LARGEST_COUNT, _LARGEST_FLOAT = 2**31 - 1, 3.4e38
+#: Numbers that are smaller are 0 in float32.
+_SMALLEST_FLOAT = 1.2e-38
 
 
 class Range(NamedTuple):
@@ -43,6 +45,8 @@ class Range(NamedTuple):
         if not isinstance(value, kind) or isinstance(value, bool):
             return False
         is_above = value > self.low if self.excludes_low else value >= self.low
+        if self.excludes_low and self.low == 0:
+            is_above = value >= _SMALLEST_FLOAT
         return bool(is_above and value <= self.high)
 
     def __str__(self) -> str:
@@ -52,6 +56,7 @@ class Range(NamedTuple):
         least = (
             f"more than {self.low:g}" if self.excludes_low else f"{self.low:g} or more"
         )
+        least += " in float32" if self.excludes_low else ""
         most = f"at most {self.high:g}" if self.high < _LARGEST_FLOAT else "finite"
         return f"{least} and {most}"
 

@@ -86,8 +86,7 @@ def merge_metrics(source: str, *groups: Metrics) -> Metrics:
     """Return groups of metrics as one, float32 () by name.
 
     Raises:
-      ValueError: if two have the same name, or one is not a single number; the message
-        names the source, such as "agent 'ppo'".
+      ValueError: if two have the same name, or one is not a single number.
     """
     merged: Metrics = {}
     for name, value in (pair for group in groups for pair in group.items()):

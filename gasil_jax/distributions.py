@@ -61,9 +61,8 @@ def _gaussian_sample(key: jax.Array, parameters: Any) -> jax.Array:
 
 def _gaussian_log_prob(parameters: Any, action: jax.Array) -> jax.Array:
     mean, log_std = parameters
-    log_std, precision = (
-        jax.lax.broadcast_to_rank(x, mean.ndim) for x in (log_std, jnp.exp(-log_std))
-    )
+    precision = jax.lax.broadcast_to_rank(jnp.exp(-log_std), mean.ndim)
+    log_std = jax.lax.broadcast_to_rank(log_std, mean.ndim)
     z = (action - mean) * precision
     return jnp.sum(-0.5 * z**2 - log_std - 0.5 * _LOG_2PI, axis=-1)
 
@@ -117,11 +116,10 @@ def _mixture_log_prob(parameters: Any, action: jax.Array) -> jax.Array:
 
 
 def _mixture_entropy(parameters: Any) -> jax.Array:
-    """Return a lower bound: a mixture's entropy has no closed form.
+    """Return a lower bound of the entropy, which has no closed form.
 
-    It is that of Kolchinsky and Tracey (2017, "Estimating mixture entropy with pairwise
-    distances") with Bhattacharyya distances. It is exact where all means are the same
-    and where all are far apart, and rises in between as they part.
+    It is that of Kolchinsky and Tracey (2017) with Bhattacharyya distances: exact where
+    all means are the same and where all are far apart, and rising in between.
     """
     mean, log_std, logits = parameters
     scaled = mean * jax.lax.broadcast_to_rank(jnp.exp(-log_std), mean.ndim)

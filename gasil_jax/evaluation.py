@@ -66,15 +66,9 @@ def run_episodes(
     num_steps: int,
     deterministic: bool = True,
 ) -> dict[str, jax.Array]:
-    """Run complete episodes with a policy; `evaluate` describes what is returned.
+    """Do what `evaluate` does, with a policy ``act(observation, key)`` -> action.
 
-    Args:
-      env: one environment.
-      act: (observation, key) -> action, a policy as from `policy.load_policy`.
-      key: random key; consumed.
-      num_episodes: number of episodes, which run in parallel.
-      num_steps: steps after which an episode is truncated, at the latest.
-      deterministic: whether to act with the policy's mean; else actions are drawn.
+    Episodes are truncated after `num_steps` steps.
 
     Raises:
       ValueError: as in `evaluate`, or if `env` is no environment, or if `act` is no

@@ -9,16 +9,11 @@ from flax import struct
 
 
 class Learner(struct.PyTreeNode):
-    """A network's parameters and its optimizer's state, one pytree.
-
-    Attributes:
-      params: the parameters.
-      optimizer_state: the optimizer's state.
-      network: the Flax module, if it is none of the package's.
-    """
+    """A network's parameters and its optimizer's state, one pytree."""
 
     params: Any
     optimizer_state: Any
+    #: The Flax module, if it is none of the package's.
     network: Any = struct.field(pytree_node=False, default=None)
 
 

@@ -51,23 +51,13 @@ def _orthogonal(
 
 
 class MLP(nn.Module):
-    """Hidden layers and a linear output layer, orthogonally initialized.
-
-    Attributes:
-      hidden_sizes: widths of the hidden layers.
-      output_size: width of the output.
-      output_scale: scale of the output layer's initial weights.
-      activation: a key of `ACTIVATIONS`.
-      layer_norm: whether what a hidden layer computes is normalized before the
-        activation (Ba, Kiros, Hinton 2016).
-      output_bias: initializer of the output layer's bias.
-    """
+    """Hidden layers and a linear output layer, orthogonally initialized."""
 
     hidden_sizes: Sequence[int]
     output_size: int
-    output_scale: float = 1.0
-    activation: str = "tanh"
-    layer_norm: bool = False
+    output_scale: float = 1.0  # of the output layer's initial weights
+    activation: str = "tanh"  # a key of `ACTIVATIONS`
+    layer_norm: bool = False  # before each activation (Ba, Kiros, Hinton 2016)
     output_bias: nn.initializers.Initializer = nn.initializers.zeros
 
     @nn.compact
@@ -127,11 +117,11 @@ class MixturePolicy(_Policy):
     """A mixture of Gaussians with one log standard deviation, the same in all states.
 
     Components with the same mean would get the same gradients and stay together. So
-    their first means, which are biases, are drawn at random. In each dimension half of
-    the variance of an untrained policy's actions is within the components, and half
-    between them: two components are then two of their deviations apart, far enough that
-    an action is ascribed to one of them. The whole mixture has mean 0 and standard
-    deviation 1, as a Gaussian has, and its components are nearly equally probable.
+    their first means, which are biases, are drawn at random. Half of the variance of an
+    untrained policy's actions is within the components, and half between them: two
+    components are then two of their deviations apart, so that an action is ascribed to
+    one of them. The whole mixture has mean 0 and standard deviation 1, as a Gaussian
+    has, and its components are nearly equally probable.
     """
 
     @nn.compact

@@ -12,17 +12,11 @@ CLIP = 10.0
 
 
 class Normalizer(struct.PyTreeNode):
-    """The mean and variance of all observations so far.
+    """The mean and variance of all observations so far; float32."""
 
-    Attributes:
-      count: float32 (), number of observations.
-      mean: float32 (obs,).
-      m2: float32 (obs,), sum of squared differences from the mean.
-    """
-
-    count: jax.Array
-    mean: jax.Array
-    m2: jax.Array
+    count: jax.Array  # (), number of observations
+    mean: jax.Array  # (obs,)
+    m2: jax.Array  # (obs,), sum of squared differences from the mean
 
 
 def init(observation_size: int) -> Normalizer:

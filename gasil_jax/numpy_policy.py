@@ -133,13 +133,9 @@ def is_mixture(weights: Mapping[str, Any]) -> bool:
 
 
 def components(output: Any, action_size: int) -> tuple[Any, Any]:
-    """Return the means and the logits of a mixture's Gaussians.
+    """Split a mixture's output, (..., component * (action + 1)).
 
-    The means are (..., component, action), and the logits (..., component).
-
-    Args:
-      output: of the network, (..., component * (action + 1)).
-      action_size: dimension of an action.
+    Returns the means, (..., component, action), and the logits, (..., component).
     """
     shape, count = output.shape[:-1], output.shape[-1] // (action_size + 1)
     mean, logits = output[..., :-count], output[..., -count:]
@@ -158,8 +154,8 @@ def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
 def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
     """Return the output of the policy's network.
 
-    It is the mean of the actions, or the logits of discrete ones, (..., action). For a
-    mixture it is (..., component * (action + 1)); `components` splits it.
+    It is the mean of the actions, or the logits of discrete ones, (..., action); for a
+    mixture see `components`.
 
     Args:
       weights: the arrays from `read`.
@@ -198,13 +194,8 @@ def _activate(weights: Mapping[str, Any], x: Any, layer: int, xp: Any) -> Any:
 def probabilities(weights: Mapping[str, Any], observation: Any) -> np.ndarray:
     """Return the probability of each discrete action, (..., action).
 
-    Args:
-      weights: the arrays from `read`.
-      observation: (..., obs), not normalized.
-
     Raises:
-      ValueError: if the policy's actions are not discrete, or if the observation has
-        another size than the policy's.
+      ValueError: as in `output`, or if the policy's actions are not discrete.
     """
     if not is_discrete(weights):
         raise ValueError(

@@ -5,6 +5,7 @@ several times as fast as an array of keys with an array of values, and PPO draws
 permutation in each of its epochs.
 """
 
+import functools
 import math
 from typing import Any
 
@@ -21,16 +22,10 @@ def permutation(key: jax.Array, size: int) -> jax.Array:
 
     The order is that of `jax.random.permutation`. The key is consumed.
     """
-
-    def of_jax(key: jax.Array) -> jax.Array:
-        return jax.random.permutation(key, size)
-
+    of_jax = functools.partial(jax.random.permutation, x=size)
     if not 1 < size <= _MAX_SIZE:
         return of_jax(key)
-
-    def ours(key: jax.Array) -> jax.Array:
-        return _by_packed_keys(key, size)
-
+    ours = functools.partial(_by_packed_keys, size=size)
     return jax.lax.platform_dependent(key, cpu=ours, default=of_jax)
 
 

@@ -76,7 +76,7 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
         return jnp.asarray(x, jnp.float32)
 
     arrays = jax.tree.map(float32, dict(weights))
-    network = arrays.pop("network", None)
+    network, log_std = arrays.pop("network", None), arrays.get("log_std")
     discrete = numpy_policy.is_discrete(arrays)
     mixture = numpy_policy.is_mixture(arrays)
     distribution = CATEGORICAL if discrete else MIXTURE if mixture else GAUSSIAN
@@ -91,11 +91,10 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
             else:
                 parameters = numpy_policy.output(arrays, float32(observation), jnp)
                 if mixture:
-                    log_std = arrays["log_std"]
                     mean, logits = numpy_policy.components(parameters, len(log_std))
                     parameters = mean, log_std, logits
                 elif not discrete:
-                    parameters = parameters, arrays["log_std"]
+                    parameters = parameters, log_std
             if key is None:
                 action = distribution.mode(parameters)
             else:

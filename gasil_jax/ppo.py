@@ -16,12 +16,7 @@ from gasil_jax.permutation import permutation
 
 
 class ActorCritic(struct.PyTreeNode):
-    """The policy and one value for each reward stream, all with their own optimizers.
-
-    Attributes:
-      policy: parameters and optimizer state of the policy's network.
-      values: the same of a `networks.Value` for each stream.
-    """
+    """The policy and a value for each reward stream, all with their own optimizers."""
 
     policy: Learner
     values: tuple[Learner, ...]
@@ -36,21 +31,13 @@ class ActorCritic(struct.PyTreeNode):
 
 
 class Batch(struct.PyTreeNode):
-    """The steps that PPO learns from; the leading axis is (steps,) or (minibatch,).
+    """The steps that PPO learns from, all of a batch or a minibatch; float32."""
 
-    Attributes:
-      observation: float32 (steps, obs), normalized.
-      action: float32 (steps, action).
-      log_prob: float32 (steps,), log density under the policy that acted.
-      advantage: float32 (steps,).
-      returns: float32 (steps, stream), targets of the values.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    log_prob: jax.Array
-    advantage: jax.Array
-    returns: jax.Array
+    observation: jax.Array  # (steps, obs), normalized
+    action: jax.Array  # (steps, action)
+    log_prob: jax.Array  # (steps,), under the policy that acted
+    advantage: jax.Array  # (steps,)
+    returns: jax.Array  # (steps, stream), targets of the values
 
 
 def generalized_advantage_estimation(

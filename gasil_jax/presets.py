@@ -134,17 +134,11 @@ def _scaled(decompose_rewards: bool) -> Rows:
 
 
 class Preset(NamedTuple):
-    """The overrides of a preset, by environment and agent.
+    """The overrides of a preset, by environment and agent."""
 
-    Attributes:
-      dense: rows for rewards that are given at every step.
-      delayed: rows for delayed rewards.
-      every: overrides for all tasks and agents; a row takes precedence.
-    """
-
-    dense: Rows
-    delayed: Rows
-    every: Overrides = types.MappingProxyType({})
+    dense: Rows  # for rewards that are given at every step
+    delayed: Rows  # for delayed rewards
+    every: Overrides = types.MappingProxyType({})  # for all; a row takes precedence
 
 
 PRESETS: Mapping[str, Preset] = {

@@ -33,7 +33,6 @@ class Rollout(struct.PyTreeNode):
       discounted_return: float32 (time, env), the episode's sum of gamma^t reward up to
         this step, of the environment's own rewards; NaN from the first faulty step on,
         and where the episode was cut short.
-      undiscounted_return: float32 (time, env), the same with gamma 1.
       episode_length: int32 (time, env), number of steps up to this one.
       faulty: bool (time, env), whether the physics failed in this step.
       cut_short: bool (time, env), whether the episode was truncated before it reached
@@ -49,7 +48,6 @@ class Rollout(struct.PyTreeNode):
     truncated: jax.Array
     episode_return: jax.Array
     discounted_return: jax.Array
-    undiscounted_return: jax.Array
     episode_length: jax.Array
     faulty: jax.Array
     cut_short: jax.Array
@@ -69,26 +67,15 @@ class Rollout(struct.PyTreeNode):
 
 
 class EnvironmentStates(struct.PyTreeNode):
-    """The running episodes; every field is (env, ...).
+    """The running episodes; every field is (env, ...), its sums those of `Rollout`."""
 
-    Attributes:
-      state: the environments' states, a Brax ``State``.
-      episode_return: float32 (env,), sum of undelayed rewards so far.
-      discounted_return: float32 (env,), sum of gamma^t reward so far.
-      undiscounted_return: float32 (env,), sum of rewards so far.
-      discount: float32 (env,), gamma^t.
-      episode_length: int32 (env,), number of steps so far.
-      starting_age: int32 (env,), the age in steps at which the running episode began.
-        The episode is truncated when this plus its length reaches the limit. Only an
-        environment's first episode may begin at an age above 0.
-    """
-
-    state: Any
+    state: Any  # Brax's `State`
     episode_return: jax.Array
     discounted_return: jax.Array
-    undiscounted_return: jax.Array
-    discount: jax.Array
-    episode_length: jax.Array
+    discount: jax.Array  # float32, gamma^t
+    episode_length: jax.Array  # int32, number of steps so far
+    # int32, the age in steps at which the episode began; above 0 in the first one only.
+    # The episode is truncated when this plus its length reaches the limit.
     starting_age: jax.Array
 
 
@@ -103,15 +90,10 @@ def init(
 ) -> EnvironmentStates:
     """Start an episode in each of `num_envs` environments.
 
-    Args:
-      env: a single environment with Brax's interface, not wrapped to reset itself.
-      key: random key for the initial states and the ages; consumed.
-      num_envs: number of environments.
-      age_limit: each first episode begins at an age drawn uniformly from
-        [0, age_limit); None starts all of them at age 0. In a task whose episodes
-        never end early, environments that start together stay together, and each
-        batch then holds one thin slice of the episode (Staggered Environment Resets,
-        arXiv 2511.21011).
+    Each first episode begins at an age drawn uniformly from [0, age_limit), or at 0 if
+    `age_limit` is None. In a task whose episodes never end early, environments that
+    start together stay together, and each batch then holds one thin slice of the
+    episode (Staggered Environment Resets, arXiv 2511.21011). The key is consumed.
     """
     keys = jax.random.split(key, num_envs + 1)
     state = jax.vmap(env.reset)(keys[:-1])
@@ -125,7 +107,6 @@ def init(
         state=state,
         episode_return=jnp.zeros(num_envs, jnp.float32),
         discounted_return=jnp.zeros(num_envs, jnp.float32),
-        undiscounted_return=jnp.zeros(num_envs, jnp.float32),
         discount=jnp.ones(num_envs, jnp.float32),
         episode_length=jnp.zeros(num_envs, jnp.int32),
         starting_age=starting_age,
@@ -191,7 +172,7 @@ def collect(
       distribution: the distribution of actions.
       num_steps: number of steps in each environment.
       max_episode_steps: length at which an episode is truncated.
-      gamma: discount of the episodes' return.
+      gamma: discount of `Rollout.discounted_return`.
 
     If the physics fails (`wrappers.step_is_sound`), the episode terminates with reward
     0 and the step is marked in ``faulty``. If an episode is truncated here, its last
@@ -240,7 +221,6 @@ def collect(
         episode_return = carry.episode_return + true_reward
         own_reward = jnp.where(sound, reward, jnp.nan)
         discounted_return = carry.discounted_return + carry.discount * own_reward
-        undiscounted_return = carry.undiscounted_return + own_reward
         transition = Rollout(
             observation=observation,
             next_observation=next_observation,
@@ -251,7 +231,6 @@ def collect(
             truncated=truncated,
             episode_return=episode_return,
             discounted_return=jnp.where(cut_short, jnp.nan, discounted_return),
-            undiscounted_return=jnp.where(cut_short, jnp.nan, undiscounted_return),
             episode_length=length,
             faulty=~sound,
             cut_short=cut_short,
@@ -263,7 +242,6 @@ def collect(
             state=state,
             episode_return=jnp.where(ended, 0.0, episode_return),
             discounted_return=jnp.where(ended, 0.0, discounted_return),
-            undiscounted_return=jnp.where(ended, 0.0, undiscounted_return),
             discount=jnp.where(ended, 1.0, carry.discount * gamma),
             episode_length=jnp.where(ended, 0, length),
             starting_age=jnp.where(ended, 0, carry.starting_age),

@@ -40,7 +40,7 @@ def bootstrap_interval(
 
     Args:
       scores: (seeds, ...). Seeds are drawn with replacement, the same ones for all
-        trailing entries; each trailing entry has its own interval.
+        trailing entries, which have an interval each.
       resamples: number of resamples; their draws are the same in every call.
 
     Returns:

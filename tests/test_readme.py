@@ -269,7 +269,7 @@ def test_options_in_the_table_exist():
     fields = [field for row in rows for field in re.findall(r"--[a-z-]+", row)]
     assert len(fields) > 18
     given, requested = options.read(options.Options, ["--env", "hopper"], "x")
-    names = {*vars(given), *vars(requested.settings)}
+    names = {*vars(given), *vars(requested.settings), *vars(requested.recording)}
     for agent in gasil_jax.agents.AGENTS:
         models = {"decompose_rewards": True, "normalize_rewards": True}
         names |= gasil_jax.algorithm(agent, **models).settings.keys()

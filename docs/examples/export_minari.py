@@ -37,8 +37,8 @@ def main() -> None:
     parser.add_argument("name", help="NAMESPACE/DATASET-vVERSION")
     options = parser.parse_args()
 
-    env, algorithm, seeds, states = saved.load(options.run)
-    every = jax.device_get(algorithm.agent.good_trajectories(states.agent))
+    env, _, seeds, states = saved.load(options.run)
+    every = jax.device_get(states.agent.buffer)
     num_actions, episodes = getattr(env, "num_actions", None), []
     for i in range(len(seeds)):
         buffer = jax.tree.map(lambda x, i=i: x[i], every)

@@ -20,8 +20,6 @@ from gasil_jax.config import number
 class Nearest(BufferedAgent):
     """PPO on the environment's reward and a bonus for steps close to good ones.
 
-    Its state is the buffer of good episodes.
-
     Attributes:
       closeness_weight: the bonus of a step that is equal to a good one.
     """
@@ -35,12 +33,12 @@ class Nearest(BufferedAgent):
             observation = normalization.normalize(context.normalizer, observation)
             return jnp.concatenate([observation, action], axis=-1)
 
-        good = pairs(*buffer.sample(key, state, 256))
+        good = pairs(*buffer.sample(key, state.buffer, 256))
         own = pairs(context.rollout.observation, context.rollout.action)
         squares = jnp.sum((own[:, :, None] - good) ** 2, axis=-1)  # (time, env, 256)
         closeness = jnp.exp(-jnp.sqrt(jnp.min(squares, axis=-1)))
         # The buffer is empty until an episode has ended.
-        closeness = jnp.where(state.size > 0, closeness, 0.0)
+        closeness = jnp.where(state.buffer.size > 0, closeness, 0.0)
         reward = context.rollout.reward + self.closeness_weight * closeness
         return state, reward, {"closeness": jnp.mean(closeness)}
 

@@ -42,16 +42,12 @@ class PPOBCAdaptive(gasil_jax.PPOBC):
             self.init_buffer(sizes), jnp.float32(0.0), jnp.bool_(False)
         )
 
-    def good_trajectories(self, state: AdaptiveCloningState) -> GoodTrajectories:
-        """Return the buffer in a state."""
-        return state.buffer
-
     def remember(
         self, state: AdaptiveCloningState, context: Context
     ) -> AdaptiveCloningState:
         """Insert a batch's episodes into the buffer, and follow the policy's return."""
         batch, past = context.rollout, (state.policy_return, state.has_episodes)
-        return_ = self.ranked_by(batch)
+        return_ = batch.discounted_return
         followed = follow_return(*past, batch.completed, return_=return_)
         buffer = self.insert(state.buffer, context, return_)
         return AdaptiveCloningState(buffer, *followed)
@@ -65,7 +61,7 @@ class PPOBCAdaptive(gasil_jax.PPOBC):
         coefficient = factor * self.behavior_cloning_coefficient
         weighted = self.replace(behavior_cloning_coefficient=coefficient)
         _, cloned, metrics = super(PPOBCAdaptive, weighted).update_policy(
-            state.buffer, actor_critic, context, key
+            state, actor_critic, context, key
         )
         policy = jax.tree.map(
             lambda new, old: jnp.where(factor > 0, new, old),

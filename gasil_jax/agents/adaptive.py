@@ -48,22 +48,13 @@ RULES: Mapping[str, Callable[[jax.Array, jax.Array], jax.Array]] = {
 
 
 class Adaptive(struct.PyTreeNode):
-    """The state of the agent.
-
-    Attributes:
-      discriminator: the discriminator D.
-      bonus_normalizer: normalizes the bonus, so that the targets of its value have the
-        same scale as those of a normalized reward's.
-      policy_return: float32 (), moving mean of the returns of the policy's latest
-        episodes, discounted as the buffer ranks them; 0 before the first episode.
-      has_episodes: bool (), whether an episode has been counted.
-      buffer: the good-trajectory buffer.
-    """
+    """The state of the agent."""
 
     discriminator: Learner
+    # The targets of the bonus's value have the scale of a normalized reward's.
     bonus_normalizer: reward_normalization.RewardNormalizer
-    policy_return: jax.Array
-    has_episodes: jax.Array
+    policy_return: jax.Array  # float32 (), moving mean over the latest whole episodes
+    has_episodes: jax.Array  # bool (), whether an episode has been counted
     buffer: GoodTrajectories
 
 
@@ -74,15 +65,13 @@ def follow_return(
     *,
     return_: jax.Array,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the moving mean of the policy's returns after a batch's episodes.
+    """Return the first two arguments, as in `Adaptive`, after a batch's episodes.
 
     Args:
-      policy_return: float32 (), the mean before the batch.
-      has_episodes: bool (), whether there were episodes before the batch; whether there
-        are after it is returned too.
+      policy_return: float32 (), the moving mean before the batch.
+      has_episodes: bool (), whether an episode was counted before the batch.
       completed: bool (time, env), whether a whole episode ended with this step.
-      return_: float32 (time, env), the episode's return up to this step; NaN if it does
-        not count.
+      return_: float32 (time, env), its return; NaN if it does not count.
     """
     counted = completed & jnp.isfinite(return_)
     count = jnp.sum(counted)
@@ -130,18 +119,14 @@ class PPOGASILAdaptive(SelfImitatingAgent):
         self, state: Adaptive, context: Context, key: jax.Array
     ) -> tuple[Adaptive, jax.Array, Metrics]:
         """Train the discriminator, and return both streams, (time, env, 2)."""
-        discriminator, bonus, metrics = self.update_and_score(
-            state.discriminator, self.source(state.buffer), context, key
-        )
+        discriminator, bonus, metrics = self.update_and_score(state, context, key)
         batch = context.rollout
         normalizer = reward_normalization.update(
             state.bonus_normalizer, bonus, batch.ended, gamma=context.config.gamma
         )
+        past = (state.policy_return, state.has_episodes)
         policy_return, has_episodes = follow_return(
-            state.policy_return,
-            state.has_episodes,
-            batch.completed,
-            return_=self.ranked_by(batch),
+            *past, batch.completed, return_=batch.discounted_return
         )
         metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
         metrics |= self.buffer_metrics(state.buffer)

@@ -28,7 +28,6 @@ from gasil_jax import learner, normalization
 from gasil_jax.agents import expert
 from gasil_jax.agents.buffered import BufferedAgent
 from gasil_jax.agents.interface import Agent
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import Schedule, choice, count, number, schedule, text, widths
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.learner import Learner
@@ -93,19 +92,22 @@ def loss(
 
 
 class Source(NamedTuple):
-    """The source of the pairs that the policy imitates.
+    """The source of the pairs that the policy imitates."""
 
-    Attributes:
-      sample: (key, n) -> observation (n, obs), action (n, action).
-      is_ready: bool (), whether there is anything to sample.
-    """
-
+    #: (key, n) -> observation (n, obs), action (n, action).
     sample: Callable[[jax.Array, int], tuple[jax.Array, jax.Array]]
-    is_ready: jax.Array
+    is_ready: jax.Array  # bool (), whether there is anything to sample
+
+
+class Imitation(struct.PyTreeNode):
+    """The state of an adversarial agent."""
+
+    discriminator: Learner  # D
+    buffer: Any = None  # `GoodTrajectories`, B in the paper; GAIL has none
 
 
 class AdversarialAgent(Agent):
-    """An agent with a discriminator.
+    """An agent with a discriminator, `state.discriminator`.
 
     Attributes:
       bonus: form of the discriminator's reward: softplus, -log D, as in the paper;
@@ -126,6 +128,10 @@ class AdversarialAgent(Agent):
     discriminator_hidden_sizes: tuple[int, ...] = widths(100, 100)
     discriminator_entropy_coefficient: float = number(1e-3, 0.0)
 
+    def source(self, state: Any, context: Context) -> Source:
+        """Return the source of the pairs that the policy imitates."""
+        raise NotImplementedError
+
     def discriminator_network(self) -> Any:
         """Return the Flax module of the logit: (..., obs), (..., action) -> (...).
 
@@ -137,9 +143,8 @@ class AdversarialAgent(Agent):
     def init_discriminator(self, key: jax.Array, sizes: Sizes) -> Learner:
         """Return an untrained discriminator; consumes the key."""
         pair = jnp.zeros(sizes.observation), jnp.zeros(sizes.action)
-        return learner.init(
-            self.discriminator_network().init(key, *pair), learner.adam()
-        )
+        params = self.discriminator_network().init(key, *pair)
+        return learner.init(params, learner.adam())
 
     def logit(
         self, params: Any, normalizer: Normalizer, observation: Any, action: Any
@@ -150,22 +155,16 @@ class AdversarialAgent(Agent):
 
     @jax.named_scope("discriminator")
     def update_and_score(
-        self, discriminator: Learner, source: Source, context: Context, key: jax.Array
+        self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Learner, jax.Array, Metrics]:
         """Train the discriminator, and return the bonus of each step of the batch.
-
-        Args:
-          discriminator: the discriminator before the update.
-          source: the pairs that the policy imitates.
-          context: the iteration's data.
-          key: random key; consumed.
 
         Returns:
           The discriminator; the bonus without alpha, float32 (time, env), which is 0
           while there is nothing to imitate; and metrics.
         """
-        discriminator, metrics = self._train(discriminator, source, context, key)
-        batch = context.rollout
+        source, batch = self.source(state, context), context.rollout
+        discriminator, metrics = self._train(state.discriminator, source, context, key)
         pairs = context.normalizer, batch.observation, batch.action
         bonus = BONUSES[self.bonus](self.logit(discriminator.params, *pairs))
         return discriminator, jnp.where(source.is_ready, bonus, 0.0), metrics
@@ -209,10 +208,6 @@ class AdversarialAgent(Agent):
         }
         return learner.select(source.is_ready, trained, discriminator), metrics
 
-    def discriminator(self, state: Any) -> Learner:
-        """Return the discriminator in a state."""
-        return state.discriminator
-
     def reward(
         self, state: Any, normalizer: Normalizer
     ) -> Callable[[jax.Array, jax.Array], jax.Array]:
@@ -229,7 +224,7 @@ class AdversarialAgent(Agent):
                 f"bonus is {self.bonus!r}: the reward of a step then depends on the "
                 "batch that it is in"
             )
-        params, form = self.discriminator(state).params, BONUSES[self.bonus]
+        params, form = state.discriminator.params, BONUSES[self.bonus]
         return lambda *pair: form(self.logit(params, normalizer, *pair))
 
 
@@ -247,40 +242,27 @@ class ShapedRewardAgent(AdversarialAgent):
     alpha: float = number(0.1, 0.0)
     alpha_schedule: Schedule = schedule()
 
-    def shape(self, context: Context, bonus: jax.Array) -> tuple[jax.Array, Metrics]:
-        """Return the rewards that PPO maximizes, (time, env), and metrics."""
+    def init(self, key: jax.Array, sizes: Sizes) -> Imitation:
+        return Imitation(self.init_discriminator(key, sizes))
+
+    def update_and_reward(
+        self, state: Imitation, context: Context, key: jax.Array
+    ) -> tuple[Imitation, jax.Array, Metrics]:
+        discriminator, bonus, metrics = self.update_and_score(state, context, key)
         bonus = self.alpha * bonus
         reward = context.rollout.reward + bonus if self.uses_reward else bonus
-        return reward, {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
-
-
-class SelfImitation(struct.PyTreeNode):
-    """The discriminator and what it learns from.
-
-    Attributes:
-      discriminator: D.
-      buffer: the good-trajectory buffer, B in the paper.
-    """
-
-    discriminator: Learner
-    buffer: GoodTrajectories
+        metrics |= {"bonus": jnp.mean(bonus), "bonus_std": jnp.std(bonus)}
+        return state.replace(discriminator=discriminator), reward, metrics
 
 
 class SelfImitatingAgent(AdversarialAgent, BufferedAgent):
     """An agent whose discriminator learns from the buffer, `state.buffer`."""
 
-    def remember(self, state: Any, context: Context) -> Any:
-        buffer = self.insert(state.buffer, context, self.ranked_by(context.rollout))
-        return state.replace(buffer=buffer)
+    def source(self, state: Any, context: Context) -> Source:
+        def sample(key: jax.Array, num_samples: int) -> tuple[jax.Array, jax.Array]:
+            return good_trajectories.sample(key, state.buffer, num_samples)
 
-    def good_trajectories(self, state: Any) -> GoodTrajectories:
-        return state.buffer
-
-    def source(self, buffer: GoodTrajectories) -> Source:
-        """Return the buffer as the source of what the policy imitates."""
-        return Source(
-            lambda key, n: good_trajectories.sample(key, buffer, n), buffer.size > 0
-        )
+        return Source(sample, state.buffer.size > 0)
 
 
 class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
@@ -288,21 +270,14 @@ class PPOGASIL(ShapedRewardAgent, SelfImitatingAgent):
 
     name = "ppo+gasil"
 
-    def init(self, key: jax.Array, sizes: Sizes) -> SelfImitation:
-        return SelfImitation(
-            self.init_discriminator(key, sizes), self.init_buffer(sizes)
-        )
+    def init(self, key: jax.Array, sizes: Sizes) -> Imitation:
+        return Imitation(self.init_discriminator(key, sizes), self.init_buffer(sizes))
 
     def update_and_reward(
-        self, state: SelfImitation, context: Context, key: jax.Array
-    ) -> tuple[SelfImitation, jax.Array, Metrics]:
-        buffer = state.buffer
-        discriminator, bonus, metrics = self.update_and_score(
-            state.discriminator, self.source(buffer), context, key
-        )
-        reward, shaped = self.shape(context, bonus)
-        state = state.replace(discriminator=discriminator)
-        return state, reward, {**metrics, **shaped, **self.buffer_metrics(buffer)}
+        self, state: Imitation, context: Context, key: jax.Array
+    ) -> tuple[Imitation, jax.Array, Metrics]:
+        state, reward, metrics = super().update_and_reward(state, context, key)
+        return state, reward, metrics | self.buffer_metrics(state.buffer)
 
 
 class GASIL(PPOGASIL):
@@ -328,9 +303,6 @@ class GAIL(ShapedRewardAgent):
     def check(self, sizes: Sizes) -> None:
         expert.check(self.expert, sizes)
 
-    def discriminator(self, state: Learner) -> Learner:
-        return state
-
     def data(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the expert's observations (steps, obs) and actions.
 
@@ -339,12 +311,7 @@ class GAIL(ShapedRewardAgent):
         assert self.expert is not None  # Ensured by `check`.
         return expert.load(self.expert)
 
-    def init(self, key: jax.Array, sizes: Sizes) -> Learner:
-        return self.init_discriminator(key, sizes)
-
-    def update_and_reward(
-        self, state: Learner, context: Context, key: jax.Array
-    ) -> tuple[Learner, jax.Array, Metrics]:
+    def source(self, state: Any, context: Context) -> Source:
         observation, action = context.data
         size = context.rollout.action.shape[-1]
 
@@ -352,7 +319,4 @@ class GAIL(ShapedRewardAgent):
             rows = jax.random.randint(key, (num_samples,), 0, observation.shape[0])
             return observation[rows], expert.vectors(action[rows], size)
 
-        source = Source(sample, jnp.bool_(True))
-        state, bonus, metrics = self.update_and_score(state, source, context, key)
-        reward, shaped = self.shape(context, bonus)
-        return state, reward, {**metrics, **shaped}
+        return Source(sample, jnp.bool_(True))

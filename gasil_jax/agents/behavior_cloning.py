@@ -13,9 +13,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from gasil_jax import buffer, learner, normalization, ppo
+from gasil_jax import buffer as good_trajectories
+from gasil_jax import learner, normalization, ppo
 from gasil_jax.agents.buffered import BufferedAgent
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics
 from gasil_jax.learner import Learner
@@ -23,7 +23,7 @@ from gasil_jax.ppo import ActorCritic
 
 
 class PPOBC(BufferedAgent):
-    """PPO on the environment's reward, then cloning of the buffer, which is its state.
+    """PPO on the environment's reward, then cloning of the buffer.
 
     Attributes:
       behavior_cloning_coefficient: weight of the cloning loss of PPO+BC.
@@ -39,20 +39,18 @@ class PPOBC(BufferedAgent):
     behavior_cloning_minibatch_size: int = count(64)
 
     def update_policy(
-        self,
-        state: GoodTrajectories,
-        actor_critic: ActorCritic,
-        context: Context,
-        key: jax.Array,
-    ) -> tuple[GoodTrajectories, ActorCritic, Metrics]:
+        self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
+    ) -> tuple[Any, ActorCritic, Metrics]:
+        buffer = state.buffer
+
         def objective(params: Any, observation: jax.Array, action: jax.Array) -> Any:
             parameters = context.policy(params, observation)
             value = -jnp.mean(context.distribution.log_prob(parameters, action))
             return self.behavior_cloning_coefficient * value, value
 
         def step(policy: Learner, key: jax.Array) -> Any:
-            observation, action = buffer.sample(
-                key, state, self.behavior_cloning_minibatch_size
+            observation, action = good_trajectories.sample(
+                key, buffer, self.behavior_cloning_minibatch_size
             )
             observation = normalization.normalize(context.normalizer, observation)
             gradient, value = jax.grad(objective, has_aux=True)(
@@ -65,8 +63,8 @@ class PPOBC(BufferedAgent):
             actor_critic.policy,
             jax.random.split(key, self.behavior_cloning_updates),
         )
-        filled = state.size > 0
+        filled = buffer.size > 0
         policy = learner.select(filled, cloned, actor_critic.policy)
         cloning_loss = jnp.where(filled, jnp.mean(values), jnp.nan)
-        metrics = {"behavior_cloning_loss": cloning_loss, **self.buffer_metrics(state)}
+        metrics = {"behavior_cloning_loss": cloning_loss, **self.buffer_metrics(buffer)}
         return state, actor_critic.replace(policy=policy), metrics

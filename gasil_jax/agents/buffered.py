@@ -3,42 +3,43 @@
 from typing import Any, ClassVar
 
 import jax
+from flax import struct
 
 from gasil_jax import buffer as good_trajectories
 from gasil_jax.agents.interface import Agent
 from gasil_jax.buffer import GoodTrajectories
-from gasil_jax.config import count, switch
+from gasil_jax.config import count
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.rollout import Rollout
+
+
+class Buffered(struct.PyTreeNode):
+    """The state of an agent that has a buffer and nothing else."""
+
+    buffer: GoodTrajectories
 
 
 class BufferedAgent(Agent):
     """An agent that imitates the steps of the best episodes (paper, section 4.1).
 
-    Its state is the buffer, unless a subclass puts the buffer into another one.
+    A subclass may have another state, with the buffer as its field `buffer`.
 
     Attributes:
       buffer_steps: capacity of the good-trajectory buffer, in steps.
       buffer_episodes: largest number of episodes in the good-trajectory buffer, besides
         its capacity in steps; None for no limit.
-      buffer_discounts: whether the good-trajectory buffer ranks episodes by their
-        discounted return, as the paper does; otherwise by the undiscounted one.
     """
 
     history_episodes: ClassVar[int] = 1
 
     buffer_steps: int = count(1000)
     buffer_episodes: int | None = count(None)
-    buffer_discounts: bool = switch(True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
-        return self.init_buffer(sizes)
+        return Buffered(self.init_buffer(sizes))
 
     def remember(self, state: Any, context: Context) -> Any:
-        return self.insert(state, context, self.ranked_by(context.rollout))
-
-    def good_trajectories(self, state: Any) -> GoodTrajectories:
-        return state
+        return_ = context.rollout.discounted_return
+        return state.replace(buffer=self.insert(state.buffer, context, return_))
 
     def init_buffer(self, sizes: Sizes) -> GoodTrajectories:
         """Return an empty buffer."""
@@ -46,23 +47,13 @@ class BufferedAgent(Agent):
             self.buffer_steps, sizes.observation, sizes.action
         )
 
-    def ranked_by(self, batch: Rollout) -> jax.Array:
-        """Return the returns that the buffer ranks episodes by, (time, env)."""
-        if self.buffer_discounts:
-            return batch.discounted_return
-        return batch.undiscounted_return
-
     @jax.named_scope("good_trajectories")
     def insert(
         self, buffer: GoodTrajectories, context: Context, return_: jax.Array
     ) -> GoodTrajectories:
         """Return the buffer with the whole episodes that ended in a batch.
 
-        Args:
-          buffer: the buffer before the batch.
-          context: the iteration's data.
-          return_: float32 (time, env), what an episode that ends with the step is
-            ranked by.
+        An episode that ends with a step is ranked by `return_`, (time, env).
         """
         batch, history = context.rollout, context.history
         assert history is not None  # Ensured by `history_episodes`.

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import user_code
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
 
@@ -127,10 +126,6 @@ class Agent(struct.PyTreeNode):
           context: the iteration's data.
         """
         return advantages[..., 0], {}
-
-    def good_trajectories(self, state: Any) -> GoodTrajectories | None:
-        """Return the good-trajectory buffer in a state; None if the agent has none."""
-        return None
 
 
 def call(part: Any, function: str, *arguments: Any) -> Any:

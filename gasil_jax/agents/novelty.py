@@ -25,10 +25,8 @@ from flax import struct
 from gasil_jax import normalization
 from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.interface import Agent
-from gasil_jax.buffer import GoodTrajectories
 from gasil_jax.config import number
 from gasil_jax.context import Context, Metrics, Sizes
-from gasil_jax.ppo import ActorCritic
 
 # The numbers of counters, which cells of the same hash share, and of random directions,
 # each with a prime that the hash multiplies by.
@@ -40,17 +38,19 @@ _TIE = 1e-3
 
 
 class Visits(struct.PyTreeNode):
-    """How often each cell was visited.
+    """How often each cell was visited; float32."""
 
-    Attributes:
-      count: float32 (counters,), number of visits to the cells of each counter.
-      directions: float32 (obs, directions), random.
-      offset: float32 (directions,), where the cells begin, from 0 to 1.
-    """
+    count: jax.Array  # (counters,), number of visits to the cells of each counter
+    directions: jax.Array  # (obs, directions), random
+    offset: jax.Array  # (directions,), where the cells begin, from 0 to 1
 
-    count: jax.Array
-    directions: jax.Array
-    offset: jax.Array
+
+class Explorer(struct.PyTreeNode):
+    """The state of an agent that seeks what is new; the last two to clone as well."""
+
+    visits: Visits
+    buffer: Any = None  # `GoodTrajectories`
+    novelty: Any = None  # float32 (env,), sum over the running episode
 
 
 class PPONovelty(Agent):
@@ -67,7 +67,7 @@ class PPONovelty(Agent):
     novelty_cell: float = number(0.5, 0.0, excludes_low=True)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
-        return self.init_visits(key, sizes)
+        return Explorer(self.init_visits(key, sizes))
 
     def init_visits(self, key: jax.Array, sizes: Sizes) -> Visits:
         """Return counters of no visits; consumes the key."""
@@ -77,10 +77,6 @@ class PPONovelty(Agent):
             directions=jax.random.normal(key, (sizes.observation, _DIRECTIONS)),
             offset=jax.random.uniform(offset_key, (_DIRECTIONS,)),
         )
-
-    def visits(self, state: Any) -> Visits:
-        """Return the counters in a state."""
-        return state
 
     def count(self, visits: Visits, context: Context) -> Visits:
         """Return the counters with a batch's visits."""
@@ -107,29 +103,15 @@ class PPONovelty(Agent):
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
     def remember(self, state: Any, context: Context) -> Any:
-        return self.count(state, context)
+        return state.replace(visits=self.count(state.visits, context))
 
     def update_and_reward(
         self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Any, jax.Array, Metrics]:
-        novelty = self.novelty(self.visits(state), context)
+        novelty = self.novelty(state.visits, context)
         bonus = self.novelty_coefficient * (novelty - jnp.mean(novelty))
         metrics = {"novelty": jnp.mean(novelty)}
         return state, context.rollout.reward + bonus, metrics
-
-
-class Explorer(struct.PyTreeNode):
-    """The state of PPO+BC+NOVELTY.
-
-    Attributes:
-      buffer: the good-trajectory buffer.
-      visits: the counters.
-      novelty: float32 (env,), sum over the running episode.
-    """
-
-    buffer: GoodTrajectories
-    visits: Visits
-    novelty: jax.Array
 
 
 class PPOBCNovelty(PPONovelty, PPOBC):
@@ -139,16 +121,10 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
     def init(self, key: jax.Array, sizes: Sizes) -> Explorer:
         return Explorer(
+            self.init_visits(key, sizes),
             buffer=self.init_buffer(sizes),
-            visits=self.init_visits(key, sizes),
             novelty=jnp.zeros(sizes.num_envs),
         )
-
-    def good_trajectories(self, state: Explorer) -> GoodTrajectories:
-        return state.buffer
-
-    def visits(self, state: Explorer) -> Visits:
-        return state.visits
 
     def remember(self, state: Explorer, context: Context) -> Explorer:
         batch, visits = context.rollout, self.count(state.visits, context)
@@ -160,14 +136,6 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
         steps = self.novelty(visits, context), batch.ended
         novelty, total = jax.lax.scan(add, state.novelty, steps)
-        return_ = self.ranked_by(batch) + _TIE * total / batch.episode_length
+        return_ = batch.discounted_return + _TIE * total / batch.episode_length
         buffer = self.insert(state.buffer, context, return_)
-        return Explorer(buffer, visits, novelty)
-
-    def update_policy(
-        self, state: Any, actor_critic: ActorCritic, context: Context, key: jax.Array
-    ) -> tuple[Any, ActorCritic, Metrics]:
-        buffer, actor_critic, metrics = super().update_policy(
-            state.buffer, actor_critic, context, key
-        )
-        return state.replace(buffer=buffer), actor_critic, metrics
+        return Explorer(visits, buffer, novelty)

@@ -38,21 +38,13 @@ _MAX_ADVANTAGE = 1.0
 
 
 class Replay(struct.PyTreeNode):
-    """The last `capacity` steps of ended episodes, as a ring buffer.
+    """The last `capacity` steps of ended episodes, as a ring buffer; float32."""
 
-    Attributes:
-      observation: float32 (capacity, obs), not normalized.
-      action: float32 (capacity, action).
-      return_: float32 (capacity,), discounted return from the step on.
-      priority: float32 (capacity,), 0 where empty.
-      cursor: int32 (), index at which the next step is written.
-    """
-
-    observation: jax.Array
-    action: jax.Array
-    return_: jax.Array
-    priority: jax.Array
-    cursor: jax.Array
+    observation: jax.Array  # (capacity, obs), not normalized
+    action: jax.Array  # (capacity, action)
+    return_: jax.Array  # (capacity,), discounted return from the step on
+    priority: jax.Array  # (capacity,), 0 where empty
+    cursor: jax.Array  # int32 (), index at which the next step is written
 
 
 def init_replay(capacity: int, observation_size: int, action_size: int) -> Replay:
@@ -69,20 +61,13 @@ def init_replay(capacity: int, observation_size: int, action_size: int) -> Repla
 def returns_to_go(
     history: History, num_steps: int, gamma: jax.Array | float
 ) -> tuple[jax.Array, jax.Array]:
-    """Return the discounted returns of steps whose episode ended in the last batch.
+    """Return the discounted returns of a history's steps, and which of them count.
 
-    Args:
-      history: the history after `record` of the batch.
-      num_steps: number of steps of each environment in a batch.
-      gamma: discount.
-
-    Returns:
-      Two arrays (env, steps of history), oldest step first: the discounted return from
-      the step on, and a mask of the steps whose episode ended in the last batch and
-      whose return is finite.
+    Both are (env, steps), oldest step first. Those count that are finite and of
+    episodes that ended in the last `num_steps` steps, the batch.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
-    length = reward.shape[1]
+    num_envs, length = reward.shape
 
     def backward(carry: Any, step: Any) -> Any:
         return_, is_complete = carry
@@ -91,7 +76,6 @@ def returns_to_go(
         is_complete = jnp.where(ended, is_new, is_complete)
         return (return_, is_complete), (return_, is_complete)
 
-    num_envs = reward.shape[0]
     start = (jnp.zeros(num_envs), jnp.zeros(num_envs, bool))
     is_new = jnp.arange(length) >= length - num_steps
     _, (return_, is_complete) = jax.lax.scan(
@@ -167,13 +151,6 @@ def return_scale(replay: Replay) -> jax.Array:
     return jnp.maximum(jnp.sqrt(square), _MIN_SCALE)
 
 
-def clipped_advantage(
-    return_: jax.Array, value: jax.Array, scale: jax.Array | float
-) -> jax.Array:
-    """Return (R - V)+ in units of `scale`, clipped at 1: (samples,)."""
-    return jnp.clip((return_ - value) / scale, 0.0, _MAX_ADVANTAGE)
-
-
 def loss(
     log_prob: jax.Array,
     value: jax.Array,
@@ -183,7 +160,7 @@ def loss(
     scale: jax.Array | float,
     value_coefficient: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Return a minibatch's loss, (), and its fraction of positive advantages, ().
+    """Return a minibatch's loss, (), and its clipped advantages, (samples,).
 
     Args:
       log_prob: float32 (samples,), log pi(a | s) of the replayed actions.
@@ -194,17 +171,15 @@ def loss(
       value_coefficient: weight of the value's loss.
     """
     chex.assert_equal_shape([log_prob, value, return_, weight])
-    advantage = clipped_advantage(return_, value, scale)
-    num_positive = jnp.sum(advantage > 0)
-    num_samples = jnp.maximum(num_positive, _MIN_SAMPLES)
+    advantage = jnp.clip((return_ - value) / scale, 0.0, _MAX_ADVANTAGE)
+    num_samples = jnp.maximum(jnp.sum(advantage > 0), _MIN_SAMPLES)
     constant = jax.lax.stop_gradient(advantage)
     policy_loss = -jnp.sum(weight * constant * log_prob) / num_samples
     # Its gradient with respect to the value is minus the clipped advantage, in the unit
     # of the returns. That is the gradient of half the square where the advantage is not
     # clipped; where it is, the gradient is a constant instead of 0.
     value_loss = -jnp.sum(weight * scale * constant * value) / num_samples
-    fraction = num_positive / advantage.shape[0]
-    return policy_loss + value_coefficient * value_loss, fraction
+    return policy_loss + value_coefficient * value_loss, advantage
 
 
 class PPOSIL(Agent):
@@ -247,34 +222,30 @@ class PPOSIL(Agent):
             observation = normalization.normalize(context.normalizer, observation)
             parameters = context.policy(params["policy"], observation)
             (critic,) = params["values"]
-            value = context.value(critic, observation)
-            return_ = state.return_[index] / context.reward_scale
-            total, fraction = loss(
+            total, advantage = loss(
                 context.distribution.log_prob(parameters, state.action[index]),
-                value,
-                return_,
+                context.value(critic, observation),
+                state.return_[index] / context.reward_scale,
                 weight=weight,
                 scale=scale,
                 value_coefficient=self.sil_value_coefficient,
             )
-            advantage = clipped_advantage(return_, value, scale)
-            return self.sil_coefficient * total, (advantage, fraction)
+            return self.sil_coefficient * total, advantage
 
         def step(carry: Any, key: jax.Array) -> Any:
             actor_critic, priority = carry
             replay = state.replace(priority=priority)
             index, weight = sample(key, replay, self.sil_minibatch_size)
-            gradient, (advantage, fraction) = jax.grad(objective, has_aux=True)(
+            gradient, advantage = jax.grad(objective, has_aux=True)(
                 actor_critic.params, index, weight
             )
             actor_critic = ppo.descend(actor_critic, gradient, context.config)
             priority = priority.at[index].set(jnp.maximum(advantage, _MIN_PRIORITY))
-            return (actor_critic, priority), fraction
+            return (actor_critic, priority), jnp.mean(advantage > 0)
 
         before = (actor_critic, state.priority)
-        after, fraction = jax.lax.scan(
-            step, before, jax.random.split(key, self.sil_updates)
-        )
+        keys = jax.random.split(key, self.sil_updates)
+        after, fraction = jax.lax.scan(step, before, keys)
         filled = jnp.any(state.priority > 0)
         actor_critic, priority = learner.select(filled, after, before)
         metrics = {"sil_fraction": jnp.where(filled, jnp.mean(fraction), jnp.nan)}

@@ -75,16 +75,6 @@ class Options:
         are not given.
       init_from: folder of a run, whose best seed's policy, values and normalizer of
         observations training starts from, instead of new ones.
-      checkpoint_every: environment steps per seed between two checkpoints; by
-        default a checkpoint is written every ten minutes.
-      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
-        with the best evaluation or, without evaluate_every, with the best returns.
-      evaluate_every: environment steps per seed between two evaluations of the
-        policy's mean action in fresh environments, rounded up to whole iterations;
-        by default none. The untrained policy is evaluated too. The scores are undelayed
-        returns, in evaluations.csv.
-      evaluate_episodes: episodes per seed in each evaluation; default 10.
-      log: trackers to log to besides metrics.csv: tensorboard, wandb.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -106,11 +96,6 @@ class Options:
     resume: bool = False
     config: pathlib.Path | None = None
     init_from: pathlib.Path | None = None
-    checkpoint_every: int | None = None
-    keep_checkpoints: int = 2
-    evaluate_every: int | None = None
-    evaluate_episodes: int | None = None
-    log: tuple[str, ...] = ()
     devices: int | None = None
     rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
@@ -174,8 +159,8 @@ def read(
     algorithm = every[0]
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
-    settings = Settings() if stored is None else stored.settings
-    parser.add_fields(Settings, "environment", settings)
+    parser.add_fields(Recording, "recording", stored and stored.recording)
+    parser.add_fields(Settings, "environment", stored and stored.settings)
     agent = algorithm.agent
     own = {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
@@ -206,13 +191,7 @@ def read(
         _seeds(options, stored),
         others=algorithms_[1:],
         settings=Settings(**parser.fields(values, "environment")),
-        recording=Recording(
-            options.checkpoint_every,
-            options.keep_checkpoints,
-            options.evaluate_every,
-            options.evaluate_episodes or Recording.evaluate_episodes,
-            options.log,
-        ),
+        recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
         start=None if stored is None else stored.start,
     )
@@ -221,15 +200,14 @@ def read(
             requested, start=saved.find_start(options.init_from)
         )
     _check(options, requested)
+    if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
+        raise InputError(
+            f"evaluate_episodes is {values.evaluate_episodes}: it needs evaluate_every"
+        )
     requested = _with_points(options, requested, stored)
     if is_begun and options.out is not None:
         requested = requested.continued_from(options.out)
-    _note_without_effect(
-        options,
-        requested,
-        default=algorithm,
-        off={x: parser.fields(values, x) for x in switches if not getattr(values, x)},
-    )
+    _note_without_effect(given, requested)
     return options, requested
 
 
@@ -269,22 +247,12 @@ def _defaults(
                     f"{origin}, where {name} was {own}, is {given}: leave it "
                     "out or name another one"
                 )
-        recording = stored.recording
         return stored.algorithms, kind(
             env=stored.env,
             agent=stored.agent,
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
-            checkpoint_every=recording.checkpoint_every,
-            keep_checkpoints=recording.keep_checkpoints,
-            evaluate_every=recording.evaluate_every,
-            evaluate_episodes=(
-                None
-                if recording.evaluate_every is None
-                else recording.evaluate_episodes
-            ),
-            log=recording.log,
             rewards=tuple(own_models),
             **_switches(stored.algorithm),
         )
@@ -414,48 +382,29 @@ def _check(options: Options, requested: Sweep) -> None:
         presets.check(options.preset)
         for each in requested.algorithms:
             algorithms.check(each)
-        trackers.check(options.log)
-    check_minimum(
-        options,
-        devices=1,
-        checkpoint_every=1,
-        keep_checkpoints=1,
-        evaluate_every=1,
-        evaluate_episodes=1,
-    )
+        trackers.check(requested.recording.log)
+    check_minimum(options, devices=1)
+    counts = ("checkpoint_every", "keep_checkpoints", "evaluate_every")
+    check_minimum(requested.recording, **dict.fromkeys(counts, 1), evaluate_episodes=1)
     check_minimum(requested.settings, max_episode_steps=1)
-    if options.evaluate_episodes is not None and options.evaluate_every is None:
-        raise InputError(
-            f"evaluate_episodes is {options.evaluate_episodes}: it needs evaluate_every"
-        )
     if options.out is not None:
         if not options.resume and getattr(options, "shard", None) is None:
             folders.refuse_used(options.out)
         folders.check_writable(options.out)
 
 
-def _note_without_effect(
-    options: Options,
-    requested: Sweep,
-    *,
-    default: Algorithm,
-    off: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Print a note for each option that was changed but has no effect."""
-    algorithm, settings = requested.algorithm, requested.settings
-    for name in environments.without_effect(options.env, settings):
-        value = getattr(settings, name)
-        note(f"{name} is {value}, which has no effect: {options.env} has none")
+def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
+    """Print a note for each option that is given but has no effect."""
+    algorithm, env = requested.algorithm, requested.env
+    unused = environments.without_effect(env, requested.settings)
+    reasons = dict.fromkeys(unused, f"{env} has none")
     for model in REWARD_MODELS:
-        for name, value in off.get(model.switch, {}).items():
-            if value != getattr(model(), name):
-                note(f"{name} is {value}, which has no effect: {model.switch} is off")
-    unchanged = {x: y for model in REWARD_MODELS for x, y in vars(model()).items()}
-    unchanged |= default.settings
-    for name, reason in points.without_effect(algorithm).items():
-        value = algorithm.settings.get(name)
-        if value not in (None, unchanged[name]):
-            note(f"{name} is {value}, which has no effect: {reason}")
+        if not algorithm.settings[model.switch]:
+            reasons |= dict.fromkeys(names(model), f"{model.switch} is off")
+    reasons |= points.without_effect(algorithm)
+    for name, value in given.items():
+        if name in reasons and value is not False:
+            note(f"{name} is {value}, which has no effect: {reasons[name]}")
 
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:

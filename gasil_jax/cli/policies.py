@@ -6,7 +6,14 @@ from typing import Literal
 
 from gasil_jax.cli.parsing import POSITIONAL, input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host.saved import Policies, best_seed, load_policies
+from gasil_jax.host.saved import (
+    Policies,
+    best_seed,
+    choose_point,
+    find,
+    load_policies,
+)
+from gasil_jax.numpy_policy import ZOO_PREFIX
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,6 +43,10 @@ class PolicyOptions:
         if not 0 <= self.key < 2**32:
             raise InputError(f"key is {self.key}: it must be from 0 to {2**32 - 1}")
         with input_checked():
-            if only_best and seed is None:
-                seed = best_seed(self.run, self.point)
-            return load_policies(self.run, self.checkpoint, self.point, seed=seed)
+            point = self.point
+            # A policy of the zoo has one seed, which needs no name.
+            of_zoo = str(self.run).startswith(ZOO_PREFIX)
+            if only_best and seed is None and not of_zoo:
+                point = choose_point(self.run, point)
+                seed = best_seed(find(self.run, point)[2])
+            return load_policies(self.run, self.checkpoint, point, seed=seed)

@@ -45,14 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.out is None:
             raise InputError("shard needs --out and the folder of the whole sweep")
-    folder, results, _ = train.train(options, requested, program, shard=shard)
-    if options.shard is not None:
-        print(f"shard {options.shard} is done, in {folder}")
-    if results is None:
-        missing = len(requested.missing(requested.trained(folder)))
-        print(f"{missing} of {len(requested.runs)} runs of the sweep are missing")
-    else:
-        train.tell(folder, results)
+    train.train(options, requested, program, shard=shard)
     return 0
 
 
@@ -84,4 +77,4 @@ def _launch(
     with folders.lock(options.out, seconds=60.0):
         trained, env = requested.trained(options.out), training.make_env(requested)
         results = train.write(options.out, requested, env, trained)
-    train.tell(options.out, results)
+    train.tell(options.out, results, env)

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from gasil_jax import statistics
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host import folders, results, saved, training
+from gasil_jax.host import environments, folders, results, saved, training
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interruption, noted
 from gasil_jax.host.output_file import WriteError, note
@@ -24,12 +25,10 @@ from gasil_jax.host.sweep import Sweep
 
 def train(
     options: Options, requested: Sweep, program: str, *, shard: tuple[int, int] = (1, 1)
-) -> tuple[pathlib.Path, Results | None, Any]:
+) -> None:
     """Train the runs of a shard that are missing in the folder of the options.
 
-    Returns:
-      The folder; the results, written to it, None while runs of other shards are
-      missing; and the environment.
+    If no run is missing then, its results are written and told.
     """
     runs = requested.part(*shard)
     needed = requested.unfinished(options.out or NOWHERE, runs)
@@ -65,8 +64,12 @@ def train(
                 interruption=interruption,
             )
         trained = requested.trained(folder)
-        if requested.missing(trained):
-            return folder, None, env
+        if shard[1] > 1:
+            print(f"shard {shard[0]}/{shard[1]} is done, in {folder}")
+        if missing := requested.missing(trained):
+            total = len(requested.runs)
+            print(f"{len(missing)} of {total} runs of the sweep are missing")
+            return
         with folders.lock(folder, seconds=60.0):
             told = write(folder, requested, env, trained, zip(needed, outcomes))
         for outcome in outcomes:
@@ -74,7 +77,7 @@ def train(
                 raise outcome.unsaved
     except WriteError as error:
         raise WriteError(f"{error}; {how}") from error
-    return folder, told, env
+    tell(folder, told, env)
 
 
 def write(
@@ -105,12 +108,18 @@ def write(
     return told
 
 
-def tell(folder: pathlib.Path, told: Results) -> None:
-    """Print the best points of a sweep, its speed, and commands to go on with."""
-    print(*results.best_in_words(told), sep="\n")
-    print(f"{speed_in_words(told.trainings)}, in {folder}")
+def tell(folder: pathlib.Path, told: Results, env: Any) -> None:
+    """Print the scores, the speed, and commands to go on with."""
+    if len(told.sweep.points) > 1:
+        print(*results.best_in_words(told), sep="\n")
+        scores = ""
+    else:
+        names = [x for x in ("final_return", "final_evaluation") if x in told.finals]
+        every = {name.replace("_", " "): told.finals[name][0] for name in names}
+        scores = f"{statistics.in_words(every)}, "
+    print(f"{scores}{speed_in_words(told.trainings)}, in {folder}")
     quoted = shlex.quote(str(folder))
-    print(
-        f"next: python -m gasil_jax.evaluate {quoted}; "
-        f"python -m gasil_jax.plot {quoted}"
-    )
+    commands = [f"evaluate {quoted}", f"plot {quoted}"]
+    if environments.can_be_drawn(env):
+        commands.append(f"render {quoted} --out episode.gif")
+    print("next:", "; ".join(f"python -m gasil_jax.{x}" for x in commands))

@@ -316,8 +316,9 @@ def latest(root: pathlib.Path) -> tuple[Checkpoint | None, list[str]]:
     for folder in reversed(_folders(root)):
         try:
             return read(folder), errors
-        except ValueError as error:
-            errors.append(str(error))
+        except (ValueError, FileNotFoundError) as error:
+            if folder.exists():  # Training may delete it meanwhile.
+                errors.append(str(error))
     return None, errors
 
 

@@ -61,5 +61,6 @@ def _keep_compiled_programs() -> None:
         folder.mkdir(parents=True, exist_ok=True)
         jax.config.update("jax_compilation_cache_dir", str(folder))
         # On some processors no program can be loaded (jax issue 38445), and JAX says so
-        # for each. It is compiled again.
-        warnings.filterwarnings("ignore", "Error reading persistent compilation cache")
+        # for each, as it does for each that a full disk has no room for.
+        failed = "Error (reading|writing) persistent compilation cache"
+        warnings.filterwarnings("ignore", failed)

@@ -239,17 +239,15 @@ def drive(
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
+    After each chunk a signal of `interruption` is answered with a checkpoint, and the
+    callback may end training. The trackers are closed at the end.
+
     Args:
       members: the members to train.
       folder: the folder of metrics.csv, evaluations.csv and checkpoints/.
       labels: columns that identify the members in the tables, (members,) each.
       recording: what is recorded, and when.
-      progress: the progress display.
-      interruption: checked after each chunk; if it has a signal, a checkpoint is
-        written.
       steps_before: environment steps that `progress` has already counted.
-      trackers: trackers that also get the metrics; they are closed at the end.
-      callback: called after each chunk; if it returns true, training ends there.
 
     Raises:
       Interrupted: if a signal was received; a checkpoint was written first.

@@ -8,9 +8,11 @@ from gasil_envs import registry, worlds
 from gasil_envs.physics.host_threads import available_cores
 from gasil_envs.registry import Settings, check, made_with, prepare, without_effect
 from gasil_envs.registry import make as make_env
+from gasil_envs.worlds import FAMILIES
 from gasil_envs.wrappers import is_discrete
 
 __all__ = [
+    "FAMILIES",
     "Settings",
     "available_cores",
     "can_be_drawn",
@@ -29,7 +31,7 @@ __all__ = [
 def names() -> list[str]:
     """Return the names of all environments, also of other packages, if installed."""
     every = list(registry.names())
-    for family in worlds.FAMILIES:
+    for family in FAMILIES:
         with contextlib.suppress(ValueError):
             every += worlds.names(family)
     return every

@@ -24,11 +24,7 @@ _ROOT = 2**32 - 1
 
 
 def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Array:
-    """Return the key of a seed's evaluation after `iteration` iterations.
-
-    It depends on these two numbers alone, not on the keys of training or on the other
-    members.
-    """
+    """Return the key of a seed's evaluation after `iteration` iterations."""
     return jax.random.fold_in(
         jax.random.fold_in(jax.random.key(_ROOT), seed), iteration
     )
@@ -37,16 +33,10 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
 class Evaluation:
     """Evaluates all members with one compiled program, sharded as training is.
 
-    Args:
-      members: the members that are trained.
-      every: environment steps per seed between two evaluations, rounded up to whole
-        iterations; the untrained and the final policy are always evaluated.
-      num_episodes: number of episodes of each policy, in fresh environments.
-      table: writes evaluations.csv.
-      trackers: trackers that also get the scores.
+    The untrained and the final policy are always evaluated.
 
     Attributes:
-      table: as given.
+      table: writes evaluations.csv.
       seconds: time of all evaluations in this process, including compilation.
     """
 
@@ -87,11 +77,7 @@ class Evaluation:
         return done % self._interval == 0 or done == last
 
     def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
-        """Evaluate the policies, write the scores and log them to the trackers.
-
-        Returns:
-          The columns of evaluations.csv, (members,) each.
-        """
+        """Evaluate, write and log; return evaluations.csv's columns, (members,)."""
         started = time.monotonic()
         episodes = jax.tree.map(np.asarray, self._score(states, self._seeds))
         episodes = self._members.trim(episodes)

@@ -65,13 +65,6 @@ def advance_members(
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
 
-    Args:
-      env: one environment.
-      algorithm: the algorithm of all members.
-      states: the members' training states, (members, ...) each leaf.
-      num_iterations: the number of iterations, int32 ().
-      data: the agent's data, which the members share.
-
     Returns:
       The new states, and metrics (members, chunk). The first `num_iterations` columns
       are filled and the others are NaN.
@@ -211,8 +204,7 @@ class Members:
     def compile(self, states: Any = None) -> tuple[Any, Callable[..., Any]]:
         """Return the states to start from, and the compiled `advance`.
 
-        Args:
-          states: states to continue from, (members, ...); default the first states.
+        They are the first states or those to continue from, (members, ...).
         """
         shapes = jax.tree.map(
             lambda x: x.update(sharding=self._sharding_of(x)),
@@ -239,17 +231,10 @@ class Members:
     def train(
         self, advance: Callable[..., Any], states: Any, first: int, count: int
     ) -> tuple[Any, dict[str, np.ndarray]]:
-        """Train for some iterations, at most `chunk`.
+        """Train for `count` iterations, at most `chunk`, after the `first` ones.
 
-        Args:
-          advance: the compiled function from `compile`.
-          states: the states before; their memory is reused.
-          first: number of iterations before this call.
-          count: number of iterations in this call.
-
-        Returns:
-          The states after it, and the metrics, (members, iterations) each. "env_steps"
-          holds whole numbers.
+        The memory of the states is reused. Metrics are (members, iterations) each, and
+        "env_steps" holds whole numbers.
         """
         states, metrics = advance(states, np.int32(count), self.data)
         metrics = {
@@ -317,11 +302,9 @@ def make_members(
     Args:
       env: one environment.
       algorithm: the algorithm that the members share.
-      seeds: absolute seed number of each member. Its key is ``jax.random.key(seed)``.
-      hyperparameters: for each member, values that replace numbers of the algorithm, by
-        name; default none.
-      devices: the devices to shard over, default all. At most one for each member is
-        used.
+      seeds: absolute seed number of each member.
+      hyperparameters: for each member, values that replace numbers of the algorithm.
+      devices: the devices to shard over, default all, at most one for each member.
     """
     every = hyperparameters or [{}] * len(seeds)
     numbers = [{**algorithm.hyperparameters, **one} for one in every]

@@ -137,13 +137,8 @@ def learning_curve(
 ) -> None:
     """Save the returns over environment steps as a PNG: all seeds, mean and interval.
 
-    Args:
-      path: the image file.
-      env_steps: (iterations,).
-      episode_return: (seeds, iterations); NaN where no episode ended.
-      title: title of the plot.
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each; None if there are none.
+    Steps are (iterations,), and returns (seeds, iterations), NaN where no episode
+    ended; evaluations are as in `draw_returns`.
     """
     from matplotlib.figure import Figure
 

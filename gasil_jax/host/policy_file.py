@@ -17,15 +17,7 @@ def save(
     seeds: Sequence[int],
     final_return: np.ndarray,
 ) -> None:
-    """Write the policies of a batch of training states to one ``.npz`` file.
-
-    Args:
-      path: the file.
-      states: the training states, (seeds, ...).
-      env: the environment that they were trained in.
-      seeds: numbers of the seeds.
-      final_return: (seeds,), NaN where unknown.
-    """
+    """Write the policies of training states, (seeds, ...), to one ``.npz`` file."""
     weights = policy.weights(states, env)
     if "network" in weights:
         output_file.note(f"{path.name} is not written: {numpy_policy.OWN_NETWORK}")

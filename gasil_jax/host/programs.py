@@ -7,6 +7,7 @@ The folder's name is a hash of the runs, so two programs never share one.
 
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import itertools
 import json
@@ -19,6 +20,7 @@ from typing import Any, TypedDict
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import folders, json_files, tables
+from gasil_jax.host.output_file import note
 from gasil_jax.host.runs import Run, identity
 from gasil_jax.host.tables import Columns
 
@@ -228,7 +230,18 @@ def read(parent: pathlib.Path, requested: Collection[Run]) -> list[Program]:
         if indices:
             runs = tuple(known[members[i]] for i in indices)
             others = len(members) - len(runs)
-            stored.append(Program(runs, path.parent, labels, others, indices))
+            program = Program(runs, path.parent, labels, others, indices)
+            config, training = program.algorithm.config, program.training
+            # It was copied here, and what learned for longer is another run.
+            if every[0]["algorithm"]["total_steps"] > config.total_steps:
+                continue
+            if training and training["iterations"] > config.num_iterations:
+                steps = training["iterations"] * config.batch_steps
+                raise InputError(
+                    f"{path.parent} was continued to {steps:,} steps: total_steps must "
+                    "be that, or the folder be moved away"
+                )
+            stored.append(program)
     return stored
 
 
@@ -248,6 +261,14 @@ def labelled(parent: pathlib.Path, point: int) -> list[Program]:
     return every
 
 
+@functools.cache
+def _note_left(path: pathlib.Path) -> None:
+    note(
+        f"{path} has begun with further runs, which are not asked for: it is not "
+        "continued, and the others are trained anew"
+    )
+
+
 def unfinished(
     requested: Collection[Run], stored: Sequence[Program]
 ) -> tuple[list[Program], list[Run]]:
@@ -258,5 +279,8 @@ def unfinished(
     """
     finished = [x for x in stored if x.is_finished]
     begun = [x for x in stored if x not in finished and not x.others]
+    for each in stored:
+        if each not in (*finished, *begun):
+            _note_left(each.path)
     held = {run for x in (*finished, *begun) for run in x.runs}
     return begun, [run for run in requested if run not in held]

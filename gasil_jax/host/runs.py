@@ -33,7 +33,6 @@ NEWER: Mapping[str, Any] = {
     "observe_phase": False,
     "action_noise": 0.0,
     "policy_components": 1,
-    "rewards": (),
 }
 
 #: Settings that are no more: the settings beside which a run had one, and the value
@@ -43,6 +42,7 @@ REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
     "admission": (("buffer_steps",), "all"),
     "ties": (("buffer_steps",), "oldest"),
     "sample_by_return": (("buffer_steps",), False),
+    "buffer_discounts": (("buffer_steps",), True),
     "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
     "discriminator_gradient_penalty": (("bonus",), 0.0),
     "discriminator_normalizes_actions": (("bonus",), False),
@@ -84,6 +84,8 @@ class Run:
     def _fields(self) -> dict[str, Any]:
         """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
+        if not values["rewards"]:  # Stored runs had no models of the user's.
+            del values["rewards"]
         for name, value in values.items():
             if callable(value):
                 values[name] = "a function"

@@ -51,25 +51,18 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     Raises:
       InputError: if it is no such folder, or has no such point.
     """
-    described = sweep.described(folder)
-    chosen = _choose_point(folder, described["points"], point)
-    agent = described["points"][chosen].get("agent", described["algorithm"]["agent"])
-    if described["only_python"] is None:
-        return described["env"], agent, _programs(folder, sweep.read(folder), chosen)
-    return described["env"], agent, programs.labelled(folder / "programs", chosen)
+    stored = sweep.described(folder)
+    chosen = _choose_point(folder, stored["points"], point)
+    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
+    if stored["only_python"] is None:
+        every = _programs(folder, sweep.made(folder, stored), chosen)
+    else:
+        every = programs.labelled(folder / "programs", chosen)
+    return stored["env"], str(agent), every
 
 
-def best_seed(folder: pathlib.Path, point: int | None) -> int | None:
-    """Return the seed with the highest final return of a point; None if unknown.
-
-    A policy of the zoo has one seed, which needs no name.
-    """
-    if str(folder).startswith(numpy_policy.ZOO_PREFIX):
-        return None
-    return _best_seed(find(folder, point)[2])
-
-
-def _best_seed(every: Sequence[Program]) -> int | None:
+def best_seed(every: Sequence[Program]) -> int | None:
+    """Return the seed with the highest final return of programs; None if unknown."""
     scores = {}
     for each in every:
         table = each.table("metrics.csv", ("episode_return",))
@@ -80,6 +73,11 @@ def _best_seed(every: Sequence[Program]) -> int | None:
                     np.nan_to_num(final, nan=-np.inf)
                 )
     return max(scores, key=scores.__getitem__) if scores else None
+
+
+def choose_point(folder: pathlib.Path, point: int | None) -> int:
+    """Return the number of the requested point of a folder; by default the best."""
+    return _choose_point(folder, sweep.described(folder)["points"], point)
 
 
 def _choose_point(
@@ -181,22 +179,12 @@ def restore(
                 "checkpoint is 'best': this point was trained with others, and "
                 "checkpoints are scored over all of them: it must be 'last'"
             )
-        root = each.path / "checkpoints"
-        if which == "best":
-            with _named(folder):
-                chosen = checkpoint.best(root)
-        else:
-            chosen, errors = checkpoint.latest(root)
-            for error in errors:
-                print(f"warning: {error}", file=sys.stderr)
-        if chosen is None:
-            scored = " with a score" if which == "best" else ""
-            raise InputError(f"run is {folder}: it has no whole checkpoint{scored}")
         init = functools.partial(train.first_state, env, each.algorithm)
         keys = jax.random.split(jax.random.key(0), each.num_members)
         with _named(folder):
             # The leaves of all members have the same shapes.
-            restored = chosen.restore(jax.eval_shape(jax.vmap(init), keys))
+            like = jax.eval_shape(jax.vmap(init), keys)
+            restored = _read_checkpoint(each.path / "checkpoints", which, like)
         own = zip(each.seeds, each.indices, strict=True)
         states |= {number: member(restored, i) for number, i in own}
     seeds = [x for x in stored.seeds if x in states]
@@ -219,7 +207,7 @@ def find_start(folder: pathlib.Path) -> Start:
     """Return the policy of a run's best seed, in its newest checkpoint."""
     stored = sweep.read(folder)
     every = _programs(folder, stored, _choose_point(folder, stored.points, None))
-    seed = _best_seed(every)
+    seed = best_seed(every)
     if seed is None:
         seed = every[0].seeds[0]
     (path,) = (x.path for x in every if seed in x.seeds)
@@ -294,6 +282,30 @@ def begin(trained: Any, env: Any, every: Sequence[Program]) -> None:
 
 def _without_checkpoint(every: Sequence[Program]) -> list[Program]:
     return [x for x in every if checkpoint.latest(x.path / "checkpoints")[0] is None]
+
+
+def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:
+    """Return the states in a checkpoint, which training may delete meanwhile."""
+    for _ in range(5):
+        before = set(root.iterdir()) if root.is_dir() else set()
+        errors: list[str] = []
+        try:
+            if which == "best":
+                chosen = checkpoint.best(root)
+            else:
+                chosen, errors = checkpoint.latest(root)
+            if chosen is None:
+                scored = " with a score" if which == "best" else ""
+                raise ValueError(f"it has no whole checkpoint{scored}")
+            states = chosen.restore(like)
+        except (ValueError, OSError):
+            if all(path.exists() for path in before):
+                raise
+        else:
+            for error in errors:
+                print(f"warning: {error}", file=sys.stderr)
+            return states
+    raise ValueError(f"training deletes {root} sooner than it can be read: try again")
 
 
 def states_of(
@@ -405,7 +417,8 @@ def load_policy(
     if has_file and which == "last" and point is None:
         return policy.make(numpy_policy.read(path, seed))
     if seed is None:
-        seed = best_seed(folder, point)
+        point = choose_point(folder, point)
+        seed = best_seed(find(folder, point)[2])
     env, _, _, states = load(
         folder, which, point, seed=seed, env=env, algorithm=algorithm
     )

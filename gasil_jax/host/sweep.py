@@ -17,6 +17,7 @@ import dataclasses
 import functools
 import hashlib
 import pathlib
+import sys
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any, Required, TypedDict
 
@@ -25,8 +26,16 @@ import jax
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, refusal, shown
-from gasil_jax.host import descriptions, folders, json_files, points, programs
+from gasil_jax.host import (
+    descriptions,
+    environments,
+    folders,
+    json_files,
+    points,
+    programs,
+)
 from gasil_jax.host.environments import Settings
+from gasil_jax.host.output_file import note
 from gasil_jax.host.points import Point
 from gasil_jax.host.programs import Program
 from gasil_jax.host.runs import Run
@@ -42,13 +51,16 @@ class Recording:
     """What is recorded of training, and when. It does not change a run's numbers.
 
     Attributes:
-      checkpoint_every: environment steps per seed between two checkpoints, rounded up
-        to whole iterations; None writes one every ten minutes.
-      keep_checkpoints: number of newest checkpoints to keep, besides the best one; 0
-        writes none.
-      evaluate_every: environment steps per seed between two evaluations; None for none.
+      checkpoint_every: environment steps per seed between two checkpoints; by
+        default a checkpoint is written every ten minutes.
+      keep_checkpoints: number of newest checkpoints to keep. One more is kept: the one
+        with the best evaluation or, without evaluate_every, with the best returns.
+      evaluate_every: environment steps per seed between two evaluations of the
+        policy's mean action in fresh environments, rounded up to whole iterations;
+        by default none. The untrained policy is evaluated too. The scores are undelayed
+        returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation.
-      log: names of trackers.
+      log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
     checkpoint_every: int | None = None
@@ -248,7 +260,13 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
 
     An algorithm that only Python can make is an argument.
     """
-    stored = described(folder)
+    return made(folder, described(folder), algorithm)
+
+
+def made(
+    folder: pathlib.Path, stored: Config, algorithm: Algorithm | None = None
+) -> Sweep:
+    """Return the sweep that a folder's config.json describes; see `read`."""
     if algorithm is None and (why := stored["only_python"]) is not None:
         raise InputError(
             f"run is {folder}, which was trained from Python with what no command line "
@@ -256,6 +274,7 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
             "python -m gasil_jax.plot"
         )
     with json_files.blamed(folder / folders.CONFIG):
+        _note_imports(folder, stored)
         if algorithm is None:
             algorithm = descriptions.read(stored["algorithm"])
         others = tuple(map(descriptions.read, stored.get("others", ())))
@@ -269,6 +288,17 @@ def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
     return Sweep(
         algorithm=algorithm, others=others, points=every, start=start, **fields
     )
+
+
+def _note_imports(folder: pathlib.Path, stored: Config) -> None:
+    """Print which modules a config.json names, which its reader imports."""
+    named: list[Any] = [stored["env"]]
+    for each in (stored["algorithm"], *stored.get("others", ())):
+        named += [each.get("agent"), *each.get("rewards", ())]
+    modules = {str(name).partition(":")[0] for name in named if ":" in str(name)}
+    new = sorted(modules - {*environments.FAMILIES, *sys.modules})
+    if new:
+        note(f"{folder} names code that is imported now: {', '.join(new)}")
 
 
 def check_seeds(seeds: Sequence[int]) -> None:

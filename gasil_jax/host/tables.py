@@ -41,18 +41,11 @@ class TableWriter:
     The cell of a value that is not finite (no episode ended yet, no discriminator) is
     empty. Reading the others as float32 gives the numbers that were written.
 
-    Args:
-      path: the file.
-      labels: columns that identify the members, (members,) each.
-      rows: number of rows to keep of an existing file, those that the checkpoint which
-        training continues from has seen; later rows are written again.
-      columns: metrics to write first, in this order; others follow.
+    Of an existing file it keeps the rows that the checkpoint has seen which training
+    continues from, and refuses one that lacks some; later ones are written again.
 
     Attributes:
       rows: number of rows so far.
-
-    Raises:
-      InputError: if the file lacks some of these rows.
     """
 
     def __init__(

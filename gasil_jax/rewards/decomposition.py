@@ -46,24 +46,13 @@ _MOST = 2**19
 
 
 class Decomposition(struct.PyTreeNode):
-    """The state of reward decomposition between iterations.
+    """The state of reward decomposition between iterations."""
 
-    Attributes:
-      network: g, parameters and optimizer state of a `networks.StepReward`.
-      rates: moments of payout / length of all windows so far; a normalizer with
-        obs = 1.
-      reward: float32 (N, H), the decomposed rewards of the history's steps.
-      open_reward: float32 (N,), sum of the decomposed rewards of the running window.
-      open_steps: float32 (N,), number of steps of the running window.
-      recorded_steps: int32 (), number of steps of each environment in the history.
-    """
-
-    network: Learner
-    rates: Normalizer
-    reward: jax.Array
-    open_reward: jax.Array
-    open_steps: jax.Array
-    recorded_steps: jax.Array
+    network: Learner  # g, a `networks.StepReward`
+    rates: Normalizer  # moments of payout / length of all windows so far, (1,)
+    reward: jax.Array  # float32 (N, H), the decomposed rewards of the history's steps
+    open_reward: jax.Array  # float32 (N,), their sum over the running window
+    open_steps: jax.Array  # float32 (N,), number of steps of the running window
 
 
 class Windows(NamedTuple):
@@ -79,21 +68,19 @@ def ends_window(reward: jax.Array, ended: jax.Array) -> jax.Array:
     return (reward != 0) | ended
 
 
-def windows(history: History, recorded_steps: jax.Array) -> Windows:
+def windows(history: History) -> Windows:
     """Return the complete windows of a history, (N, H), in time order.
 
     A window whose first step is no longer in the history, and one that ends with a NaN
     reward, is left out.
     """
     reward, ended = history.in_time(history.reward), history.in_time(history.ended)
-    steps = reward.shape[1]
-    index = jnp.arange(steps, dtype=jnp.int32)[None]
-    recorded = index >= steps - recorded_steps
-    last = ends_window(reward, ended) | ~recorded
+    index = jnp.arange(reward.shape[1], dtype=jnp.int32)[None]
+    last = ends_window(reward, ended)
     latest = jax.lax.cummax(jnp.where(last, index, -1), axis=1)
     before = jnp.pad(latest[:, :-1], ((0, 0), (1, 0)), constant_values=-1)
     return Windows(
-        ends=last & recorded & (before >= 0) & jnp.isfinite(reward),
+        ends=last & (before >= 0) & jnp.isfinite(reward),
         payout=reward,
         length=index - before,
     )
@@ -247,7 +234,6 @@ class Decompose(RewardModel):
             reward=jnp.zeros((sizes.num_envs, sizes.history_steps), jnp.float32),
             open_reward=jnp.zeros(sizes.num_envs, jnp.float32),
             open_steps=jnp.zeros(sizes.num_envs, jnp.float32),
-            recorded_steps=jnp.int32(0),
         )
 
     def update(
@@ -289,10 +275,8 @@ class Decompose(RewardModel):
         )
         num_steps, ring = batch.reward.shape[0], history.observation.shape[1]
         cursor = (history.cursor - num_steps) % ring
-        recorded_steps = jnp.minimum(state.recorded_steps + num_steps, ring)
-        complete = windows(history, recorded_steps)
         trained = self._train(
-            state.network, history, complete, rates=rates, key=key, predict=predict
+            state.network, history, rates=rates, key=key, predict=predict
         )
         healthy, trained = learner.keep_if_finite(trained, state.network)
         # What the network does not explain of a payout is shared by the window's steps.
@@ -313,7 +297,6 @@ class Decompose(RewardModel):
             reward=write(recorded, reward, cursor),
             open_reward=running[0],
             open_steps=running[1],
-            recorded_steps=recorded_steps,
         )
         # The NaNs that mark episodes without a valid return must stay.
         no_return = jnp.isnan(history.reward)
@@ -328,7 +311,6 @@ class Decompose(RewardModel):
         self,
         network: Learner,
         history: History,
-        complete: Windows,
         *,
         rates: Normalizer,
         key: jax.Array,
@@ -342,6 +324,7 @@ class Decompose(RewardModel):
         """
         num_windows = self.decomposition_minibatch_size
         num_rows = self.decomposition_window_steps
+        complete = windows(history)
         steps = complete.ends.shape[1]
         rings = history.observation, history.action, history.next_observation
         mean, scale = normalization.moments(rates)

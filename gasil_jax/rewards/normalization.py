@@ -23,15 +23,10 @@ CLIP = 10.0
 
 
 class RewardNormalizer(struct.PyTreeNode):
-    """The running sums and their moments, from which the scale is computed.
+    """The running sums and their moments, from which the scale is computed."""
 
-    Attributes:
-      running: float32 (env,), sum of gamma^age reward over the running episode.
-      sums: moments of all such sums so far; a normalizer with obs = 1.
-    """
-
-    running: jax.Array
-    sums: normalization.Normalizer
+    running: jax.Array  # float32 (env,), sum of gamma^age reward over the episode
+    sums: normalization.Normalizer  # moments of all such sums so far, (1,)
 
 
 def init(num_envs: int) -> RewardNormalizer:
@@ -46,14 +41,7 @@ def update(
     *,
     gamma: jax.Array | float,
 ) -> RewardNormalizer:
-    """Return the normalizer updated by a batch of rewards.
-
-    Args:
-      normalizer: the normalizer before the batch.
-      reward: float32 (time, env), finite.
-      ended: bool (time, env), whether the episode ended with this step.
-      gamma: discount.
-    """
+    """Return the normalizer updated by a batch of finite rewards, (time, env)."""
     chex.assert_equal_shape([reward, ended])
 
     def step(running: jax.Array, now: Any) -> Any:

@@ -108,8 +108,7 @@ def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
         agent, context = algorithm.agent, example_context(ENV, algorithm, key)
         state = agent.remember(gasil_jax.init(ENV, algorithm, key).agent, context)
         _, rewards, _ = agent.update_and_reward(state, context, key)
-        source = agent.source(state.buffer)
-        _, bonus, _ = agent.update_and_score(state.discriminator, source, context, key)
+        _, bonus, _ = agent.update_and_score(state, context, key)
         return state.buffer.size, context.rollout.reward, bonus, rewards
 
     size, reward, bonus, rewards = first(jax.random.key(0))
@@ -156,5 +155,3 @@ def test_options_of_buffer_and_discriminator_change_what_is_kept_and_learned():
     assert np.all(np.isfinite(fewer)) and not np.allclose(params, fewer, atol=1e-7)
     assert learned(buffer_steps=150).size == 150 < plain.size
     assert learned(buffer_episodes=1).size == 50 < plain.size
-    undiscounted = learned(buffer_discounts=False)
-    assert mean_return(undiscounted) > 1.02 * mean_return(plain)

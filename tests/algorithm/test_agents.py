@@ -164,9 +164,10 @@ def test_cloning_makes_the_good_steps_likelier():
     )
     # Only the cloning, which comes last in the iteration, differs.
     states, _ = train("ppo+bc", 1, changes=(strong, without))
-    good = gasil_jax.member(states.agent, 0)
-    np.testing.assert_array_equal(states.agent.size, 100)
-    np.testing.assert_array_equal(states.agent.action[1], good.action)
+    buffers = states.agent.buffer
+    good = gasil_jax.member(buffers, 0)
+    np.testing.assert_array_equal(buffers.size, 100)
+    np.testing.assert_array_equal(buffers.action[1], good.action)
     normalizer = normalization.init(ENV.observation_size)
     observation = normalization.normalize(normalizer, good.observation[:100])
     network = GaussianPolicy(CONFIG.hidden_sizes, ENV.action_size)

@@ -43,7 +43,7 @@ def test_novelty_is_one_over_the_root_of_the_visits():
     state = agent.init(KEY, gasil_jax.context.sizes_of(ENV, 4))
     for batches in (1, 2):
         state = agent.remember(state, context)
-        novelty = np.array(agent.novelty(state, context))
+        novelty = np.array(agent.novelty(state.visits, context))
         assert novelty[0, 0] == np.float32(batches**-0.5)
         np.testing.assert_allclose(novelty[1:], (127 * batches) ** -0.5, rtol=1e-6)
     _, reward, metrics = agent.update_and_reward(state, context, KEY)
@@ -64,8 +64,7 @@ def test_of_episodes_with_equal_returns_the_novel_ones_are_kept():
         normalizer=normalization.init(ENV.observation_size),
     )
     for kind, novel in ((agent, True), (PPOBC(buffer_steps=8), False)):
-        state = remembered(kind, context)
-        buffer = state.buffer if novel else state
+        buffer = remembered(kind, context).buffer
         first = np.array(buffer.action[0])
         env = int(np.where((np.array(batch.action) == first).all(-1))[1][0])
         assert buffer.size > 0 and (env == 2) == novel

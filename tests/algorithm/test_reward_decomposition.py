@@ -30,9 +30,9 @@ MODEL = gasil_jax.Decompose(
 _windows = jax.jit(decomposition.windows)
 
 
-def windows_of(*arguments):
+def windows_of(history):
     """The windows of a history, in NumPy."""
-    return jax.tree.map(np.asarray, _windows(*arguments))
+    return jax.tree.map(np.asarray, _windows(history))
 
 
 def new_history(num_envs=NUM_ENVS, **more):
@@ -72,7 +72,6 @@ def random_batches(seed, num_batches, delay=5):
             truncated=np.zeros(shape, bool),
             episode_return=zeros,
             discounted_return=zeros,
-            undiscounted_return=zeros,
             episode_length=np.zeros(shape, np.int32),
             faulty=faulty,
             cut_short=ended & ~faulty & (rng.random(shape) < 0.2),
@@ -132,8 +131,7 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
             cut_short=False,
         )
         history = good_trajectories.record(history, steps)
-        recorded = np.int32((batch + 1) * NUM_STEPS)
-        windows = windows_of(history, recorded)
+        windows = windows_of(history)
         most = max(most, int(windows.ends.sum()))
         assert (windows.length[windows.ends] == LIMIT).all()
     assert most == complete
@@ -184,7 +182,7 @@ def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_pai
                         position = ring - len(steps) + t
                         expected[env, position] = (payout[env], t + 1 - begin)
                     begin = t + 1
-        result = windows_of(history, state.recorded_steps)
+        result = windows_of(history)
         assert {*zip(*np.nonzero(result.ends), strict=True)} == set(expected)
         given = np.asarray(history.in_time(state.reward))
         for (env, end), (payout, length) in expected.items():
@@ -226,13 +224,10 @@ def test_a_failed_update_leaves_the_network_and_nothing_else():
     before, after = (state for state, *_ in failed[:2])
     same = np.testing.assert_array_equal
     jax.tree.map(same, before.network, after.network)
-    for (left, history, _, _), (right, _, reward, _) in zip(usual, failed, strict=True):
+    for (left, *_), (right, _, reward, _) in zip(usual, failed, strict=True):
         assert np.isfinite(reward).all()
-        same(left.recorded_steps, right.recorded_steps)
         same(left.open_steps, right.open_steps)
         same(left.rates.mean, right.rates.mean)
-        windows = [windows_of(history, x.recorded_steps) for x in (left, right)]
-        jax.tree.map(same, *windows)
 
 
 def test_fit_is_r_squared_of_the_windows_that_count():
@@ -339,7 +334,7 @@ def test_agents_and_ppo_see_decomposed_rewards_and_the_buffer_the_environments()
     assert np.isnan(state.history.reward).any()
     assert np.all(metrics["skipped_updates"] == 0)
     assert jnp.nanmean(state.history.reward != 0.0) < 0.1
-    assert state.agent.size > 0
+    assert state.agent.buffer.size > 0
 
 
 def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():

@@ -153,8 +153,8 @@ def test_a_cut_episode_counts_in_no_metric_no_buffer_and_no_replay(agent):
     assert ended.any() and (metrics["episode_length"][ended] == LIMIT).all()
     assert (metrics["episode_return"][ended] == -LIMIT).all()
     if agent.name == "ppo+bc":
-        assert int(state.agent.size) == 30
-        np.testing.assert_array_equal(state.agent.return_, -LIMIT)
+        assert int(state.agent.buffer.size) == 30
+        np.testing.assert_array_equal(state.agent.buffer.return_, -LIMIT)
     else:
         # A whole episode's steps have the returns -1 to -LIMIT, each as often.
         replay = state.agent

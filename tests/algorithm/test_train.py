@@ -51,7 +51,7 @@ def test_it_trains_an_environment_of_brax():
     assert np.all(np.isfinite(metrics["policy_loss"]))
     # No episode ends by itself, and none is longer than the limit.
     assert set(np.asarray(metrics["episode_length"])) == {50.0}
-    assert int(state.agent.size) > 0
+    assert int(state.agent.buffer.size) > 0
 
 
 def test_an_environment_with_the_physics_of_brax_can_be_traced():
@@ -103,6 +103,7 @@ def test_a_setting_that_it_does_not_have_is_refused(change, message):
         (CONFIG, "hyperparameters is Config.*: it must be numbers by name"),
         ({"gamma": 1.5}, "gamma is 1.5"),
         ({"learning_rate": -jnp.ones(())}, "rate is -1.0"),
+        ({"learning_rate": 1e-60}, "rate is 1e-60: it must be more than 0 in float32"),
         ({"alpha": np.ones(3)}, r"alpha has shape \(3,\): .*vmap"),
         ({"discriminator_updates": 1}, "discriminator_updates is not traced"),
         ({"imitation_weight": 0.5}, r"of ppo\+gasil-adaptive, not of ppo\+gasil"),

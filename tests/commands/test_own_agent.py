@@ -222,8 +222,9 @@ def test_a_run_without_its_module_says_so(my_agents, tmp_path, capsys):
     path = tmp_path / "config.json"
     path.write_text(path.read_text().replace("my_agents:Own", "gone:Own"))
     assert evaluate.main([str(tmp_path)]) == 2
-    message = "error: agent 'gone:Own' can't be imported: No module named 'gone'\n"
-    assert capsys.readouterr().err == message
+    told, error = capsys.readouterr().err.splitlines()
+    assert told.startswith("note: ") and told.endswith(" imported now: gone")
+    assert error == "error: agent 'gone:Own' can't be imported: No module named 'gone'"
 
 
 def test_an_algorithm_has_the_numbers_of_its_agent(my_agents):

@@ -55,7 +55,7 @@ def test_the_help_explains_every_option_by_topic(agent, monkeypatch, capsys):
     assert not re.findall(r"^  --\S+( \S+)*\n(?! {8})", shown, re.MULTILINE)
     topics = re.split(r"^(\w+):\n", shown, flags=re.MULTILINE)[1:]
     for topic, flag in (
-        ("run", "--log"),
+        ("recording", "--log"),
         ("environment", "--obs-noise"),
         ("training", "--gamma"),
         ("decompose_rewards", "--decomposition-updates"),

@@ -103,8 +103,8 @@ def test_a_sweep_from_end_to_end(swept):
     assert re.match(f"best mean: {sentence}", best), best
     assert re.match(f"best worst seed: {sentence}", worst), worst
     assert re.match(r"[\d,]+ steps/s on .*, in out$", speed), speed
-    commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out"
-    assert following == f"next: {commands}"
+    commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out; "
+    assert following.startswith(f"next: {commands}python -m gasil_jax.render out ")
 
     rows = table(out)
     assert [(row["point"], row["seed"]) for row in rows] == [

@@ -81,9 +81,7 @@ def test_the_weight_is_the_gap_in_quarters_of_the_buffers_return(behind):
     # It is PPO+BC with the weight as a factor, and PPO's own policy without weight.
     full = CLONING.agent.behavior_cloning_coefficient
     plain = gasil_jax.PPOBC(buffer_steps=CLONING.agent.buffer_steps)
-    of = lambda x: cloned(plain.replace(behavior_cloning_coefficient=x), state.buffer)[
-        0
-    ]
+    of = lambda x: cloned(plain.replace(behavior_cloning_coefficient=x), state)[0]
     expected = of(full * metrics["return_gap"]) if weight > 0 else networks().policy
     assert distance(policy, expected) < 1e-6 < distance(policy, of(0.5 * full))
     assert (distance(policy, of(full)) > 1e-6) == (weight < 1)

@@ -4,6 +4,7 @@ import errno
 import json
 import os
 import pathlib
+import shutil
 import subprocess
 import sys
 from unittest import mock
@@ -14,7 +15,7 @@ import numpy as np
 import orbax.checkpoint
 import pytest
 
-from gasil_jax.host import checkpoint
+from gasil_jax.host import checkpoint, saved
 
 #: Characters that mean something to a shell, to patterns, to URLs, or nothing at all.
 NAMES = ("sweep[lr=1e-3]", "a*?{b}", "line\nline", "$x%20#", " é ", "--x")
@@ -216,7 +217,7 @@ def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path):
     program = """
 import pathlib, resource, sys
 import numpy as np
-from gasil_jax.host import checkpoint
+from gasil_jax.host import checkpoint, saved
 
 # No file may grow beyond this: writing fails as on a full disk.
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
@@ -237,3 +238,20 @@ def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", broken)
     with pytest.raises(checkpoint.WriteError, match=r"written: Input/output error$"):
         write(tmp_path, 1)
+
+
+def test_a_checkpoint_that_training_deletes_is_replaced_by_a_newer_one(
+    untrained_point_mass, tmp_path, monkeypatch
+):
+    out = shutil.copytree(untrained_point_mass, tmp_path / "out")
+    (folder,) = out.glob("programs/*/checkpoints/*")
+    restore, deleted = checkpoint.Checkpoint.restore, []
+
+    def while_training(self, like):
+        if not deleted:
+            deleted.append(self.folder.name)
+            self.folder.rename(self.folder.with_name("00000007"))
+        return restore(self, like)
+
+    monkeypatch.setattr(checkpoint.Checkpoint, "restore", while_training)
+    assert saved.load(out)[2] == [0] and deleted == [folder.name]

@@ -80,3 +80,7 @@ def test_a_program_of_which_some_runs_are_asked_for(parent, tmp_path, capsys):
     longer = dataclasses.replace(one, algorithm=one.algorithm.replace(total_steps=384))
     (program,) = longer.unfinished(out)
     assert program.seeds == (2,) and not program.path.exists()
+    assert "is not continued" in capsys.readouterr().err
+    # Programs of more steps are other runs.
+    less = dataclasses.replace(short, algorithm=one.algorithm.replace(total_steps=128))
+    assert less.stored(out) == [] and len(less.unfinished(out)) == 1

@@ -12,7 +12,7 @@ from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import run
-from gasil_jax.host import resources
+from gasil_jax.host import environments, resources
 from gasil_jax.host.members import make_members
 from gasil_jax.host.programs import Program
 
@@ -170,3 +170,28 @@ def test_members_have_equal_shares_of_the_devices_that_are_used():
 def test_available_memory_is_read():
     free = resources.available(jax.devices())
     assert free is None or 10**7 < free < 10**14
+
+
+def test_the_limit_of_a_container_counts_as_cores(tmp_path):
+    root, own = tmp_path / "cgroup", tmp_path / "own"
+
+    def limit(folder, **files):
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, text in files.items():
+            (folder / name.replace("__", ".")).write_text(text)
+
+    cores = environments.available_cores(root, own)
+    own.write_text("0::/jobs/one\n")
+    limit(root / "jobs/one", cpu__max="max 100000\n")
+    assert environments.available_cores(root, own) == cores
+    limit(root / "jobs", cpu__max="50000 100000\n")
+    assert environments.available_cores(root, own) == 1
+    limit(root / "jobs", cpu__max=f"{10**9} 1000\n")
+    assert environments.available_cores(root, own) == cores
+    # The first version, in which each resource has its own hierarchy.
+    own.write_text("5:memory:/\n4:cpu,cpuacct:/docker/x\n")
+    quota = {"cpu__cfs_quota_us": "-1\n", "cpu__cfs_period_us": "100000\n"}
+    limit(root / "cpu/docker/x", **quota)
+    assert environments.available_cores(root, own) == cores
+    limit(root / "cpu/docker", **{**quota, "cpu__cfs_quota_us": "90000\n"})
+    assert environments.available_cores(root, own) == 1

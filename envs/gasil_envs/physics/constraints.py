@@ -9,7 +9,7 @@ B batch.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -171,58 +171,31 @@ class Group(NamedTuple):
     constants: Constants
 
 
-class Rows(NamedTuple):
-    """The constants of n rows, none of them of contacts.
+class Strength(NamedTuple):
+    """How hard n rows push or pull, none of them of contacts.
 
     Attributes:
       inverse_weight: (n or 1, 1).
       impedance: the coefficients.
       bound: (n, 1), largest force of rows that push and pull; None if they only push.
-      of_qpos: (n, nq), what is constrained is this times qpos.
-      of_qvel: (n, V), its Jacobian.
     """
 
     inverse_weight: np.ndarray
     impedance: Impedance
     bound: np.ndarray | None
-    of_qpos: np.ndarray
-    of_qvel: np.ndarray
+
+    @classmethod
+    def of(
+        cls, model: mujoco.MjModel, inverse_weight: Any, solver: Any, bound: Any = None
+    ) -> "Strength":
+        """From (n,) weights, solref and solimp, and (n,) bounds."""
+        bound = None if bound is None else bound[:, None].astype(np.float32)
+        return cls(_constant(inverse_weight), Impedance.of(model, *solver), bound)
 
 
-class Equalities(NamedTuple):
-    """Joints and tendons whose positions are polynomials of others'.
-
-    Attributes:
-      rows: of the positions.
-      start: (n, 1), positions at qpos0.
-      others: of_qpos and of_qvel of the other joints and tendons.
-      other_start: (n, 1), their positions at qpos0.
-      polynomial: (n, 5), coefficients from the constant on.
-    """
-
-    rows: Rows
-    start: np.ndarray
-    others: tendons.Tendons
-    other_start: np.ndarray
-    polynomial: np.ndarray
-
-
-class Others(NamedTuple):
-    """The rows that are neither of contacts nor of the limits of slides and hinges.
-
-    Attributes:
-      friction: dry friction of all degrees of freedom, or None.
-      equalities: joints and tendons that follow others, or None.
-      tendon_friction: dry friction of tendons, or None.
-      tendon_limits: their limits, low and high (2, n, 1), and margin (n, 1), or None.
-      ball_limits: joint numbers, largest angles and margins (n, 1), or None.
-    """
-
-    friction: Rows | None
-    equalities: Equalities | None
-    tendon_friction: Rows | None
-    tendon_limits: tuple[Rows, np.ndarray, np.ndarray] | None
-    ball_limits: tuple[Rows, np.ndarray, np.ndarray, np.ndarray] | None
+#: (nq, B) positions -> (n, B) how far n rows are from being held, and their Jacobians
+#: (n, V, B). Rows that only push act where that is negative.
+Place = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Layout(NamedTuple):
@@ -230,7 +203,8 @@ class Layout(NamedTuple):
 
     limits: Limits
     groups: tuple[Group, ...]
-    others: Others
+    friction: Strength | None
+    others: tuple[tuple[Strength, Place], ...]
     impratio: float
 
     @property
@@ -302,7 +276,14 @@ def layout(model: mujoco.MjModel) -> Layout:
         for dim in (1, 3, 4, 6)
         if (contact.dim == dim).any()
     ]
-    return Layout(limits, tuple(groups), _others(model), model.opt.impratio)
+    friction = None
+    if model.dof_frictionloss.any():
+        solver = model.dof_solref, model.dof_solimp
+        loss = model.dof_frictionloss
+        friction = Strength.of(model, model.dof_invweight0, solver, loss)
+    kinds = (_equalities, _tendon_friction, _tendon_limits, _ball_limits)
+    others = tuple(rows for kind in kinds if (rows := kind(model)) is not None)
+    return Layout(limits, tuple(groups), friction, others, model.opt.impratio)
 
 
 def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
@@ -437,174 +418,140 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     )
 
 
-def _others(model: mujoco.MjModel) -> Others:
-    fixed = tendons.fixed(model)
-    of_joint = tendons.Tendons(
-        np.eye(model.nq)[model.jnt_qposadr], np.eye(model.nv)[model.jnt_dofadr]
+def _wide(x: np.ndarray, qpos: jax.Array) -> jax.Array:
+    """(n, ...) to float32 (n, ..., B)."""
+    x = x.astype(np.float32)[..., None]
+    return jnp.broadcast_to(x, (*x.shape[:-1], qpos.shape[-1]))
+
+
+def _equalities(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+    """Joints and tendons whose positions are polynomials of others'."""
+    index = np.flatnonzero(model.eq_active0)
+    if not index.size:
+        return None
+    fixed, joints = tendons.fixed(model), (model.jnt_qposadr, model.jnt_dofadr)
+    # Of the joints, then of the tendons, and 0 for no second one.
+    of_qpos, of_qvel, start, weight = (
+        np.concatenate([of_joints, of_tendons, 0 * of_joints[:1]])
+        for of_joints, of_tendons in (
+            (np.eye(model.nq)[joints[0]], fixed.of_qpos),
+            (np.eye(model.nv)[joints[1]], fixed.of_qvel),
+            (model.qpos0[joints[0]], model.tendon_length0),
+            (model.dof_invweight0[joints[1]], model.tendon_invweight0),
+        )
+    )
+    is_joint = model.eq_type[index] == mujoco.mjtEq.mjEQ_JOINT
+    first, second = (
+        np.where(i < 0, -1, np.where(is_joint, i, i + model.njnt))
+        for i in (model.eq_obj1id[index], model.eq_obj2id[index])
     )
 
-    def rows(
-        own: tendons.Tendons, inverse_weight: Any, solver: Any, bound: Any = None
-    ) -> Rows:
-        bound = None if bound is None else bound[:, None].astype(np.float32)
-        impedance = Impedance.of(model, *solver)
-        return Rows(_constant(inverse_weight), impedance, bound, *own)
-
-    def at(x: tendons.Tendons, index: np.ndarray) -> tendons.Tendons:
-        return tendons.Tendons(
-            *(np.where(index[:, None] < 0, 0.0, y[index]) for y in x)
+    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        own, x = (
+            constant_times(of_qpos[i], qpos) - start[i, None].astype(np.float32)
+            for i in (first, second)
         )
+        value, slope = jnp.zeros_like(x), jnp.zeros_like(x)
+        for c in model.eq_data[index, 4::-1].T[..., None].astype(np.float32):
+            slope = slope * x + value
+            value = value * x + c
+        others = slope[:, None] * _wide(of_qvel[second], qpos)
+        return own - value, _wide(of_qvel[first], qpos) - others
 
-    friction = tendon_friction = tendon_limits = ball_limits = equalities = None
-    if model.dof_frictionloss.any():
-        own = tendons.Tendons(np.zeros((model.nv, model.nq)), np.eye(model.nv))
-        solver = model.dof_solref, model.dof_solimp
-        loss = model.dof_frictionloss
-        friction = rows(own, model.dof_invweight0, solver, loss)
+    solver = model.eq_solref[index], model.eq_solimp[index]
+    unbounded = np.full(index.size, np.inf)
+    return Strength.of(model, weight[first] + weight[second], solver, unbounded), place
+
+
+def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
     index = np.flatnonzero(model.tendon_frictionloss)
-    if index.size:
-        solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
-        weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
-        tendon_friction = rows(at(fixed, index), weight, solver, loss)
-    index = np.flatnonzero(model.tendon_limited)
-    if index.size:
-        solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
-        tendon_limits = (
-            rows(at(fixed, index), model.tendon_invweight0[index], solver),
-            model.tendon_range[index].T[..., None].astype(np.float32),
-            model.tendon_margin[index][:, None].astype(np.float32),
-        )
-    index = np.flatnonzero(model.jnt_limited & (model.jnt_type == tree.BALL))
-    if index.size:
-        weight = model.dof_invweight0[model.jnt_dofadr[index]]
-        solver = model.jnt_solref[index], model.jnt_solimp[index]
-        ball_limits = (
-            rows(at(of_joint, index), weight, solver),
-            index,
-            model.jnt_range[index].max(axis=1)[:, None].astype(np.float32),
-            model.jnt_margin[index][:, None].astype(np.float32),
-        )
-    index = np.flatnonzero(model.eq_active0)
-    if index.size:
-        is_joint = model.eq_type[index] == mujoco.mjtEq.mjEQ_JOINT
-        first, second = model.eq_obj1id[index], model.eq_obj2id[index]
-
-        def pick(of_joints: np.ndarray, of_tendons: np.ndarray, i: np.ndarray) -> Any:
-            """Return a row of either, 0 where there is no second joint or tendon."""
-            of_tendons = of_tendons if len(of_tendons) else np.zeros_like(of_joints[:1])
-            chosen = [
-                (of_joints if joint else of_tendons)[j]
-                for joint, j in zip(is_joint, np.maximum(i, 0), strict=True)
-            ]
-            return np.stack(chosen) * (i >= 0).reshape(-1, *(1,) * (of_joints.ndim - 1))
-
-        def both(i: np.ndarray) -> tendons.Tendons:
-            return tendons.Tendons(
-                *(pick(*x, i) for x in zip(of_joint, fixed, strict=True))
-            )
-
-        def start(i: np.ndarray) -> np.ndarray:
-            at_start = model.qpos0[model.jnt_qposadr], model.tendon_length0
-            return pick(*at_start, i)[:, None].astype(np.float32)
-
-        def weight(i: np.ndarray) -> np.ndarray:
-            of_joints = model.dof_invweight0[model.jnt_dofadr]
-            return pick(of_joints, model.tendon_invweight0, i)
-
-        solver = model.eq_solref[index], model.eq_solimp[index]
-        unbounded = np.full(index.size, np.inf)
-        equalities = Equalities(
-            rows(both(first), weight(first) + weight(second), solver, unbounded),
-            start(first),
-            both(second),
-            start(second),
-            model.eq_data[index, :5],
-        )
-    return Others(friction, equalities, tendon_friction, tendon_limits, ball_limits)
-
-
-def friction_rows(others: Others, qvel: jax.Array) -> newton.FrictionRows | None:
-    """Return the dry friction of the degrees of freedom at qvel (V, B)."""
-    rows = others.friction
-    if rows is None or rows.bound is None:
+    if not index.size:
         return None
-    weight = _weight(rows.impedance(jnp.zeros_like(qvel)), rows.inverse_weight)
+    of_qvel = tendons.fixed(model).of_qvel[index]
+
+    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return _wide(np.zeros(index.size), qpos), _wide(of_qvel, qpos)
+
+    solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
+    weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
+    return Strength.of(model, weight, solver, loss), place
+
+
+def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+    index = np.flatnonzero(model.tendon_limited)
+    if not index.size:
+        return None
+    of_qpos, of_qvel = (x[index] for x in tendons.fixed(model))
+    low, high = model.tendon_range[index].T[..., None].astype(np.float32)
+    margin = model.tendon_margin[index, None].astype(np.float32)
+
+    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        length = constant_times(of_qpos, qpos)
+        sign = jnp.where(length - low < high - length, 1.0, -1.0)
+        distance = jnp.minimum(length - low, high - length) - margin
+        return distance, sign[:, None] * _wide(of_qvel, qpos)
+
+    solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
+    return Strength.of(model, model.tendon_invweight0[index], solver), place
+
+
+def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+    index = np.flatnonzero(model.jnt_limited & (model.jnt_type == tree.BALL))
+    if not index.size:
+        return None
+    most = model.jnt_range[index].max(axis=1) - model.jnt_margin[index]
+
+    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+        angles, jacobians = [], []
+        for joint in index:
+            first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
+            axis, angle = tree.axis_angle(qpos[first : first + 4])
+            angles.append(angle)
+            none = jnp.zeros((model.nv, angle.shape[-1]), jnp.float32)
+            jacobians.append(jnp.concatenate([none[:dof], -axis, none[dof + 3 :]]))
+        return _wide(most, qpos) - stacked(angles), stacked(jacobians)
+
+    solver = model.jnt_solref[index], model.jnt_solimp[index]
+    weight = model.dof_invweight0[model.jnt_dofadr[index]]
+    return Strength.of(model, weight, solver), place
+
+
+def friction_rows(
+    friction: Strength | None, qvel: jax.Array
+) -> newton.FrictionRows | None:
+    """Return the dry friction of the degrees of freedom at qvel (V, B)."""
+    if friction is None or friction.bound is None:
+        return None
+    impedance = friction.impedance(jnp.zeros_like(qvel))
+    weight = _weight(impedance, friction.inverse_weight)
     return newton.FrictionRows(
-        reference=jnp.asarray(-rows.impedance.damping) * qvel,
-        weight=jnp.where(rows.bound > 0, weight, 0.0),
-        bound=jnp.broadcast_to(rows.bound, qvel.shape),
+        reference=jnp.asarray(-friction.impedance.damping) * qvel,
+        weight=jnp.where(friction.bound > 0, weight, 0.0),
+        bound=jnp.broadcast_to(friction.bound, qvel.shape),
     )
 
 
 @jax.named_scope("constraint_rows")
 def other_rows(
-    model: mujoco.MjModel, others: Others, qpos: jax.Array, qvel: jax.Array
-) -> list[newton.ContactRows]:
-    """Return the rows of joints and tendons but for friction and scalar limits."""
-    result = []
-
-    def add_rows(
-        rows: Rows, jacobian: jax.Array, distance: jax.Array, acts: Any = True
-    ) -> None:
-        jacobian = jnp.where(acts, jnp.swapaxes(jacobian, 0, 1), 0.0)
-        jacobian = materialize(jnp.swapaxes(jacobian, 0, 1))
-        distance = jnp.where(acts, distance, 0.0)
-        impedance = rows.impedance(distance)
-        speed = total(jacobian * qvel, 1)
-        pull = rows.impedance.stiffness * impedance * distance
-        weight = jnp.where(acts, _weight(impedance, rows.inverse_weight), 0.0)
-        result.append(
-            newton.ContactRows(
-                basis=jacobian[:, None],
-                reference=(-rows.impedance.damping * speed - pull)[:, None],
-                weight=weight[:, None],
-                edges=((1,),),
-                bound=None
-                if rows.bound is None
-                else jnp.broadcast_to(rows.bound, weight.shape)[:, None],
-            )
-        )
-
-    def constant(x: np.ndarray) -> jax.Array:
-        x = x.astype(np.float32)[..., None]
-        return jnp.broadcast_to(x, (*x.shape[:-1], qpos.shape[-1]))
-
-    if others.equalities is not None:
-        rows, start, other, other_start, polynomial = others.equalities
-        x = constant_times(other.of_qpos, qpos) - other_start
-        coefficients = polynomial.T[..., None].astype(np.float32)
-        value, slope = jnp.zeros_like(x), jnp.zeros_like(x)
-        for c in coefficients[::-1]:
-            slope = slope * x + value
-            value = value * x + c
-        distance = constant_times(rows.of_qpos, qpos) - start - value
-        jacobian = constant(rows.of_qvel) - slope[:, None] * constant(other.of_qvel)
-        add_rows(rows, jacobian, distance)
-    if others.tendon_friction is not None:
-        rows = others.tendon_friction
-        none = jnp.zeros((len(rows.of_qvel), qpos.shape[-1]), jnp.float32)
-        add_rows(rows, constant(rows.of_qvel), none)
-    if others.tendon_limits is not None:
-        rows, (low, high), margin = others.tendon_limits
-        length = constant_times(rows.of_qpos, qpos)
-        at_low = length - low < high - length
-        distance = jnp.minimum(length - low, high - length) - margin
-        sign = jnp.where(at_low, 1.0, -1.0)
-        jacobian = sign[:, None] * constant(rows.of_qvel)
-        add_rows(rows, jacobian, distance, distance < 0.0)
-    if others.ball_limits is not None:
-        rows, joints, most, margin = others.ball_limits
-        angles, jacobians = [], []
-        for joint in joints:
-            first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
-            axis, angle = tree.axis_angle(qpos[first : first + 4])
-            angles.append(angle)
-            before = jnp.zeros((dof, angle.shape[-1]), jnp.float32)
-            after = jnp.zeros((model.nv - dof - 3, angle.shape[-1]), jnp.float32)
-            jacobians.append(jnp.concatenate([before, -axis, after]))
-        distance = most - stacked(angles) - margin
-        add_rows(rows, stacked(jacobians), distance, distance < 0.0)
-    return result
+    strength: Strength, place: Place, qpos: jax.Array, *, qvel: jax.Array
+) -> newton.ContactRows:
+    """Return rows of joints or tendons as contacts with one axis."""
+    distance, jacobian = place(qpos)
+    inverse_weight, solimp, bound = strength
+    acts = distance < 0.0 if bound is None else jnp.ones_like(distance, bool)
+    jacobian = materialize(jnp.where(acts[:, None], jacobian, 0.0))
+    distance = jnp.where(acts, distance, 0.0)
+    impedance = solimp(distance)
+    pull = solimp.stiffness * impedance * distance
+    weight = jnp.where(acts, _weight(impedance, inverse_weight), 0.0)
+    reference = -solimp.damping * total(jacobian * qvel, 1) - pull
+    return newton.ContactRows(
+        basis=jacobian[:, None],
+        reference=reference[:, None],
+        weight=weight[:, None],
+        edges=((1,),),
+        bound=None if bound is None else jnp.broadcast_to(bound, weight.shape)[:, None],
+    )
 
 
 @jax.named_scope("constraint_rows")

@@ -189,7 +189,9 @@ def forward(
         for x in groups
     ]
     limits = constraints.limit_rows(dynamics.layout.limits, qpos, qvel)
-    others = constraints.other_rows(model, dynamics.layout.others, qpos, qvel)
+    others = [
+        constraints.other_rows(*x, qpos, qvel=qvel) for x in dynamics.layout.others
+    ]
     trees = tree.trees(model)
 
     def constrain(contacts: Sequence[constraints.Contacts], for_speed: bool) -> Any:
@@ -203,7 +205,7 @@ def forward(
             state.qacc_warmstart,
             limits,
             (*rows, *others),
-            constraints.friction_rows(dynamics.layout.others, qvel),
+            constraints.friction_rows(dynamics.layout.friction, qvel),
         )
         solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)

@@ -200,9 +200,43 @@ def weighted_axes(
         yield add(terms)
 
 
-def _where(marks: list[bool], rows: Any, mark: bool = True) -> list[Any]:
-    """Return the entries of a list of rows that have a mark."""
-    return [x for x, y in zip(rows, marks, strict=True) if y is mark]
+# A row's cost as a function of d = J qacc - aref, for a row that only pushes (`most` is
+# None) and for one that also pulls, with a force up to `most`.
+
+
+def _cost(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
+    """Twice the cost."""
+    if most is None:
+        return w * jnp.minimum(d, 0.0) ** 2
+    force = _derivative(d, w, most)
+    return force * (2.0 * d - force / jnp.maximum(w, 1e-30))
+
+
+def _derivative(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
+    """The first derivative of the cost: the force, with the opposite sign."""
+    if most is None:
+        return _curvature(d, w, most) * d
+    return jnp.clip(w * d, -most, most)
+
+
+def _curvature(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
+    """The second derivative of the cost."""
+    return jnp.where(d < 0.0 if most is None else jnp.abs(w * d) < most, w, 0.0)
+
+
+def _rate(d: jax.Array, w: jax.Array, most: Any, slope: jax.Array) -> jax.Array:
+    """The derivative of the cost along a direction in which d changes by `slope`."""
+    if most is None:
+        return _curvature(d, w, most) * slope * d
+    return _derivative(d, w, most) * slope
+
+
+def _piece(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
+    """Which piece of the cost: whether it pushes, or which of its bounds it is at."""
+    if most is None:
+        return d < 0.0
+    force = w * d
+    return jnp.sign(force) * (jnp.abs(force) >= most)
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
@@ -213,55 +247,19 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
       iterations: largest number of Newton iterations.
       line_search: largest number of steps of each line search.
     """
-    each, weight = jax.tree.map, system.weight
-    pulls = [bound is not None for bound in system.bound]
-    bound = _where(pulls, system.bound)
-    pull_weight = _where(pulls, weight)
+    each = jax.tree.map
 
-    def held(jaref: Any) -> Any:
-        """Return the force, with the opposite sign, of the rows that also pull."""
-        return each(
-            lambda d, w, most: jnp.clip(w * d, -most, most),
-            _where(pulls, jaref),
-            pull_weight,
-            bound,
-        )
+    def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
+        """Return a function of each row; `others` are the last arguments."""
+        rows = zip(jaref, system.weight, system.bound, *others, strict=True)
+        return [
+            each(lambda d, w, *x: function(d, w, None, *x), d, w, *x)
+            if most is None
+            else each(function, d, w, most, *x)
+            for d, w, most, *x in rows
+        ]
 
-    # A row's piece of its cost: whether it pushes, or which of its bounds it is at.
-    def piece(jaref: Any) -> Any:
-        pushing = each(lambda d: d < 0.0, _where(pulls, jaref, False))
-        return pushing, each(
-            lambda f, most: jnp.sign(f) * (jnp.abs(f) >= most), held(jaref), bound
-        )
-
-    def inner_weight(jaref: Any) -> Any:
-        """Return the second derivative of each row's cost."""
-        rows = []
-        for d, w, most in zip(jaref, weight, system.bound, strict=True):
-            if most is None:
-                rows.append(each(lambda d, w: jnp.where(d < 0.0, w, 0.0), d, w))
-            else:
-                rows.append(
-                    each(
-                        lambda d, w, x: jnp.where(jnp.abs(w * d) < x, w, 0.0),
-                        d,
-                        w,
-                        most,
-                    )
-                )
-        return rows
-
-    def derivative(active: Any, jaref: Any) -> Any:
-        """Return the first derivative of each row's cost."""
-        pushing = iter(
-            each(
-                jnp.multiply, _where(pulls, active, False), _where(pulls, jaref, False)
-            )
-        )
-        pulling = iter(held(jaref))
-        return [next(pulling if both else pushing) for both in pulls]
-
-    # J qacc - aref of each row, by MuJoCo's name: a row pushes where it is negative.
+    # J qacc - aref of each row, by MuJoCo's name.
     def jaref_at(qacc: Any) -> Any:
         return system.store(each(jnp.subtract, system.times(qacc), system.reference))
 
@@ -269,23 +267,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         return system.total(each(jnp.multiply, a, b))
 
     def row_cost(jaref: Any) -> jax.Array:
-        cost = system.total(
-            each(
-                lambda d, w: w * jnp.minimum(d, 0.0) ** 2,
-                _where(pulls, jaref, False),
-                _where(pulls, weight, False),
-            )
-        )
-        if not any(pulls):
-            return cost
-        return cost + system.total(
-            each(
-                lambda f, d, w: f * (2.0 * d - f / jnp.maximum(w, 1e-30)),
-                held(jaref),
-                _where(pulls, jaref),
-                pull_weight,
-            )
-        )
+        return system.total(of_rows(_cost, jaref))
 
     warmstart, smooth = system.warmstart, system.solve(None, system.force)
     away = each(jnp.subtract, warmstart, smooth)
@@ -298,10 +280,11 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
 
     def iterate(carry: Any) -> Any:
         qacc, jaref = carry
-        active = inner_weight(jaref)
         residual = each(jnp.subtract, system.inertia_times(qacc), system.force)
-        pull = system.transposed_times(derivative(active, jaref))
-        active, gradient = system.store((active, each(jnp.add, residual, pull)))
+        pull = system.transposed_times(of_rows(_derivative, jaref))
+        active, gradient = system.store(
+            (of_rows(_curvature, jaref), each(jnp.add, residual, pull))
+        )
         direction = each(jnp.negative, system.solve(active, gradient))
 
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
@@ -312,24 +295,19 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         def search_step(search: Any) -> Any:
             step, low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
-            one_sided = (_where(pulls, x, False) for x in (there, slope, weight))
-            pushed = each(lambda d, s, w: jnp.where(d < 0.0, w * s, 0.0), *one_sided)
-            second = quadratic + dot(pushed, _where(pulls, slope, False))
-            first = linear + step * quadratic + dot(pushed, _where(pulls, there, False))
-            if any(pulls):
-                along = _where(pulls, slope)
-                inner = _where(pulls, inner_weight(there))
-                second = second + dot(each(jnp.multiply, inner, along), along)
-                first = first + dot(held(there), along)
+            bent = each(jnp.multiply, of_rows(_curvature, there), slope)
+            second = quadratic + dot(bent, slope)
+            rates = of_rows(_rate, there, slope)
+            first = linear + step * quadratic + system.total(rates)
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
             following = jnp.where(inside, following, 0.5 * (low + high))
-            now = piece(there)
+            now = of_rows(_piece, there)
             return (following, low, high, now), system.differ(before, now)
 
-        step, before = jnp.ones_like(linear), piece(jaref)
+        step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
         search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), before)
         step = system.repeat(
             search_step, search, least=1, most=line_search, is_short=True
@@ -337,18 +315,10 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         qacc, moved = each(
             lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
         )
-        return (qacc, moved), system.differ(before, piece(moved))
+        return (qacc, moved), system.differ(before, of_rows(_piece, moved))
 
     start = each(choose, (warmstart, at_warmstart), (smooth, at_smooth))
     qacc, jaref = system.repeat(
         iterate, start, least=2, most=iterations, is_short=False
     )
-    pushes = iter(
-        each(
-            lambda d, w: w * jnp.maximum(-d, 0.0),
-            _where(pulls, jaref, False),
-            _where(pulls, weight, False),
-        )
-    )
-    both_ways = iter(each(jnp.negative, held(jaref)))
-    return qacc, [next(both_ways if both else pushes) for both in pulls]
+    return qacc, each(jnp.negative, of_rows(_derivative, jaref))

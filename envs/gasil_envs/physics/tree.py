@@ -29,8 +29,9 @@ FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_HINGE),
 )
 _NEGLIGIBLE = 1e-9
-#: From this distance from the origin on, metres, rounding moves contacts by 1e-5 m/s.
-_FAR = 20.0
+#: From this distance from the origin on, metres, and this condition of the joint-space
+#: inertia on, rounding moves bodies by more than 1e-5 of their velocity in a step.
+_FAR, _UNEVEN = 20.0, 5e3
 
 
 class Kinematics(NamedTuple):
@@ -72,16 +73,21 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 
 
 def rounding(model: mujoco.MjModel) -> list[str]:
-    """Return what to warn of if bodies that move start far from the origin."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
+    """Return the parts of a model that float32 resolves too little of."""
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    own = np.sqrt(np.diag(inertia))
     away = np.linalg.norm(data.xpos[model.body_weldid > 0], axis=1).max(initial=0.0)
-    if away < _FAR:
-        return []
-    return [
-        f"bodies {away:.0f} m from the origin, where float32 rounds positions to "
-        f"{away * 1e-7:.0e} m"
-    ]
+    found = []
+    if away > _FAR:
+        found.append(
+            f"bodies {away:.0f} m from the origin, where positions are rounded to "
+            f"{away * 1e-7:.0e} m"
+        )
+    if (condition := np.linalg.cond(inertia / np.outer(own, own))) > _UNEVEN:
+        found.append(f"bodies, whose inertia has the condition {condition:.0e}")
+    return found
 
 
 def trees(model: mujoco.MjModel) -> list[tuple[int, slice]]:
