@@ -144,6 +144,9 @@ draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
 draw --smooth 0 | smooth is 0: it must be 1 or more
 draw --x steps | x 'steps' is unknown
 draw --out x.txt | must end in .png, .pdf, .svg
+draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
+draw --smooth 0 | smooth is 0: it must be 1 or more
+draw --x steps | x 'steps' is unknown: did you mean 'env_steps'
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png
 draw --out RUN/summary.png --point 1 | point is 1: 
