@@ -336,7 +336,7 @@ _PROTOCOL = joined(
 )
 
 
-_CHOSEN_TWICE = Arm("ppo+bonus (second stage)", "ppo+bonus")
+_CHOSEN_BY_TWO = Arm("ppo+bonus (chosen by two seeds)", "ppo+bonus")
 
 
 def _control_panel(env: str, delay: int, normalize: bool) -> Panels:
@@ -347,11 +347,13 @@ def _control_panel(env: str, delay: int, normalize: bool) -> Panels:
     bimodal = env in (*_BIMODAL, "halfcheetah")
     parts = [
         _paper_panel(env, delay, normalize, agents=PAIR),
-        one(["ppo+bonus"], base=search, seeds=40 if bimodal else 20),
     ]
     if (env, normalize) == ("hopper", True):
-        # Two seeds chose a point that more did not confirm. Its final seeds are new.
-        parts.append(one([_CHOSEN_TWICE], base=SecondStage, seeds=20, first_seed=10))
+        # Two seeds chose a point that more did not confirm. The final seeds are new.
+        parts.append(one([_CHOSEN_BY_TWO], base=search, seeds=40))
+        parts.append(one(["ppo+bonus"], base=SecondStage, seeds=20, first_seed=10))
+    else:
+        parts.append(one(["ppo+bonus"], base=search, seeds=40 if bimodal else 20))
     if bimodal and normalize:
         base = functools.partial(search, bonus="centered")
         parts.append(one([_CENTERED], base=base, seeds=20))
@@ -369,8 +371,8 @@ _PROTOCOL_CONTROLS = joined(
 #: What is compared in each panel of the controls that has both curves.
 _CONTROL_PAIRS = [
     ("ppo+gasil", "ppo+bonus"),
-    ("ppo+gasil", _CHOSEN_TWICE.name),
-    (_CHOSEN_TWICE.name, "ppo"),
+    ("ppo+gasil", _CHOSEN_BY_TWO.name),
+    (_CHOSEN_BY_TWO.name, "ppo"),
     ("ppo+gasil", _CENTERED.name),
     ("ppo+bonus", "ppo"),
     (_CENTERED.name, "ppo"),
