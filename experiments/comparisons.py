@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments.curves import Comparisons
 from experiments.search import generator
-from gasil_jax.statistics import bootstrap_interval, interquartile_mean
+from gasil_jax.statistics import interquartile_mean
 
 #: Significance level of a family of verdicts.
 LEVEL = 0.05
@@ -262,15 +262,6 @@ def number(value: float, spec: str = "") -> str:
 def in_words(middle: float, low: float, high: float, spec: str = "") -> str:
     """Return a number and its interval as text, formatted as by `number`."""
     return "{} [{}, {}]".format(*(number(x, spec) for x in (middle, low, high)))
-
-
-def interval(scores: np.ndarray) -> str:
-    """Return as text the interquartile mean of (seeds,), if enough with an interval."""
-    middle = float(interquartile_mean(scores))
-    if len(scores) < FEWEST_SEEDS:
-        return number(middle)
-    low, high = map(float, bootstrap_interval(scores))
-    return in_words(middle, low, high)
 
 
 def over_tasks(name: str, scores: Sequence[np.ndarray]) -> tuple[float, float, float]:

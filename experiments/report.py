@@ -18,7 +18,6 @@ import numpy as np
 from experiments import claims, plots, tables
 from experiments.agents import OWN
 from experiments.claims import Pages
-from experiments.comparisons import interval
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
 from experiments.options import Options, Parser
@@ -27,7 +26,7 @@ from experiments.store import RESULTS, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
-from gasil_jax.statistics import interquartile_mean
+from gasil_jax.statistics import bootstrap_interval, interquartile_mean
 
 NOTES = pathlib.Path(__file__).parent / "notes"
 README = pathlib.Path(__file__).parent.parent / "README.md"
@@ -121,9 +120,8 @@ def curves_table(pages: Pages) -> Iterable[list[str]]:
     ]
     for name, results in pages.items():
         for (panel, label), one in results.curves.items():
-            final = interval(one.final).replace(",", "").strip("]")
-            middle, _, ends = final.partition(" [")
-            low, _, high = ends.partition(" ")
+            low, high = map(float, bootstrap_interval(one.final))
+            final = [float(interquartile_mean(one.final)), low, high]
             evaluated = ""
             if len(one.evaluated):
                 evaluated = f"{interquartile_mean(one.evaluated):.1f}"
@@ -132,8 +130,8 @@ def curves_table(pages: Pages) -> Iterable[list[str]]:
                 solved = f"{results.scores[panel, label].mean():.2f}"
             settings = tables.settings(results, panel, label)
             seeds, by = f"{len(one.records)}", one.provenance()
-            rest = [middle, low, high, evaluated, solved, settings, by]
-            yield [name, panel, label, seeds, *rest]
+            words = [f"{x:.5g}" for x in final] + [evaluated, solved, settings, by]
+            yield [name, panel, label, seeds, *words]
 
 
 def comparisons_table(pages: Pages) -> Iterable[list[str]]:

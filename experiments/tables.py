@@ -185,12 +185,6 @@ def apart(results: Results, panel: str, ours: str, other: str) -> str:
     return f"{compared}, {compared.verdict}" if compared else ""
 
 
-def judged(results: Results, panel: str, ours: str, other: str) -> str:
-    """Return the verdict of a comparison alone."""
-    compared = results.comparisons.get((panel, ours, other))
-    return compared.verdict if compared else "not measured"
-
-
 def count(results: Results, verdict: str, kind: str, ours: str, *others: str) -> str:
     """Return on how many tasks a curve has one verdict against all others."""
     on = [
@@ -297,7 +291,7 @@ def share(results: Results, kind: str, name: str) -> str:
 SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        *(claim, curves, forest, numbers, final, search, apart, judged, count, below),
+        *(claim, curves, forest, numbers, final, search, apart, count, below),
         *(foretold, passing, published, grids, share),
     )
 }

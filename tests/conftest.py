@@ -85,7 +85,9 @@ def equal_members_share_a_program():
 
     Members are equal if they are trained by the same algorithm, whatever its numbers,
     in the same environment, or in one that was made by the same name with the same
-    settings. Yields the programs, for a test that needs one to be compiled.
+    settings. Yields the programs, for a test that needs one to be compiled. Without it
+    three files of tests/host (evaluations, disks, folders) took 83 seconds of a
+    processor, and not 61.
     """
     import jax
 

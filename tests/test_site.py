@@ -255,7 +255,7 @@ def test_a_browser_without_network_shows_all_pages(site, pages, tmp_path):
             process.wait(20)
             server.shutdown()
             (site / "visit.html").unlink()
-    assert len(seen) == len(pages) > 20
+    assert len(seen) == len(pages) > 15
     for address, page in seen.items():
         assert not page["unseen"] + page["outside"], (address, page)
         assert not page["flat"] + page["raised"], (address, page)

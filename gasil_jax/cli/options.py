@@ -21,7 +21,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
-    saved,
+    start,
     sweep,
     trackers,
 )
@@ -156,22 +156,12 @@ def read(
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
     every, default = _defaults(kind, first, stored, origin)
-    algorithm = every[0]
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
-    agent = algorithm.agent
-    own = {type(model): model for model in algorithm.rewards}
-    parser.add_fields(Config, "training", algorithm.config)
-    parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
-    for model in REWARD_MODELS:
-        parser.add_fields(model, model.switch, own.get(model, model()))
-    for each in algorithm.own_models:
-        parser.add_fields(type(each), each.name, each, all_shown=True)
-    for other in every[1:]:
-        parser.add_fields(type(other.agent), other.agent.name, other.agent)
-    values = parser.read(arguments, _why_not(algorithm))
+    _add_algorithms(parser, every)
+    values = parser.read(arguments, _why_not(every[0]))
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(arguments)}
     switches = [model.switch for model in REWARD_MODELS]
@@ -196,9 +186,7 @@ def read(
         start=None if stored is None else stored.start,
     )
     if options.init_from is not None:
-        requested = dataclasses.replace(
-            requested, start=saved.find_start(options.init_from)
-        )
+        requested = dataclasses.replace(requested, start=start.find(options.init_from))
     _check(options, requested)
     if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
         raise InputError(
@@ -209,6 +197,20 @@ def read(
         requested = requested.continued_from(options.out)
     _note_without_effect(given, requested)
     return options, requested
+
+
+def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
+    """Add an option for each setting; those of several agents have one."""
+    algorithm, *others = every
+    agent, own = algorithm.agent, {type(model): model for model in algorithm.rewards}
+    parser.add_fields(Config, "training", algorithm.config)
+    parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
+    for model in REWARD_MODELS:
+        parser.add_fields(model, model.switch, own.get(model, model()))
+    for each in algorithm.own_models:
+        parser.add_fields(type(each), each.name, each, all_shown=True)
+    for other in others:
+        parser.add_fields(type(other.agent), other.agent.name, other.agent)
 
 
 def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:

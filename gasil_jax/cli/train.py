@@ -13,7 +13,7 @@ from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host import environments, folders, results, saved, training
+from gasil_jax.host import environments, folders, results, saved, start, training
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interruption, noted
 from gasil_jax.host.output_file import WriteError, note
@@ -39,7 +39,7 @@ def train(
             options.out or pathlib.Path("runs"),
             num_devices=options.devices,
         )
-        start = requested.start and saved.load_start(requested.start, env, needed)
+        policy = requested.start and start.load(requested.start, env, needed)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     with folders.lock(folder, seconds=60.0):
@@ -54,8 +54,8 @@ def train(
     try:
         with noted(how), Interruption() as interruption:
             needed = requested.unfinished(folder, runs)
-            if start is not None:
-                saved.begin(start, env, needed)
+            if policy is not None:
+                start.begin(policy, env, needed)
             outcomes = training.train_programs(
                 env,
                 needed,

@@ -35,18 +35,16 @@ def create(folder: pathlib.Path, *, option: str = "out") -> pathlib.Path:
 
 def create_new(name: str) -> pathlib.Path:
     """Create a folder under runs/, with a number after its name if that is taken."""
-    runs = create(pathlib.Path("runs"))
-    number = 1
+    runs, number = create(pathlib.Path("runs")), 1
     while True:
         folder = runs / (name if number == 1 else f"{name}-{number}")
         try:
             folder.mkdir()
+            return folder
         except FileExistsError:
             number += 1
         except OSError as error:
             raise InputError(unwritable(folder, error)) from None
-        else:
-            return folder
 
 
 def check_writable(folder: pathlib.Path) -> None:

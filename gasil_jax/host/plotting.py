@@ -215,7 +215,8 @@ def final_returns(
     axes.set(xlabel="final return of each seed; the bar is their mean")
     axes.invert_yaxis()
     beside.set(xlabel=words, ylabel="episode return", title="the best points")
-    beside.legend(frameon=False, title="point")
+    if beside.get_lines():
+        beside.legend(frameon=False, title="point")
     axes.ticklabel_format(axis="x", useOffset=False, style="plain")
     plain_ticks(beside)
     figure.suptitle(title)

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_envs import user_code, wrappers
+from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
 from gasil_jax import numpy_policy, policy, train
 from gasil_jax.agents.adversarial import AdversarialAgent
@@ -31,11 +31,11 @@ from gasil_jax.host import (
     training,
 )
 from gasil_jax.host.driver import Outcome
-from gasil_jax.host.members import make_members, member
+from gasil_jax.host.members import member
 from gasil_jax.host.output_file import note
 from gasil_jax.host.points import in_words
 from gasil_jax.host.programs import Program
-from gasil_jax.host.sweep import Start, Sweep
+from gasil_jax.host.sweep import Sweep
 
 
 def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
@@ -55,7 +55,7 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     chosen = _choose_point(folder, stored["points"], point)
     agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
     if stored["only_python"] is None:
-        every = _programs(folder, sweep.made(folder, stored), chosen)
+        every = programs_of(folder, sweep.made(folder, stored), chosen)
     else:
         every = programs.labelled(folder / "programs", chosen)
     return stored["env"], str(agent), every
@@ -101,7 +101,7 @@ def _choose_point(
     return point
 
 
-def _programs(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
+def programs_of(folder: pathlib.Path, stored: Sweep, point: int) -> list[Program]:
     """Return the programs that hold a point's runs, with no other runs."""
     left = {stored.runs[point, seed] for seed in stored.seeds}
     of_point = []
@@ -172,7 +172,7 @@ def restore(
 ) -> tuple[Algorithm, list[int], Any]:
     """Return algorithm, seed numbers and states (seed, ...) of a point; see `load`."""
     states: dict[int, train.TrainState] = {}
-    every = _programs(folder, stored, point)
+    every = programs_of(folder, stored, point)
     for each in every:
         if which == "best" and len(each.runs) < each.num_members:
             raise InputError(
@@ -201,87 +201,6 @@ def restore(
 
     stacked = jax.tree.map(stack, *(states[x] for x in seeds))
     return every[0].algorithm, seeds, stacked
-
-
-def find_start(folder: pathlib.Path) -> Start:
-    """Return the policy of a run's best seed, in its newest checkpoint."""
-    stored = sweep.read(folder)
-    every = _programs(folder, stored, _choose_point(folder, stored.points, None))
-    seed = best_seed(every)
-    if seed is None:
-        seed = every[0].seeds[0]
-    (path,) = (x.path for x in every if seed in x.seeds)
-    newest, _ = checkpoint.latest(path / "checkpoints")
-    if newest is None:
-        raise InputError(f"run is {folder}: it has no whole checkpoint")
-    return Start(str(folder.absolute()), seed, newest.digest())
-
-
-def load_start(start: Start, env: Any, every: Sequence[Program]) -> Any:
-    """Return the trained state that programs start from; None if all have begun.
-
-    Raises:
-      InputError: if it is gone or has changed, or has networks of another form.
-    """
-    if not (fresh := _without_checkpoint(every)):
-        return None
-    folder = pathlib.Path(start.run)
-    if find_start(folder).sha256 != start.sha256:
-        raise InputError(
-            f"init_from is {folder}, which has been trained since: what began from its "
-            "earlier policy can't begin anew"
-        )
-    *_, trained = load(folder, seed=start.seed)
-    for each in fresh:
-        first = functools.partial(train.first_state, env, each.algorithm)
-        parts = [
-            (x.actor_critic.policy.params, x.normalizer)
-            for x in (jax.eval_shape(first, jax.random.key(0)), member(trained, 0))
-        ]
-        if change := user_code.first_change(*parts):
-            where, own, other = change
-            raise InputError(
-                f"init_from is {folder}, whose policy has another form: {where} is "
-                f"{other} and not {own}"
-            )
-    return trained
-
-
-def begin(trained: Any, env: Any, every: Sequence[Program]) -> None:
-    """Write a first checkpoint, with a trained policy, in programs that have none.
-
-    The networks' parameters and the normalizer of observations are the trained ones;
-    all else, such as optimizers, buffers and discriminators, is as in a new run.
-    """
-
-    def spread(new: Any, old: Any) -> Any:
-        return jax.tree.map(lambda x, y: jnp.broadcast_to(y, x.shape), new, old)
-
-    old = trained.actor_critic
-    for each in _without_checkpoint(every):
-        own = make_members(env, each.algorithm, each.seeds, each.hyperparameters)
-        states = own.trim(own.init())
-        now = states.actor_critic
-        policy, values = spread(now.policy.params, old.policy.params), now.values
-        # Another agent may have more streams of rewards, each with its values.
-        if len(values) == len(old.values):
-            values = tuple(
-                x.replace(params=spread(x.params, y.params))
-                for x, y in zip(values, old.values)
-            )
-        states = states.replace(
-            actor_critic=now.replace(
-                policy=now.policy.replace(params=policy), values=values
-            ),
-            normalizer=spread(states.normalizer, trained.normalizer),
-        )
-        record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
-        with each.opened():
-            checkpoint.write(each.path / "checkpoints", 0, states, record)
-
-
-def _without_checkpoint(every: Sequence[Program]) -> list[Program]:
-    return [x for x in every if checkpoint.latest(x.path / "checkpoints")[0] is None]
 
 
 def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:

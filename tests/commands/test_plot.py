@@ -6,6 +6,7 @@ import shutil
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
+from refusals import refused
 
 from gasil_jax.cli import plot
 from gasil_jax.errors import InputError
@@ -128,32 +129,5 @@ def test_files_of_other_libraries_are_curves(trained, figures, tmp_path, capsys)
         (tmp_path / "damaged.csv", columns, "damaged: could not convert"),
         (tmp_path / "none.csv", columns, "must be a run or a CSV file"),
     ):
-        assert plot.main([str(path), *more, "--out", str(tmp_path / "y.png")]) == 2
-        assert message in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            "RUN --metric entropie",
-            "metric 'entropie' is unknown: did you mean 'entropy'",
-        ),
-        ("RUN --smooth 0", "smooth is 0: it must be 1 or more"),
-        ("RUN --x steps", "x 'steps' is unknown"),
-        ("", "runs is empty: name one folder or more"),
-        ("RUN --out x.txt", "must end in .png, .pdf, .svg"),
-        ("RUN --out RUN/learning_curve.png", "which exists: name a new file"),
-        ("RUN --out /proc/nowhere/x.png", "out is /proc/nowhere/x.png"),
-        ("RUN --out RUN/summary.png --point 1", "point is 1: "),
-        ("RUN/programs --out /proc/x.png", "must be the folder of a run"),
-        ("RUN RUN --labels a", "labels has 1 names: it must have one for each of the"),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(
-    arguments, message, trained, tmp_path, monkeypatch, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    assert plot.main(arguments.replace("RUN", str(trained.folder)).split()) == 2
-    (error,) = capsys.readouterr().err.splitlines()
-    assert message in error
+        told = refused(capsys, plot, path, *more, "--out", tmp_path / "y.png")
+        assert message in told

@@ -41,7 +41,7 @@ run --resume | resume needs --out and the folder to continue
 run --resume --out nosuch | out is nosuch, which holds no run to continue: to
 hopper --agent ppo+gasill | did you mean 'ppo+gasil'?
 hopper --agent ppo --alpha 0.7 | alpha is a setting of gasil, ppo+gasil, gail, not
-hopper --agent ppo+sil --no-buffer-discounts | --no-buffer-discounts is unknown: buffer_
+hopper --agent ppo+sil --buffer-episodes 3 | --buffer-episodes is unknown: buffer_
 hopper --preset papre | did you mean 'paper'
 hopper --seeds 0 | seeds is 0: it must be from 1 to
 hopper --seeds 1e30 | must be from 1 to 1,048,576
@@ -140,7 +140,13 @@ evaluate RUN/programs | has no config.json: it must be the folder of a run or a 
 evaluate RUN/nowhere | does not exist: it must be the folder of a run or a sweep
 swept --point 4 | has points 0 to 3
 swept --point 1 --checkpoint best | it must be 'last'
+draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
+draw --smooth 0 | smooth is 0: it must be 1 or more
+draw --x steps | x 'steps' is unknown
 draw --out x.txt | must end in .png, .pdf, .svg
+draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
+draw --smooth 0 | smooth is 0: it must be 1 or more
+draw --x steps | x 'steps' is unknown: did you mean 'env_steps'
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png
 draw --out RUN/summary.png --point 1 | point is 1: 

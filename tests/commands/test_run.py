@@ -25,7 +25,7 @@ from gasil_jax import run
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.reporting import HelpShown, reports_errors
-from gasil_jax.host import checkpoint, saved, training
+from gasil_jax.host import checkpoint, saved, start, training
 from gasil_jax.host import sweep as sweep_
 
 pytestmark = pytest.mark.xdist_group("commands")
@@ -309,7 +309,7 @@ def test_training_starts_from_another_runs_policy(tmp_path, monkeypatch, capsys)
     (stored,) = (path.parent for path in tmp_path.glob("second/**/00000000"))
     begun = checkpoint.read(stored / "00000000")
     *_, trained = saved.load(pathlib.Path("first"))
-    best = saved.find_start(pathlib.Path("first")).seed
+    best = start.find(pathlib.Path("first")).seed
     *_, last = saved.load(pathlib.Path("second"))
     first = gasil_jax.member(begun.restore(jax.eval_shape(lambda: last)), 0)
     expected = gasil_jax.member(trained, best)

@@ -86,13 +86,11 @@ def test_few_seeds_make_nothing_clear():
     few = {name: x[:3] for name, x in scores(high=9.0, low=0.0).items()}
     (result,) = compare(few, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert comparisons.interval(np.array([1.0, 2.0, 3.0])) == "2.0"
     # Nor does a seed that ended no episode.
     none = scores(high=9.0, low=0.0)
     none["a", "low"][0] = np.nan
     (result,) = compare(none, family(("high", "low"))).values()
     assert result.verdict == "not clear"
-    assert comparisons.interval(np.arange(5.0)).startswith("2.0 [")
 
 
 def sides(scores, panels, pair):
