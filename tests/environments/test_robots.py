@@ -112,7 +112,10 @@ def test_a_task_s_own_functions_make_its_episodes():
     [
         ({"world": '<geom type="box" size="1 1 1"/>'}, "contacts of capsule and box"),
         (
-            {"top": '<option integrator="implicitfast" density="1"/>'},
+            {
+                "top": '<option integrator="implicitfast"/>',
+                "world": '<body pos="5 0 0"><freejoint/><geom size="0.1"/></body>',
+            },
             "a medium or a free body without others, with implicitfast",
         ),
         ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),

@@ -164,11 +164,15 @@ class Constants(struct.PyTreeNode):
 
 
 class Group(NamedTuple):
-    """The possible contacts of one condim; `edges` are as in `newton.ContactRows`."""
+    """The possible contacts of one condim; `edges` are as in `newton.ContactRows`.
+
+    `stiffness` is that of the stiffest, in units of the inertia that it moves.
+    """
 
     edges: tuple[tuple[int, ...], ...]
     pairs: collision.Pairs
     constants: Constants
+    stiffness: float
 
 
 class Strength(NamedTuple):
@@ -205,24 +209,11 @@ class Layout(NamedTuple):
     groups: tuple[Group, ...]
     friction: Strength | None
     others: tuple[tuple[Strength, Place], ...]
-    impratio: float
 
     @property
     def stiffness(self) -> float:
         """How much stiffer the stiffest contact is than the inertia that it moves."""
-        most = 0.0
-        for group in self.groups:
-            x = group.constants
-            softness = 1.0 - x.impedance.highest.astype(np.float64)
-            if len(group.edges) > 1:
-                softness = (
-                    softness
-                    * 2
-                    * x.friction[:, 0].astype(np.float64) ** 2
-                    / self.impratio
-                )
-            most = max(most, float(np.max(1.0 / softness)))
-        return min(most, _MOST_STIFFNESS)
+        return max((group.stiffness for group in self.groups), default=0.0)
 
 
 class Contacts(NamedTuple):
@@ -283,7 +274,7 @@ def layout(model: mujoco.MjModel) -> Layout:
         friction = Strength.of(model, model.dof_invweight0, solver, loss)
     kinds = (_equalities, _tendon_friction, _tendon_limits, _ball_limits)
     others = tuple(rows for kind in kinds if (rows := kind(model)) is not None)
-    return Layout(limits, tuple(groups), friction, others, model.opt.impratio)
+    return Layout(limits, tuple(groups), friction, others)
 
 
 def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
@@ -365,15 +356,20 @@ def _group(
     sliding = friction[:, 0]
     inverse_weight = model.body_invweight0[body, 0].sum(axis=1)
     floor = np.full(len(index), mujoco.mjMINVAL)
-    moved = inverse_weight
+    # A body that turns about its middle resists as what it touches with does.
+    reach = model.geom_rbound[contact.geoms[index]]
+    turned = (model.body_invweight0[body, 1] * reach**2).sum(axis=1)
+    moved = np.where(inverse_weight < 1e-4 * turned, turned, inverse_weight)
     if condim > 1:
-        moved = inverse_weight = inverse_weight * (1 + sliding**2)
+        moved, inverse_weight = (x * (1 + sliding**2) for x in (moved, inverse_weight))
         inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
         floor = floor * 2 * sliding**2 / model.opt.impratio
     # Without friction an edge would weigh 1e10 times as much as what it moves.
     floor = np.maximum(floor, moved / _MOST_STIFFNESS)
     impedance = Impedance.of(model, at(contact.solref), at(contact.solimp))
     highest = impedance.highest[:, 0].astype(np.float64)
+    resistance = np.maximum(inverse_weight * (1 - highest) / highest, floor)
+    stiffness = float(np.max(moved / resistance))
     if (inverse_weight * (1 - highest) > floor * highest).all():
         floor = np.full(1, mujoco.mjMINVAL)  # It is not reached.
 
@@ -386,7 +382,7 @@ def _group(
         least_resistance=_constant(floor),
         impedance=impedance,
     )
-    return Group(edges, pairs, constants)
+    return Group(edges, pairs, constants, stiffness)
 
 
 def _weight(
