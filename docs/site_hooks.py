@@ -16,6 +16,8 @@ _LOG = logging.getLogger("mkdocs.hooks.site")
 _FORMULA = re.compile(
     r'<(span|div) class="arithmatex">\\([(\[])(.*?)\\[)\]]</\1>', re.DOTALL
 )
+#: A module in api.md, with the options that choose its names.
+_MODULE = re.compile(r"^::: (\S+)\n((?:    .*\n)*)", re.MULTILINE)
 #: A picture and where it is.
 _PICTURE = re.compile(r'(<img [^>]*src="([^"]*)"[^>]*>)')
 #: TeX's spaces that the converter leaves out: around a function's name, and none behind
@@ -41,11 +43,20 @@ def _mathml(match: re.Match[str]) -> str:
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
-    """Let the search prefer the guide to results, which have the same words."""
+    """Let the search prefer the guide to results, which have the same words.
+
+    The page of the API links the pages of its modules.
+    """
     section = page.file.src_uri.partition("/")[0]
-    boost = {"results": 0.3, "reproducing.md": 0.3, "api.md": 0.6}.get(section, 2.0)
+    boost = {"results": 0.3, "reproducing.md": 0.3, "api": 0.6}.get(section, 2.0)
     page.meta.setdefault("search", {"boost": boost})
-    return markdown
+    return _MODULE.sub(_link, markdown) if section == "api.md" else markdown
+
+
+def _link(module: re.Match[str]) -> str:
+    names = re.search(r"members: \[(.*)\]", module[2])
+    more = f": {names[1]}" if names else ""
+    return f"- [`{module[1]}`](api/{module[1]}.md){more}\n"
 
 
 def on_page_content(content: str, page: Any, **_: Any) -> str:
@@ -62,8 +73,14 @@ def on_page_content(content: str, page: Any, **_: Any) -> str:
 
 
 def on_files(files: Any, config: Any, **_: Any) -> Any:
-    """Make a page of each notebook, with what its code has printed and drawn."""
+    """Make a page of each module of the API, and of each notebook.
+
+    A notebook's page has what its code has printed and drawn.
+    """
     docs = pathlib.Path(config.docs_dir)
+    for module in _MODULE.finditer((docs / "api.md").read_text()):
+        uri, content = f"api/{module[1]}.md", f"# {module[1]}\n\n{module[0]}"
+        files.append(File.generated(config, uri, content=content))
     for path in docs.glob("examples/*.ipynb"):
         parts = []
         for cell in json.loads(path.read_text())["cells"]:

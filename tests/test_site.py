@@ -83,6 +83,9 @@ def target(site, path, link):
 
 def test_all_that_is_public_is_there(site):
     assert "make_train" in (site / "api" / "index.html").read_text()
+    assert 'id="gasil_jax.train.make_train"' in (
+        (site / "api" / "gasil_jax.train" / "index.html").read_text()
+    )
 
 
 def test_nothing_is_loaded_from_outside(site, pages):
