@@ -156,7 +156,8 @@ def test_a_picture_leads_to_its_file(site):
     )
 
 
-def test_the_page_of_a_notebook_shows_what_it_printed_and_drew(tmp_path, monkeypatch):
+def test_notebooks_and_modules_have_pages(tmp_path, monkeypatch):
+    """A notebook's shows what it printed and drew."""
     hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
     picture = {"data": {"image/png": "iVBORw0KGgo="}}
     code = {"cell_type": "code", "source": ["1 + 1"]}
@@ -164,6 +165,8 @@ def test_the_page_of_a_notebook_shows_what_it_printed_and_drew(tmp_path, monkeyp
     cells = [{"cell_type": "markdown", "source": ["# Title"]}, code]
     (tmp_path / "examples").mkdir()
     (tmp_path / "examples" / "x.ipynb").write_text(json.dumps({"cells": cells}))
+    module = "::: a.b\n    options:\n      members: [c]\n"
+    (tmp_path / "api.md").write_text(f"# API\n\n{module}\n::: d\n")
     made = {}
     monkeypatch.setattr(
         hooks["File"],
@@ -174,6 +177,8 @@ def test_the_page_of_a_notebook_shows_what_it_printed_and_drew(tmp_path, monkeyp
     shown = "```text\n2\n3\n```\n\n![output of the code above](x-3.png)"
     assert made["examples/x.md"] == f"# Title\n\n```python\n1 + 1\n```\n\n{shown}"
     assert made["examples/x-3.png"].startswith(b"\x89PNG")
+    assert made["api/a.b.md"] == f"# a.b\n\n{module}"
+    assert made["api/d.md"] == "# d\n\n::: d\n"
 
 
 def test_a_formula_that_is_not_known_is_told(caplog):
