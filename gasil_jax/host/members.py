@@ -23,6 +23,7 @@ from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, Range
 from gasil_jax.errors import refusal
+from gasil_jax.host import resources
 
 T = TypeVar("T")
 
@@ -205,13 +206,19 @@ class Members:
         """Return the states to start from, and the compiled `advance`.
 
         They are the first states or those to continue from, (members, ...).
+
+        Raises:
+          InputError: if an array of the program does not fit into memory; nothing is
+            compiled then.
         """
         shapes = jax.tree.map(
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
         )
         arguments = shapes, np.int32(0), self.data
-        compiled = _in_thread(lambda: self.advance.lower(*arguments).compile())
+        traced = self.advance.trace(*arguments)
+        resources.check_arrays(traced.jaxpr.jaxpr, self.algorithm, self.devices)
+        compiled = _in_thread(lambda: traced.lower().compile())
         # The first states have a program of their own, which takes seconds too.
         first = _in_thread(
             lambda: jax.block_until_ready(

@@ -12,6 +12,8 @@ from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import run
+from gasil_jax.config import count
+from gasil_jax.errors import InputError
 from gasil_jax.host import environments, resources
 from gasil_jax.host.members import make_members
 from gasil_jax.host.programs import Program
@@ -86,6 +88,25 @@ def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
     one = resources.need(gasil_jax.make_env("point_mass"), algorithm)
     with pytest.raises(ValueError, match=f"most is for {re.escape(part)}"):
         resources.check_memory(one, algorithm, 1, jax.devices()[:1])
+
+
+class Wide(gasil_jax.Agent):
+    rows: int = count(1)
+
+    def update_and_reward(self, state, context, key):
+        rows = jax.random.normal(key, (self.rows, 1000))
+        return state, context.rollout.reward + rows.mean(), {}
+
+
+def test_any_count_that_shapes_a_large_array_is_refused_before_compiling(monkeypatch):
+    monkeypatch.setattr(jax.stages.Lowered, "compile", None)
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.Algorithm(Wide(rows=2**31 - 1))
+    told = (
+        r"an array of shape \(1, 2147483647, 1000\), with rows 2147483647: it needs 8"
+    )
+    with pytest.raises(InputError, match=told):
+        make_members(env, algorithm, [0]).compile()
 
 
 def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
